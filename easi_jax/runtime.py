@@ -1,0 +1,109 @@
+"""Readies jax before its backend starts. Imported first by ``easi_jax``.
+
+Everything here is a default: what the environment or an earlier
+``jax.config.update`` has set is left alone. ``status()`` says what is in force.
+"""
+
+import contextlib
+import io
+import logging
+import os
+from pathlib import Path
+
+_MIN_POOL = 8
+_state: dict[str, object] = {}
+
+
+def cores() -> int:
+    """CPU cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS
+        return os.cpu_count() or 1
+
+
+def backend_started() -> bool:
+    """True once jax has initialised a backend, after which nothing can be set."""
+    from jax._src import xla_bridge
+
+    return bool(xla_bridge.backends_are_initialized())
+
+
+def cache_dir() -> Path:
+    """Folder of the persistent compilation cache."""
+    chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    if chosen:
+        return Path(chosen)
+    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(base) / "easi-jax" / "xla"
+
+
+def prepare() -> dict[str, object]:
+    """Sets what must be set before jax starts its backend; safe to call again.
+
+    - ``NPROC``: jaxlib's intra-op pool must be larger than the number of cores,
+      or a batched Cholesky of a few hundred matrices can wait for itself for ever.
+    - one CPU device per core, so that a mesh over them uses all of them;
+    - persistent compilation cache;
+    - full float32 products on GPUs that would use TF32;
+    - quiet imports of mujoco.mjx where warp is missing.
+    """
+    if _state:
+        return _state
+    if not os.environ.get("NPROC"):
+        os.environ["NPROC"] = str(max(_MIN_POOL, 4 * cores()))
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    import jax
+
+    late = backend_started()
+    if not late:
+        flags = os.environ.get("XLA_FLAGS", "")
+        own_count = (
+            "JAX_NUM_CPU_DEVICES" in os.environ
+            or "xla_force_host_platform_device_count" in flags
+        )
+        if not own_count and jax.config.jax_num_cpu_devices == -1:
+            jax.config.update("jax_num_cpu_devices", cores())
+        if jax.config.jax_default_matmul_precision is None:
+            jax.config.update("jax_default_matmul_precision", "highest")
+        _ready_cache()
+    with contextlib.redirect_stdout(io.StringIO()):
+        logging.getLogger("jax._src.xla_bridge").setLevel(logging.ERROR)
+        from mujoco import mjx  # noqa: F401  prints two lines without warp
+    _state.update(late=late)
+    return _state
+
+
+def _ready_cache() -> None:
+    import jax
+
+    if jax.config.jax_compilation_cache_dir is None:
+        path = cache_dir()
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError:  # a read-only home: run without, `train.info` shows it
+            return
+        jax.config.update("jax_compilation_cache_dir", str(path))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def status() -> dict[str, object]:
+    """What is in force now, for ``python -m train.info`` and for run folders."""
+    import jax
+
+    prepare()
+    pool = int(os.environ.get("NPROC", "0") or 0)
+    devices = jax.devices()
+    return {
+        "cores": cores(),
+        "nproc": pool,
+        "deadlock_cure": pool > cores() and not _state["late"],
+        "platform": devices[0].platform,
+        "device_kind": devices[0].device_kind,
+        "devices": len(devices),
+        "one_device_per_core": devices[0].platform != "cpu" or len(devices) == cores(),
+        "compilation_cache": jax.config.jax_compilation_cache_dir,
+        "matmul_precision": jax.config.jax_default_matmul_precision,
+        "x64": bool(jax.config.jax_enable_x64),
+        "prepared_before_backend": not _state["late"],
+    }
