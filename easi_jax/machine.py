@@ -1,0 +1,122 @@
+"""A robot as it is simulated: MuJoCo model, what may vary, control step."""
+
+import math
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from easi_jax.errors import UserError
+from easi_jax.model import Model, put_model, with_parameters
+from easi_jax.parameters import ParameterSpace
+from easi_jax.physics import Physics, at_rest, control_step
+
+
+class Machine:
+    """A MuJoCo model, its parameters and its control step.
+
+    Attributes:
+        mj_model: the model as given, nominal values in it.
+        space: the parameters that may vary.
+        dt: control step [s].
+        substeps: physics steps in a control step. The physics step is ``dt``
+            divided by the smallest whole number that brings it to the model's own
+            timestep or below.
+
+    Raises:
+        UserError: what MJX cannot simulate, or an address that the model lacks.
+    """
+
+    def __init__(
+        self, mj_model: mujoco.MjModel, space: ParameterSpace, dt: float | None = None
+    ) -> None:
+        step = float(mj_model.opt.timestep)
+        self.dt = float(dt) if dt is not None else step
+        if not 0 < self.dt < 10:
+            raise UserError(f"control step {self.dt} s: give one above 0 and below 10")
+        self.substeps = max(1, math.ceil(self.dt / step - 1e-6))
+        self.mj_model = mj_model
+        self.space = space
+
+    @cached_property
+    def base(self) -> Model:
+        """The model at its nominal parameters, on the device, gates opened."""
+        model = put_model(self.mj_model, self.space.addresses)
+        physics_dt = self.dt / self.substeps
+        option = model.mjx.opt.replace(
+            timestep=jnp.asarray(physics_dt, model.mjx.opt.timestep.dtype)
+        )
+        return model.replace(mjx=model.mjx.replace(opt=option))
+
+    def model(self, theta: jax.Array) -> Model:
+        """The model at parameters ``theta`` ``(n,)`` in SI units."""
+        return with_parameters(self.base, theta)
+
+    def start(self, qpos: jax.Array, qvel: jax.Array) -> Physics:
+        """A measured state, nothing known of what came before it."""
+        return at_rest(self.base, qpos, qvel)
+
+    def step(self, model: Model, state: Physics, ctrl: jax.Array) -> Physics:
+        """One control step with ``ctrl`` ``(nu,)`` held."""
+        return control_step(model, state, ctrl, self.substeps)
+
+    @cached_property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the entries of `state_vector`: positions, then velocities."""
+        m = self.mj_model
+        pos, vel = [], []
+        for j in range(m.njnt):
+            name = m.joint(j).name or f"joint{j}"
+            n = {0: 6, 1: 3}.get(int(m.jnt_type[j]), 1)
+            ends = [""] if n == 1 else [f".{i}" for i in range(n)]
+            pos += [f"qpos.{name}{e}" for e in ends]
+            vel += [f"qvel.{name}{e}" for e in ends]
+        return (*pos, *vel)
+
+    @cached_property
+    def _hinge_only(self) -> bool:
+        return bool(np.all(self.mj_model.jnt_type >= 2))
+
+    def difference(
+        self,
+        qpos_a: jax.Array,
+        qvel_a: jax.Array,
+        qpos_b: jax.Array,
+        qvel_b: jax.Array,
+    ) -> jax.Array:
+        """State b minus state a, ``(2 nv,)``: positions in the tangent space
+        (rotation vectors for free and ball joints), then velocities.
+
+        Hinges are subtracted as they are: simulated angles do not wrap.
+        """
+        if self._hinge_only:
+            dq = qpos_b - qpos_a
+        else:
+            dq = self._tangent(qpos_a, qpos_b)
+        return jnp.concatenate([dq, qvel_b - qvel_a])
+
+    def _tangent(self, qa: jax.Array, qb: jax.Array) -> jax.Array:
+        m, out = self.mj_model, []
+        for j in range(m.njnt):
+            a, kind = int(m.jnt_qposadr[j]), int(m.jnt_type[j])
+            if kind == 0:
+                out += [qb[a : a + 3] - qa[a : a + 3]]
+                a += 3
+            if kind <= 1:
+                out += [_rotation_between(qa[a : a + 4], qb[a : a + 4])]
+            else:
+                out += [qb[a : a + 1] - qa[a : a + 1]]
+        return jnp.concatenate(out)
+
+
+def _rotation_between(qa: jax.Array, qb: jax.Array) -> jax.Array:
+    """Rotation vector from unit quaternion a to b (w x y z), in a's frame [rad]."""
+    wa, va, wb, vb = qa[0], qa[1:], qb[0], qb[1:]
+    w = wa * wb + va @ vb
+    v = wa * vb - wb * va - jnp.cross(va, vb)
+    v = jnp.where(w < 0, -v, v)
+    n2 = v @ v
+    n = jnp.sqrt(jnp.where(n2 > 1e-16, n2, 1.0))
+    return v * jnp.where(n2 > 1e-16, 2 * jnp.arctan2(n, jnp.abs(w)) / n, 2.0)

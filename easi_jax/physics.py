@@ -1,0 +1,96 @@
+"""One control step of physics: the state, the substeps, and nothing else."""
+
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from mujoco import mjx
+from mujoco.mjx._src import forward as mjx_forward
+from mujoco.mjx._src import sensor as mjx_sensor
+from mujoco.mjx._src.types import IntegratorType
+
+from easi_jax import solver
+from easi_jax.small_linalg import unroll_small
+
+
+@flax.struct.dataclass
+class Physics:
+    """What the simulation carries from step to step; small, and can be saved.
+
+    Attributes:
+        qpos: joint positions, ``(nq,)`` [m, rad].
+        qvel: joint velocities, ``(nv,)`` [m/s, rad/s].
+        act: actuator activations, ``(na,)``.
+        warmstart: last acceleration, where the solver starts, ``(nv,)``.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    act: jax.Array
+    warmstart: jax.Array
+
+
+def at_rest(model: Any, qpos: jax.Array, qvel: jax.Array) -> Physics:
+    """A state with nothing known of what came before it."""
+    m = model.mjx
+    return Physics(
+        qpos=qpos, qvel=qvel, act=jnp.zeros(m.na), warmstart=jnp.zeros(m.nv)
+    )
+
+
+def data_at(model: Any, state: Physics, ctrl: jax.Array) -> mjx.Data:
+    """The `mjx.Data` of a state, before `forward`."""
+    return mjx.make_data(model.mjx).replace(
+        qpos=state.qpos,
+        qvel=state.qvel,
+        act=state.act,
+        qacc_warmstart=state.warmstart,
+        ctrl=ctrl,
+    )
+
+
+def forward(m: mjx.Model, d: mjx.Data) -> mjx.Data:
+    """`mjx.forward` with this package's constraint solver where it applies."""
+    if not solver.supported(m):
+        return mjx.forward(m, d)
+    d = mjx_forward.fwd_position(m, d)
+    d = mjx_sensor.sensor_pos(m, d)
+    d = mjx_forward.fwd_velocity(m, d)
+    d = mjx_sensor.sensor_vel(m, d)
+    d = mjx_forward.fwd_actuation(m, d)
+    d = mjx_forward.fwd_acceleration(m, d)
+    if d._impl.efc_J.size == 0:
+        d = d.replace(qacc=d.qacc_smooth)
+    else:
+        d = solver.solve(m, d, int(m.opt.iterations))
+    return mjx_sensor.sensor_acc(m, d)
+
+
+def mjx_step(m: mjx.Model, d: mjx.Data) -> mjx.Data:
+    """`mjx.step`, its constraint solve and small matrices batched well."""
+    if m.opt.integrator == IntegratorType.RK4:
+        return mjx.step(m, d)  # RK4 solves inside its stages
+    d = forward(m, d)
+    if m.opt.integrator == IntegratorType.EULER:
+        return mjx_forward.euler(m, d)
+    return mjx_forward.implicit(m, d)
+
+
+_unrolled_step = unroll_small(mjx_step)
+
+
+def control_step(
+    model: Any, state: Physics, ctrl: jax.Array, substeps: int
+) -> Physics:
+    """Holds ``ctrl`` ``(nu,)`` for ``substeps`` physics steps.
+
+    The joint speed limit, which MuJoCo lacks, clips velocities after each substep.
+    """
+
+    def substep(s: Physics, _: None) -> tuple[Physics, None]:
+        d = _unrolled_step(model.mjx, data_at(model, s, ctrl))
+        qvel = jnp.clip(d.qvel, -model.speed_limit, model.speed_limit)
+        return Physics(d.qpos, qvel, d.act, d.qacc_warmstart), None
+
+    return jax.lax.scan(substep, state, None, length=substeps)[0]
