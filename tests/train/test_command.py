@@ -1,0 +1,180 @@
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from easi_jax.errors import UserError
+from train import _command
+from train._command import Meter, duration, main, progress, show_table
+
+ROOT = Path(__file__).parents[2]
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Does a thing worth doing."""
+
+    out: Path
+    """Folder that holds the run."""
+    preset: Literal["paper", "default"] = "default"
+    """Recipe of the search."""
+    population: int = 300
+    """Individuals per generation."""
+
+
+def _call(run, *args):
+    main(Config, run, name="train.thing", args=args)
+
+
+def _nothing(config):
+    pass
+
+
+def test_arguments_become_the_config():
+    seen = []
+    _call(seen.append, "--out", "a", "--preset", "paper", "--population", "3")
+    assert seen == [Config(Path("a"), "paper", 3)]
+
+
+def test_help_shows_docstrings_and_defaults(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        _call(_nothing, "--help")
+    assert exit_.value.code == 0
+    text = capsys.readouterr().out
+    assert "python -m train.thing" in text
+    assert "Does a thing worth doing." in text
+    assert "Individuals per generation. (default: 300)" in text
+    assert "{paper,default}" in text
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        ([], "--out PATH"),
+        (["--out", "a", "--presett", "paper"], "--preset {paper,default}"),
+        (["--out", "a", "--preset", "papr"], "'paper'"),
+        (["--out", "a", "--population", "many"], "Error parsing --population"),
+    ],
+)
+def test_wrong_arguments_exit_with_2_and_help(args, said, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        _call(_nothing, *args)
+    assert exit_.value.code == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert said in err
+
+
+def test_user_error_is_one_line_and_2(capsys):
+    def run(config):
+        raise UserError('unknown robot "antt";\n  did you mean "ant"?')
+
+    with pytest.raises(SystemExit) as exit_:
+        _call(run, "--out", "a")
+    assert exit_.value.code == 2
+    assert capsys.readouterr() == (
+        "",
+        'error: unknown robot "antt"; did you mean "ant"?\n',
+    )
+
+
+def test_programming_errors_are_not_dressed_up():
+    def run(config):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        _call(run, "--out", "a")
+
+
+@pytest.mark.parametrize(
+    ("kept", "said"), [(True, "--resume"), (False, "before the first checkpoint")]
+)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_says_what_is_kept(tmp_path, capsys, kept, said, number):
+    if kept:
+        (tmp_path / "checkpoints" / "search" / "step_000000000003").mkdir(parents=True)
+
+    def run(config):
+        os.kill(os.getpid(), number)
+
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as exit_:
+        _call(run, "--out", str(tmp_path))
+    assert exit_.value.code == 130
+    err = capsys.readouterr().err
+    assert said in err
+    assert str(tmp_path) in err
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_progress_without_terminal_is_plain_lines(capsys, monkeypatch):
+    monkeypatch.setattr(_command, "LOG_SECONDS", 0.0)
+    with progress("search", total=4) as shown:
+        shown.advance(2, fitness=np.float32(1.23456), non_finite=3)
+        shown.advance(2)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert lines[0].startswith("search  2/4  0:00 so far  fitness 1.235  non finite 3")
+    assert lines[1].startswith("search  4/4  0:00 in all")
+
+
+def test_progress_log_is_rationed(capsys):
+    with progress("search", total=100) as shown:
+        for _ in range(100):
+            shown.advance(1)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split()[1] for line in lines] == ["1/100", "100/100"]
+
+
+def test_rate_leaves_out_the_chunk_that_compiles():
+    now = [0.0]
+    meter = Meter(total=40, done=10, clock=lambda: now[0])
+    now[0] = 60.0  # compilation and the first chunk
+    meter.advance(10)
+    assert meter.rate is None
+    assert meter.summary() == "20/40  1:00 so far"
+    now[0] = 65.0
+    meter.advance(10)
+    assert meter.rate == pytest.approx(2.0)
+    now[0] = 66.0  # time left falls between chunks as well
+    assert meter.left == pytest.approx(4.0)
+    assert meter.summary() == "30/40  2/s  0:04 left"
+
+
+def test_duration():
+    assert [duration(x) for x in (7.4, 750, 3723)] == ["0:07", "12:30", "1:02:03"]
+
+
+def test_table_shows_every_cell_unfolded_in_a_pipe(capsys):
+    show_table(
+        "Returns [WD]", ("method", "return"), [("UDR [a]", 1.0), ("EASI" * 20, 2.5)]
+    )
+    out = capsys.readouterr().out
+    assert "Returns [WD]" in out
+    assert "UDR [a]" in out
+    assert "EASI" * 20 in out
+    assert "2.5 │" in out
+
+
+def test_commands_import_without_jax():
+    names = sorted(f"train.{p.stem}" for p in (ROOT / "train").glob("[a-z]*.py"))
+    assert "train.info" in names
+    code = (
+        f"import sys\nimport {', '.join(names)}\n"
+        "print([m for m in ('jax', 'mujoco', 'easi_jax') if m in sys.modules])"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=ROOT,
+        check=True,
+    )
+    assert found.stdout.strip() == "[]"

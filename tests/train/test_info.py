@@ -1,0 +1,70 @@
+import os
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from easi_jax import runtime
+from train.info import measures
+
+ROOT = Path(__file__).parents[2]
+
+
+def _info(**changes):
+    dropped = ("NPROC", "XLA_FLAGS", "JAX_NUM_CPU_DEVICES")
+    env = {k: v for k, v in os.environ.items() if k not in dropped}
+    return subprocess.run(
+        [sys.executable, "-m", "train.info"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=ROOT,
+        env={**env, **changes},
+        check=True,
+    )
+
+
+def test_fresh_process_has_every_measure_in_force():
+    found = _info()
+    assert found.stderr == ""
+    assert version("jax") in found.stdout
+    assert version("mujoco-mjx") in found.stdout
+    assert "quiet imports" in found.stdout
+    assert "│ NO" not in found.stdout
+
+
+def test_what_the_environment_took_away_is_shown():
+    found = _info(NPROC="1", JAX_NUM_CPU_DEVICES="1")
+    rows = [line for line in found.stdout.splitlines() if "│ NO" in line]
+    missing = ["deadlock cure"] + ["one device per core"] * (runtime.cores() > 1)
+    assert len(rows) == len(missing)
+    for row, name in zip(rows, missing, strict=True):
+        assert name in row
+
+
+@pytest.mark.parametrize(
+    ("change", "printed", "name"),
+    [
+        ({"compilation_cache": None}, "", "compilation cache"),
+        ({"matmul_precision": None}, "", "full float32 products"),
+        ({"prepared_before_backend": False}, "", "set before jax starts"),
+        ({}, "Failed to import warp", "quiet imports"),
+    ],
+)
+def test_each_lost_measure_is_a_no(change, printed, name):
+    state = {
+        "cores": 2,
+        "nproc": 8,
+        "deadlock_cure": True,
+        "platform": "cpu",
+        "devices": 2,
+        "one_device_per_core": True,
+        "compilation_cache": "/cache",
+        "matmul_precision": "highest",
+        "prepared_before_backend": True,
+    }
+    assert state.keys() <= runtime.status().keys()
+    rows = measures({**state, **change}, printed)
+    assert [row[0] for row in rows if row[1] == "NO"] == [name]

@@ -1,0 +1,1 @@
+"""Commands: ``python -m train.NAME``, one file each."""

@@ -1,0 +1,264 @@
+"""What all commands share: arguments, errors, progress and tables.
+
+Imports no jax, so that ``--help`` is quick; a command's ``run`` imports what it needs.
+"""
+
+import contextlib
+import re
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn, Protocol, TypeVar
+
+_Config = TypeVar("_Config")
+
+LOG_SECONDS = 10.0
+_NUMBER = re.compile(r"[-+]?\d|nan|-?inf|$")
+USER_ERROR = 2
+INTERRUPTED = 130
+
+
+class Progress(Protocol):
+    """A bar or, where nobody watches, a log."""
+
+    def advance(self, n: int = 1, **fields: float | int | str) -> None:
+        """``n`` steps are done; ``fields`` are the numbers worth watching."""
+        ...
+
+
+def main(
+    config_class: type[_Config],
+    run: Callable[[_Config], None],
+    *,
+    name: str,
+    args: Sequence[str] | None = None,
+) -> None:
+    """Parses the arguments, calls ``run`` and turns its failures into exit statuses.
+
+    Args:
+        config_class: frozen dataclass; its docstring is the command's description and
+            the docstring under each field the option's help.
+        run: does the work; raises ``UserError`` for what a user can mend.
+        name: such as ``train.easi``.
+        args: arguments in place of ``sys.argv``, for tests.
+
+    Raises:
+        SystemExit: 2 for a mistake in arguments, files or values, 130 when
+            interrupted.
+    """
+    import tyro
+
+    config = tyro.cli(config_class, prog=f"python -m {name}", args=args)
+    try:
+        from easi_jax.errors import UserError
+
+        try:
+            with _terminate_as_interrupt():
+                run(config)
+        except UserError as error:
+            _stop(f"error: {' '.join(str(error).split())}", USER_ERROR)
+    except KeyboardInterrupt:
+        _stop(_interrupted(getattr(config, "out", None)), INTERRUPTED)
+    except BrokenPipeError:
+        # The reader of our output has gone, as in `... | head`.
+        sys.stderr.close()
+        raise SystemExit(1) from None
+
+
+def show_table(
+    title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]
+) -> None:
+    """Prints a result table; columns of numbers are right-aligned."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table()
+    cells = [[_text(cell) for cell in row] for row in rows]
+    for index, column in enumerate(columns):
+        numeric = all(_NUMBER.match(row[index]) for row in cells)
+        table.add_column(Text(column), justify="right" if numeric else "left")
+    for row in cells:
+        table.add_row(*map(Text, row))
+    console = _console(sys.stdout)
+    console.print(Text(title, "bold"))
+    console.print(table)
+
+
+def say(message: str) -> None:
+    """Prints one line of result, as it is."""
+    _console(sys.stdout).print(message, markup=False, highlight=False, soft_wrap=True)
+
+
+@contextlib.contextmanager
+def progress(name: str, total: int, done: int = 0) -> Iterator[Progress]:
+    """Shows how far ``name`` is, its rate and the time left, on standard error.
+
+    Args:
+        name: of the stage, such as ``search``.
+        total: steps in all.
+        done: steps that an earlier process did.
+    """
+    meter = Meter(total, done)
+    if sys.stderr.isatty():
+        with _bar(name, meter) as shown:
+            yield shown
+    else:
+        yield _Log(name, meter)
+
+
+class Meter:
+    """Rate and time left; the first chunk, which compiles, is left out of both."""
+
+    def __init__(
+        self, total: int, done: int = 0, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.total = total
+        self.done = done
+        self._clock = clock
+        self._begin = clock()
+        self._first: tuple[int, float] | None = None
+        self._last = self._begin
+
+    def advance(self, n: int) -> None:
+        """``n`` further steps are done."""
+        self.done += n
+        self._last = self._clock()
+        if self._first is None:
+            self._first = (self.done, self._last)
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the start."""
+        return self._clock() - self._begin
+
+    @property
+    def rate(self) -> float | None:
+        """Steps per second since the first chunk; None before there are any."""
+        if self._first is None or self._last <= self._first[1]:
+            return None
+        return (self.done - self._first[0]) / (self._last - self._first[1])
+
+    @property
+    def left(self) -> float | None:
+        """Seconds left at this rate; None while it is unknown."""
+        if not self.rate:
+            return None
+        since = self._clock() - self._last
+        return max(0.0, (self.total - self.done) / self.rate - since)
+
+    def summary(self) -> str:
+        """Such as ``20/50  3.1/s  0:10 left``."""
+        count = f"{self.done}/{self.total}"
+        if self.done >= self.total:
+            return f"{count}  {duration(self.elapsed)} in all"
+        if self.rate is None or self.left is None:
+            return f"{count}  {duration(self.elapsed)} so far"
+        return f"{count}  {self.rate:.3g}/s  {duration(self.left)} left"
+
+
+def duration(seconds: float) -> str:
+    """``0:07``, ``12:30`` or ``1:02:03``."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+class _Log:
+    def __init__(self, name: str, meter: Meter) -> None:
+        self._name = name
+        self._meter = meter
+        self._last = -float("inf")
+
+    def advance(self, n: int = 1, **fields: float | int | str) -> None:
+        self._meter.advance(n)
+        due = self._meter.elapsed - self._last >= LOG_SECONDS
+        if due or self._meter.done >= self._meter.total:
+            self._last = self._meter.elapsed
+            line = f"{self._name}  {self._meter.summary()}  {_fields(fields)}"
+            print(line.rstrip(), file=sys.stderr, flush=True)
+
+
+@contextlib.contextmanager
+def _bar(name: str, meter: Meter) -> Iterator[Progress]:
+    from rich.progress import BarColumn, ProgressColumn, Task, TextColumn
+    from rich.progress import Progress as Bar
+    from rich.table import Column
+    from rich.text import Text
+
+    class Summary(ProgressColumn):
+        def render(self, task: Task) -> Text:
+            return Text(meter.summary())
+
+    line = Column(no_wrap=True)
+    rest = Column(no_wrap=True, overflow="ellipsis", ratio=1)
+    bar = Bar(
+        TextColumn("{task.description}", markup=False, table_column=line),
+        BarColumn(bar_width=24),
+        Summary(table_column=line),
+        TextColumn(
+            "{task.fields[values]}", style="dim", markup=False, table_column=rest
+        ),
+        console=_console(sys.stderr),
+        refresh_per_second=4,
+        expand=True,
+    )
+    task = bar.add_task(name, total=meter.total, completed=meter.done, values="")
+
+    class Shown:
+        def advance(self, n: int = 1, **fields: float | int | str) -> None:
+            meter.advance(n)
+            bar.update(task, advance=n, values=_fields(fields))
+
+    with bar:
+        yield Shown()
+
+
+def _console(stream: Any) -> Any:
+    from rich.console import Console
+
+    # A pipe or a file has no width; 80 columns would fold the tables.
+    return Console(file=stream, width=None if stream.isatty() else 120)
+
+
+def _fields(fields: dict[str, float | int | str]) -> str:
+    return "  ".join(f"{k.replace('_', ' ')} {_text(v)}" for k, v in fields.items())
+
+
+def _text(value: object) -> str:
+    if hasattr(value, "item"):
+        value = value.item()  # type: ignore[attr-defined]
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _interrupted(out: Path | str | None) -> str:
+    if out is None:
+        return "interrupted"
+    kept = any(Path(out).glob("checkpoints/**/step_*"))
+    if kept:
+        return (
+            f"interrupted; {out} keeps all up to the last checkpoint: the same "
+            "command with --resume goes on from there"
+        )
+    return f"interrupted before the first checkpoint; nothing to resume in {out}"
+
+
+@contextlib.contextmanager
+def _terminate_as_interrupt() -> Iterator[None]:
+    """A cluster's SIGTERM ends a run as tidily as Ctrl-C does."""
+
+    def stop(number: int, frame: FrameType | None) -> NoReturn:
+        raise KeyboardInterrupt
+
+    old = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, old)
+
+
+def _stop(message: str, status: int) -> NoReturn:
+    print(message, file=sys.stderr)
+    raise SystemExit(status)

@@ -1,0 +1,84 @@
+"""``python -m train.info``: versions, devices, and what protects this run."""
+
+import contextlib
+import dataclasses
+import io
+
+from train._command import main, show_table
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Shows versions, devices and whether each runtime measure is in force."""
+
+
+def run(config: Config) -> None:
+    """Prints the three tables."""
+    printed = _import_output()
+    from easi_jax import runtime
+    from easi_jax.io.versions import versions
+
+    found = versions()
+    packages = {k: v or "not installed" for k, v in found["packages"].items()}
+    rows = [
+        ("easi-jax", found["easi-jax"]),
+        ("commit", found["commit"] or "not a checkout"),
+        ("python", found["python"]),
+        ("system", found["system"]),
+        *packages.items(),
+    ]
+    show_table("Versions", ("package", "version"), rows)
+    state = runtime.status()
+    devices = [
+        ("platform", state["platform"]),
+        ("kind", state["device_kind"]),
+        ("devices", state["devices"]),
+        ("CPU cores", state["cores"]),
+    ]
+    show_table("Devices", ("", "found"), devices)
+    show_table(
+        "Runtime measures", ("measure", "in force", "detail"), measures(state, printed)
+    )
+
+
+def measures(state: dict[str, object], printed: str) -> list[tuple[str, str, str]]:
+    """Name, yes or no, and detail of each measure of ``easi_jax.runtime``.
+
+    Args:
+        state: of ``runtime.status()``.
+        printed: what importing ``easi_jax`` printed.
+    """
+    cache = state["compilation_cache"]
+    precision = state["matmul_precision"]
+    late = "" if state["prepared_before_backend"] else "jax started before easi_jax"
+    pool = f"NPROC={state['nproc']}, {state['cores']} cores"
+    return [
+        ("set before jax starts", _yes(not late), late or "nothing was too late"),
+        ("deadlock cure", _yes(state["deadlock_cure"]), pool),
+        (
+            "one device per core",
+            _yes(state["one_device_per_core"]),
+            f"{state['devices']} {state['platform']} devices",
+        ),
+        ("compilation cache", _yes(cache), str(cache or "no folder can be written")),
+        (
+            "full float32 products",
+            _yes(precision in ("highest", "float32")),
+            f"jax_default_matmul_precision={precision}",
+        ),
+        ("quiet imports", _yes(not printed), printed[:60] or "nothing printed"),
+    ]
+
+
+def _yes(value: object) -> str:
+    return "yes" if value else "NO"
+
+
+def _import_output() -> str:
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        import easi_jax  # noqa: F401
+    return " ".join(out.getvalue().split())
+
+
+if __name__ == "__main__":
+    main(Config, run, name="train.info")
