@@ -1,0 +1,147 @@
+"""The columns that a model gives a log, and their check."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+
+from easi_jax.errors import UserError, nearest
+
+_COORDINATES = {
+    mujoco.mjtJoint.mjJNT_FREE: (7, 6),
+    mujoco.mjtJoint.mjJNT_BALL: (4, 3),
+    mujoco.mjtJoint.mjJNT_SLIDE: (1, 1),
+    mujoco.mjtJoint.mjJNT_HINGE: (1, 1),
+}
+_CHECKED = ("qpos.", "qvel.", "ctrl.")
+_LISTED = 5
+
+
+@dataclass(frozen=True)
+class LogColumns:
+    """Column names of a model.
+
+    Attributes:
+        qpos: in the order of ``qpos``, ``nq`` names.
+        qvel: in the order of ``qvel``, ``nv`` names.
+        ctrl: in the order of ``ctrl``, ``nu`` names.
+        joints: each joint's velocity columns (all of them or none are given).
+        sensors: each named sensor's columns.
+    """
+
+    qpos: tuple[str, ...]
+    qvel: tuple[str, ...]
+    ctrl: tuple[str, ...]
+    joints: tuple[tuple[str, ...], ...]
+    sensors: Mapping[str, tuple[str, ...]]
+
+    @property
+    def known(self) -> tuple[str, ...]:
+        """Every name that has a meaning."""
+        sensors = (name for names in self.sensors.values() for name in names)
+        return ("time", "run", *self.qpos, *self.qvel, *self.ctrl, *sensors)
+
+
+def log_columns(model: mujoco.MjModel) -> LogColumns:
+    """The columns of ``model``'s logs.
+
+    Raises:
+        UserError: a joint or actuator without a name, names that make two columns
+            one, or a model without joints.
+    """
+    qpos: list[str] = []
+    joints: list[tuple[str, ...]] = []
+    for i in range(model.njnt):
+        joint = model.joint(i)
+        if not joint.name:
+            body = model.body(int(model.jnt_bodyid[i])).name
+            raise UserError(
+                f'the model\'s joint {i} (in body "{body}") has no name; '
+                "logs find joints by name"
+            )
+        size, dofs = _COORDINATES[mujoco.mjtJoint(int(model.jnt_type[i]))]
+        qpos += _numbered(f"qpos.{joint.name}", size)
+        joints.append(_numbered(f"qvel.{joint.name}", dofs))
+    if not qpos:
+        raise UserError("the model has no joint: there is nothing to log")
+    ctrl: list[str] = []
+    for i in range(model.nu):
+        name = model.actuator(i).name
+        if not name:
+            raise UserError(
+                f"the model's actuator {i} has no name; logs find actuators by name"
+            )
+        ctrl.append(f"ctrl.{name}")
+    sensors = {
+        model.sensor(i).name: _numbered(
+            f"sensor.{model.sensor(i).name}", int(model.sensor_dim[i])
+        )
+        for i in range(model.nsensor)
+        if model.sensor(i).name
+    }
+    columns = LogColumns(
+        qpos=tuple(qpos),
+        qvel=tuple(name for names in joints for name in names),
+        ctrl=tuple(ctrl),
+        joints=tuple(joints),
+        sensors=sensors,
+    )
+    for name, count in Counter(columns.known).items():
+        if count > 1:
+            raise UserError(
+                f'two parts of the model share the log column "{name}"; rename one'
+            )
+    return columns
+
+
+def check_columns(
+    path: Path, names: Mapping[str, object], columns: LogColumns
+) -> list[str]:
+    """Checks a file's column names against the model's.
+
+    Returns:
+        Names that are ignored, in the file's order.
+
+    Raises:
+        UserError: a column that the model needs is missing, or a position,
+            velocity or command has a name that the model does not know.
+    """
+    missing = [
+        name for name in ("time", *columns.qpos, *columns.ctrl) if name not in names
+    ]
+    if missing:
+        known = set(columns.known)
+        strangers = [name for name in names if name not in known]
+        first = f'"{missing[0]}"'
+        others = ", ".join(f'"{name}"' for name in missing[1:_LISTED])
+        more = f" (also missing: {others}" if others else ""
+        if more and len(missing) > _LISTED:
+            more += f" and {len(missing) - _LISTED} more"
+        raise UserError(
+            f"{path}: no column {first}, which the model needs"
+            f"{nearest(missing[0], strangers)}{more + ')' if more else ''}"
+        )
+    ignored = [name for name in names if name not in columns.known]
+    for name in ignored:
+        if name.startswith(_CHECKED):
+            raise UserError(
+                f'{path}: the model has nothing for column "{name}"'
+                f"{nearest(name, columns.known)}"
+            )
+    for group in columns.joints:
+        given = [name for name in group if name in names]
+        if given and len(given) < len(group):
+            lacking = next(name for name in group if name not in names)
+            raise UserError(
+                f'{path}: column "{given[0]}" needs "{lacking}" beside it; '
+                "give all velocities of a joint or none"
+            )
+    return ignored
+
+
+def _numbered(name: str, size: int) -> tuple[str, ...]:
+    if size == 1:
+        return (name,)
+    return tuple(f"{name}.{i}" for i in range(size))

@@ -1,0 +1,266 @@
+"""Tables of named columns from CSV, NPZ and Parquet files, and back."""
+
+import csv
+import io
+import os
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+
+from easi_jax.errors import UserError
+from easi_jax.io.files import atomic_write
+
+EXTENSIONS = (".csv", ".npz", ".parquet")
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """The columns of one file, converted when asked for.
+
+    Attributes:
+        path: the file.
+        columns: by name: cells of a CSV, a 1-D array, or (a ``str``) why the
+            column cannot be used.
+    """
+
+    path: Path
+    columns: Mapping[str, list[str] | np.ndarray | str]
+
+    def rows(self, name: str) -> int:
+        """Number of rows of column ``name``."""
+        return len(self._column(name))
+
+    def numbers(self, name: str) -> np.ndarray:
+        """Column ``name`` as float64, ``(rows,)``; an empty cell is NaN.
+
+        Raises:
+            UserError: the column holds text or has no plain rows.
+        """
+        column = self._column(name)
+        if isinstance(column, np.ndarray) and column.dtype.kind in "biuf":
+            return column.astype(np.float64)
+        values = np.empty(len(column))
+        for i, cell in enumerate(column):
+            try:
+                values[i] = float(cell) if cell.strip() else np.nan
+            except ValueError:
+                hint = '; use "." as decimal point' if "," in cell else ""
+                raise UserError(
+                    f'{self.path}: row {i + 1}, column "{name}" holds "{cell[:40]}" '
+                    f"instead of a number{hint}"
+                ) from None
+        return values
+
+    def labels(self, name: str) -> np.ndarray:
+        """Column ``name`` as text, ``(rows,)``; whole numbers without a point."""
+        column = self._column(name)
+        if isinstance(column, np.ndarray) and column.dtype.kind == "f":
+            texts = [str(int(x)) if x == np.floor(x) else str(x) for x in column]
+        else:
+            texts = [str(cell).strip() for cell in column]
+        missing = [i + 1 for i, text in enumerate(texts) if text in ("", "nan")]
+        if missing:
+            raise UserError(
+                f'{self.path}: row {missing[0]} has no value in column "{name}"'
+            )
+        return np.array(texts)
+
+    def _column(self, name: str) -> list[str] | np.ndarray:
+        column = self.columns[name]
+        if isinstance(column, str):
+            raise UserError(
+                f'{self.path}: column "{name}" holds {column}; '
+                "a log has one number per row and column"
+            )
+        return column
+
+
+def read_table(path: str | os.PathLike[str]) -> Table:
+    """Reads a CSV, NPZ or Parquet file, told apart by the extension.
+
+    Nothing is ever unpickled.
+
+    Raises:
+        UserError: no such file, another extension, empty, unreadable, cut short,
+            not UTF-8, or two columns of one name.
+    """
+    path = Path(path)
+    extension = path.suffix.lower()
+    if path.is_dir():
+        raise UserError(f"{path} is a folder; give the log files in it")
+    if extension not in EXTENSIONS:
+        raise UserError(f"{path}: a log ends in {', '.join(EXTENSIONS)}")
+    try:
+        if path.stat().st_size == 0:
+            raise UserError(f"{path} is empty")
+        if extension == ".csv":
+            return Table(path, _read_csv(path))
+        if extension == ".npz":
+            return Table(path, _read_npz(path))
+        return Table(path, _read_parquet(path))
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    except OSError as error:
+        reason = error.strerror or str(error).splitlines()[0]
+        raise UserError(f"{path}: cannot be read ({reason})") from None
+
+
+def write_table(
+    path: str | os.PathLike[str],
+    columns: Mapping[str, np.ndarray],
+    digits: int | None = None,
+) -> None:
+    """Writes 1-D columns of one length; the file appears whole or not at all.
+
+    Args:
+        path: ends in ``.csv``, ``.npz`` or ``.parquet``.
+        columns: by name, numbers or text.
+        digits: significant digits of a CSV; None for all that round-trip.
+
+    Raises:
+        UserError: another extension, or a place that cannot be written.
+    """
+    path = Path(path)
+    extension = path.suffix.lower()
+    if extension not in EXTENSIONS:
+        raise UserError(f"{path}: a log ends in {', '.join(EXTENSIONS)}")
+    if extension == ".csv":
+        atomic_write(path, _csv_text(columns, digits))
+        return
+    buffer = io.BytesIO()
+    if extension == ".npz":
+        # entry by entry, since savez refuses a column named "file"
+        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, array in columns.items():
+                with archive.open(f"{name}.npy", "w") as entry:
+                    np.lib.format.write_array(entry, array, allow_pickle=False)
+    else:
+        pyarrow.parquet.write_table(pyarrow.table(dict(columns)), buffer)
+    atomic_write(path, buffer.getvalue())
+
+
+def _csv_text(columns: Mapping[str, np.ndarray], digits: int | None) -> str:
+    def cells(column: np.ndarray) -> list[str]:
+        if column.dtype.kind != "f" or digits is None:
+            return [str(x) for x in column.tolist()]
+        return [f"{x:.{digits}g}" for x in column.tolist()]
+
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(cells(c) for c in columns.values()), strict=True))
+    return text.getvalue()
+
+
+def _read_csv(path: Path) -> dict[str, list[str] | np.ndarray | str]:
+    rows: list[list[str]] = []
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            start = file.readline()
+            file.seek(0)
+            rows = [row for row in csv.reader(file, delimiter=_delimiter(start)) if row]
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: not UTF-8 text; save it as UTF-8 CSV") from None
+    except csv.Error as error:
+        raise UserError(f"{path}: not a CSV file ({error})") from None
+    if not rows:
+        raise UserError(f"{path} is empty")
+    header = [name.strip() for name in rows.pop(0)]
+    if all(_is_number(name) for name in header):
+        raise UserError(f"{path}: the first row must name the columns")
+    _refuse_duplicates(path, header)
+    for i, row in enumerate(rows):
+        if len(row) != len(header):
+            cut = "; is the file cut short?" if i + 1 == len(rows) else ""
+            raise UserError(
+                f"{path}: row {i + 1} has {len(row)} cells "
+                f"where the header has {len(header)}{cut}"
+            )
+    return {name: [row[i] for row in rows] for i, name in enumerate(header)}
+
+
+def _read_npz(path: Path) -> dict[str, list[str] | np.ndarray | str]:
+    broken = UserError(f"{path}: not an NPZ file, damaged or cut short")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            if not isinstance(archive, np.lib.npyio.NpzFile):
+                raise broken
+            _refuse_duplicates(path, archive.files)
+            return {name: _npz_column(archive, name) for name in archive.files}
+    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, AttributeError):
+        raise broken from None
+
+
+def _npz_column(archive: np.lib.npyio.NpzFile, name: str) -> np.ndarray | str:
+    try:
+        array = archive[name]
+    except ValueError as error:
+        if "allow_pickle" in str(error):
+            return "pickled objects"
+        raise
+    if not isinstance(array, np.ndarray):
+        return "something that is no array"
+    if array.ndim != 1:
+        return f"a {array.ndim}-dimensional array"
+    if array.dtype.kind not in "biufU":
+        return f"values of type {array.dtype}"
+    return array
+
+
+def _read_parquet(path: Path) -> dict[str, list[str] | np.ndarray | str]:
+    try:
+        with pyarrow.parquet.ParquetFile(path) as file:
+            _refuse_duplicates(path, file.schema_arrow.names)
+            table = file.read()
+    except (pyarrow.ArrowException, OSError) as error:
+        if isinstance(error, OSError) and error.errno:
+            raise
+        raise UserError(f"{path}: not a Parquet file, damaged or cut short") from None
+    return {
+        name: _parquet_column(column)
+        for name, column in zip(table.column_names, table.columns, strict=True)
+    }
+
+
+def _parquet_column(column: pyarrow.ChunkedArray) -> np.ndarray | str:
+    kind = column.type
+    types = pyarrow.types
+    if types.is_dictionary(kind):
+        kind = kind.value_type
+        column = column.cast(kind)
+    if types.is_string(kind) or types.is_large_string(kind):
+        return np.array([text or "" for text in column.to_pylist()], dtype=np.str_)
+    if types.is_boolean(kind) or types.is_null(kind):
+        column = column.cast(pyarrow.int8())
+    elif not (types.is_integer(kind) or types.is_floating(kind)):
+        return f"values of type {kind}"
+    return column.cast(pyarrow.float64(), safe=False).to_numpy()
+
+
+def _delimiter(header: str) -> str:
+    if "," not in header:
+        for other in (";", "\t"):
+            if other in header:
+                return other
+    return ","
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _refuse_duplicates(path: Path, names: list[str]) -> None:
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise UserError(f'{path}: column "{twice[0]}" is there more than once')
