@@ -1,0 +1,137 @@
+"""One style for all figures, in colors that all eyes tell apart.
+
+The colors are Okabe and Ito's ("Color Universal Design", 2008), which people with any
+of the common color vision deficiencies can tell apart.
+"""
+
+import io
+import math
+import re
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
+
+INK = "#24292f"
+FAINT = "#6e7781"
+GRID = "#d8dee4"
+BLUE, VERMILION, GREEN, PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
+SKY, ORANGE = "#56b4e9", "#e69f00"
+SERIES = (BLUE, VERMILION, GREEN, PURPLE, SKY, ORANGE)
+
+_P = ParamSpec("_P")
+ROUND = (1, 2, 5, 10)
+DASHED: Any = {"color": INK, "lw": 1.2, "ls": (0, (4, 2.5))}
+_WIDTH = 9.0  # inches; the report's text column
+_STYLE: Any = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "easi-jax",
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.titlecolor": INK,
+    "axes.labelcolor": FAINT,
+    "axes.edgecolor": FAINT,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "axes.formatter.limits": (-3, 4),
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "xtick.color": FAINT,
+    "ytick.color": FAINT,
+    "text.color": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 9.0,
+    "lines.solid_capstyle": "round",
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+}
+
+
+def styled(draw: Callable[_P, str]) -> Callable[_P, str]:
+    """A figure function that draws in this style and leaves the global one alone."""
+
+    @wraps(draw)
+    def styled(*args: _P.args, **kwargs: _P.kwargs) -> str:
+        with matplotlib.rc_context(_STYLE):
+            return draw(*args, **kwargs)
+
+    return styled
+
+
+def grid(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure with ``count`` axes; ``height`` of a row in inches."""
+    rows = math.ceil(count / columns)
+    figure = Figure(figsize=(_WIDTH, height * rows + 0.3), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
+    for spare in axes[count:]:
+        spare.remove()
+    return figure, axes[:count]
+
+
+def fit(axis: Axes, values: np.ndarray, log: bool) -> None:
+    """Limits and ticks that hold all finite values (on a log axis: the positive)."""
+    values = values[np.isfinite(values) & ((values > 0) | (not log))]
+    if not values.size:
+        return
+    low, high = values.min(), values.max()
+    if not log:
+        margin = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
+        axis.set_ylim(low - margin, high + margin)
+        axis.yaxis.set_major_locator(MaxNLocator(4, steps=ROUND))
+        return
+    factor = max((high / low) ** 0.06, 1.02)
+    axis.set_yscale("log")
+    axis.set_ylim(low / factor, high * factor)
+    axis.yaxis.set_major_locator(FixedLocator(_log_ticks(low / factor, high * factor)))
+    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+    axis.yaxis.set_minor_locator(NullLocator())
+
+
+def _log_ticks(low: float, high: float) -> list[float]:
+    """Three or so ticks between, round numbers wherever there are enough."""
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    found: list[float] = []
+    for digits in ((1,), (1, 3), (1, 2, 5), (1, 1.5, 2, 3, 5, 7)):
+        ticks = [digit * 10.0**decade for decade in decades for digit in digits]
+        found = [tick for tick in ticks if low <= tick <= high]
+        if len(found) >= 3:
+            return found[:: math.ceil(len(found) / 5)]
+    return found if len(found) == 2 else np.linspace(low, high, 5)[1:-1:2].tolist()
+
+
+def legend_above(figure: Figure, handles: list[Any]) -> None:
+    """One legend for all axes, in a row at the top left."""
+    figure.legend(
+        handles=handles, loc="outside upper left", ncols=len(handles), borderpad=0
+    )
+
+
+def dash(index: int) -> Any:
+    """Line style of the curve ``index``, so that color is not all that differs."""
+    return ("-", (0, (6, 1.5)), (0, (1.5, 1.2)), (0, (6, 1.2, 1.2, 1.2)))[index % 4]
+
+
+def with_unit(name: str, unit: str) -> str:
+    """``name [unit]``, safe from matplotlib's mathematics."""
+    label = f"{name} [{unit}]" if unit else name
+    return label.replace("$", r"\$")
+
+
+def svg(figure: Figure) -> str:
+    """SVG text, the same for the same figure: no date, no random names."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    # matplotlib's metadata name addresses on the network.
+    return re.sub(r"\s*<metadata>.*?</metadata>", "", buffer.getvalue(), flags=re.S)
