@@ -181,24 +181,25 @@ def prediction_errors(
         values = [float(np.asarray(row)[i]) for row in errors.values()]
         places = np.arange(len(values))
         colors = [SERIES[k % len(SERIES)] for k in places]
-        axis.barh(places, values, height=0.62, color=colors)
+        finite = [v if math.isfinite(v) else 0.0 for v in values]
+        axis.barh(places, finite, height=0.62, color=colors)
         for place, value in zip(places, values, strict=True):
             axis.annotate(
-                f"{value:.3g}",
-                (value, place),
+                f"{value:.3g}" if math.isfinite(value) else "not finite",
+                (value if math.isfinite(value) else 0.0, place),
                 xytext=(4, 0),
                 textcoords="offset points",
                 va="center",
                 fontsize=8.5,
             )
         if floor is not None:
-            axis.axvline(float(np.asarray(floor)[i]), **DASHED)
+            finite.append(float(np.asarray(floor)[i]))
+            axis.axvline(finite[-1], **DASHED)
         first = i % columns == 0
         axis.set_yticks(places, list(errors) if first else [""] * len(values))
         axis.tick_params(axis="y", length=0, labelcolor=INK)
         axis.invert_yaxis()
-        finite = [v for v in values if math.isfinite(v)]
-        axis.set_xlim(0, 1.25 * max(finite, default=1.0) or 1.0)
+        axis.set_xlim(0, 1.25 * max(finite, default=0.0) or 1.0)
         axis.xaxis.set_major_locator(MaxNLocator(3, steps=ROUND))
         axis.grid(False, axis="y")
         axis.set_title(with_unit(channels[i], units[i]))

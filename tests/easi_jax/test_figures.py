@@ -81,7 +81,7 @@ def test_prediction_errors_write_each_value():
     )
     texts = [text.strip() for text in _texts(svg)]
     assert {"nominal", "identified", "x [m]", "theta [rad]"} <= set(texts)
-    assert {"0.5", "0.125", "20", "noise floor"} <= set(texts)
+    assert {"0.5", "0.125", "20", "not finite", "noise floor"} <= set(texts)
 
 
 def test_same_data_give_the_same_text_and_global_style_is_left_alone():
