@@ -1,8 +1,6 @@
 """What can be wrong with the values of a log."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -17,24 +15,6 @@ _FEWEST_STEPS, _FEW_STEPS = 0.01, 0.2
 _ZERO_NORM = 1e-6
 _NORM_OFF = 0.05
 _TURNS = 4
-
-
-class Rows(NamedTuple):
-    """Rows of a file, or of a part of it: T rows, NaN where a column is missing."""
-
-    time: np.ndarray
-    label: np.ndarray
-    qpos: np.ndarray
-    qvel: np.ndarray
-    ctrl: np.ndarray
-    sensors: Mapping[str, np.ndarray]
-
-    def take(self, rows: np.ndarray) -> "Rows":
-        """The given rows, in the given order."""
-        return Rows(
-            *(part[rows] for part in self[:5]),
-            sensors={name: values[rows] for name, values in self.sensors.items()},
-        )
 
 
 def check_sizes(
@@ -90,7 +70,11 @@ def rate(path: Path, dt: float, timestep: float) -> str:
 
 
 def normalized(
-    path: Path, model: mujoco.MjModel, qpos: np.ndarray, good: np.ndarray
+    path: Path,
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    label: np.ndarray,
+    good: np.ndarray,
 ) -> tuple[np.ndarray, list[str]]:
     """Brings quaternions to length one and one sign, and unrolls wrapped hinges.
 
@@ -98,6 +82,7 @@ def normalized(
         path: the file, for messages.
         model: the machine.
         qpos: ``(T, nq)``.
+        label: recording of each row, ``(T,)``.
         good: rows that are used, ``(T,)`` bool; the others are left alone.
 
     Returns:
@@ -113,9 +98,9 @@ def normalized(
         kind, start = model.jnt_type[i], int(model.jnt_qposadr[i])
         name = model.joint(i).name
         if kind == mujoco.mjtJoint.mjJNT_HINGE and not model.jnt_limited[i]:
-            unrolled = np.unwrap(qpos[rows, start])
-            if not np.array_equal(unrolled, qpos[rows, start]):
-                qpos[rows, start] = unrolled
+            turns = _wraps(qpos[rows, start], label[rows])
+            if turns.any():
+                qpos[rows, start] -= 2 * np.pi * turns
                 notes.append(f"joint {name}: jumps by a whole turn were unrolled")
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             start += 3
@@ -140,6 +125,17 @@ def normalized(
         sign = np.cumprod(np.concatenate([[1.0], np.where(turned, -1.0, 1.0)]))
         qpos[rows, start : start + 4] = quaternion * sign[: len(rows), None]
     return qpos, notes
+
+
+def _wraps(values: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """Whole turns by which each row has jumped since its recording began."""
+    turns = np.zeros(len(values))
+    for name in set(label.tolist()):
+        rows = np.flatnonzero(label == name)
+        step = np.diff(values[rows])
+        jump = np.sign(step) * (np.abs(np.abs(step) - 2 * np.pi) < np.pi / 2)
+        turns[rows[1:]] = np.cumsum(jump)
+    return turns
 
 
 def ranges(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray) -> list[str]:

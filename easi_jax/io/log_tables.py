@@ -189,7 +189,9 @@ def _read_csv(path: Path) -> dict[str, list[str] | np.ndarray | str]:
 def _read_npz(path: Path) -> dict[str, list[str] | np.ndarray | str]:
     broken = UserError(f"{path}: not an NPZ file, damaged or cut short")
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        # opened here, since numpy leaves a file that it cannot read open
+        with path.open("rb") as file:
+            archive = np.load(file, allow_pickle=False)
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise broken
             _refuse_duplicates(path, archive.files)

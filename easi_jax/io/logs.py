@@ -15,6 +15,7 @@ from easi_jax.errors import UserError
 from easi_jax.io import log_checks
 from easi_jax.io.log_columns import LogColumns, check_columns, log_columns
 from easi_jax.io.log_mapping import LogMapping, read_mapping
+from easi_jax.io.log_rows import EVEN, Rows, is_even, resampled
 from easi_jax.io.log_tables import Table, read_table, write_table
 from easi_jax.recording import Log, Run
 from easi_jax.windows import fitted_velocity
@@ -22,10 +23,6 @@ from easi_jax.windows import fitted_velocity
 PathLike = str | os.PathLike[str]
 
 HOLE_STEPS = 3.0
-# Rows nearer than this share of a step to an even grid are taken as they are:
-# interpolating them would smooth noise here and not there.
-_EVEN = 0.01
-_RATE_AGREES = 1e-4
 
 
 def read_logs(
@@ -160,7 +157,9 @@ class _Reader:
                 f"{np.sum(~good)} of {len(good)} rows dropped for a non-finite time, "
                 f"position or command (the first is row {first})"
             )
-        qpos, notes = log_checks.normalized(self.path, self.model, raw.qpos, good)
+        qpos, notes = log_checks.normalized(
+            self.path, self.model, raw.qpos, raw.label, good
+        )
         raw = raw._replace(qpos=qpos)
         for text in (
             *notes,
@@ -186,7 +185,7 @@ class _Reader:
             self.note(f"velocities estimated from positions: {', '.join(estimated)}")
         return runs
 
-    def _arrays(self, table: Table) -> log_checks.Rows:
+    def _arrays(self, table: Table) -> Rows:
         rows = table.rows("time")
 
         def column(name: str) -> np.ndarray:
@@ -219,7 +218,7 @@ class _Reader:
                 sensors[name] = block(names)
             elif given:
                 self.note(f"sensor {name} ignored: it has {len(names)} columns")
-        return log_checks.Rows(
+        return Rows(
             time=column("time"),
             label=label,
             qpos=block(self.columns.qpos),
@@ -229,7 +228,7 @@ class _Reader:
         )
 
     def _recording(
-        self, name: str, raw: log_checks.Rows, rows: np.ndarray, good: np.ndarray
+        self, name: str, raw: Rows, rows: np.ndarray, good: np.ndarray
     ) -> list[Run]:
         """The runs of one recording: ``rows`` of the file, ``good`` the usable."""
         timed = rows[np.isfinite(raw.time[rows])]
@@ -245,24 +244,25 @@ class _Reader:
                 f"({raw.time[a]:.9g} s) to row {b + 1} ({raw.time[b]:.9g} s); several "
                 'recordings in one file need a "run" column'
             )
-        dt = float(np.median(gaps))
+        # nine digits: equal rates stay equal under the rounding of time stamps
+        dt = float(f"{np.median(gaps):.9g}")
         rate_note = log_checks.rate(self.path, dt, self.model.opt.timestep)
         if rate_note:
             self.note(rate_note)
         # a piece ends before every row that cannot follow the one before it
         time = raw.time[rows]
         with np.errstate(invalid="ignore"):
-            follows = np.diff(time) <= dt * (HOLE_STEPS + _EVEN)
+            follows = np.diff(time) <= dt * (HOLE_STEPS + EVEN)
         follows &= good[1:] & good[:-1]
         pieces = np.split(np.arange(len(rows)), np.flatnonzero(~follows) + 1)
         pieces = [piece for piece in pieces if good[piece[0]]]
         holes = int(np.sum(good[1:] & good[:-1] & ~follows))
         if holes:
-            self.note(f"{name}: {holes} holes of more than {HOLE_STEPS:.0f} steps")
+            self.note(f"{name}: holes longer than {HOLE_STEPS:.0f} steps: {holes}")
         runs: list[Run] = []
         single = sum(len(piece) < 2 for piece in pieces)
         if single:
-            self.note(f"{name}: {single} rows left out, alone between holes")
+            self.note(f"{name}: rows left out because alone between holes: {single}")
         for piece in pieces:
             if len(piece) >= 2:
                 suffix = f"#{len(runs) + 1}" if len(pieces) - single > 1 else ""
@@ -271,18 +271,14 @@ class _Reader:
             self.note(f"{name} split into {len(runs)} runs")
         return runs
 
-    def _run(self, name: str, rows: log_checks.Rows, dt: float) -> Run:
-        count = len(rows.time)
-        mean = (rows.time[-1] - rows.time[0]) / (count - 1)
-        off = rows.time - rows.time[0] - mean * np.arange(count)
-        even = np.abs(off).max() <= _EVEN * dt and abs(mean / dt - 1) <= _RATE_AGREES
-        if not even:
+    def _run(self, name: str, rows: Rows, dt: float) -> Run:
+        if not is_even(rows.time, dt):
             worst = np.abs(np.diff(rows.time) / dt - 1).max()
             self.note(
                 f"{name}: time steps differ from the control step of {dt:.6g} s by up "
                 f"to {100 * worst:.0f} %; brought to it by interpolation"
             )
-            rows = self._resampled(rows, dt)
+            rows = resampled(rows, dt, self.configuration)
         fitted = fitted_velocity(rows.qpos, dt, self.configuration)
         given = np.isfinite(rows.qvel)
         columns_given = given.any(0)
@@ -300,31 +296,6 @@ class _Reader:
             ctrl=rows.ctrl,
             configuration=self.configuration,
             sensors=rows.sensors,
-        )
-
-    def _resampled(self, rows: log_checks.Rows, dt: float) -> "log_checks.Rows":
-        """``rows`` at multiples of ``dt`` from the first row's time."""
-        span = rows.time[-1] - rows.time[0]
-        time = rows.time[0] + dt * np.arange(int(span / dt + _EVEN) + 1)
-        held = np.searchsorted(rows.time, time + _EVEN * dt, side="right") - 1
-        before = np.minimum(held, len(rows.time) - 2)
-        share = (time - rows.time[before]) / np.diff(rows.time)[before]
-        share = np.clip(share, 0.0, 1.0)[:, None]
-
-        def between(values: np.ndarray) -> np.ndarray:
-            a, b = values[before], values[before + 1]
-            nearest = np.where(share < 0.5, a, b)
-            both = np.isfinite(a) & np.isfinite(b)
-            return np.where(both, a + share * (b - a), nearest)
-
-        turn = self.configuration.difference(rows.qpos[before], rows.qpos[before + 1])
-        return log_checks.Rows(
-            time=time,
-            label=rows.label[held],
-            qpos=self.configuration.integrate(rows.qpos[before], share * turn),
-            qvel=between(rows.qvel),
-            ctrl=rows.ctrl[held],
-            sensors={name: between(v) for name, v in rows.sensors.items()},
         )
 
 

@@ -1,0 +1,84 @@
+"""The lift arm example: its logs are what make_log.py makes, and carry the truth."""
+
+import importlib.util
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+
+from easi_jax.io.logs import read_logs
+from easi_jax.recording import physics_steps
+from easi_jax.windows import make_windows
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "lift_arm"
+LOGS = [EXAMPLE / "sweep.csv", EXAMPLE / "moves.csv"]
+
+
+@pytest.fixture(scope="module")
+def make_log():
+    spec = importlib.util.spec_from_file_location("make_log", EXAMPLE / "make_log.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def nominal() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_path(str(EXAMPLE / "model.xml"))
+
+
+def test_logs_are_made_again_byte_for_byte(make_log, tmp_path):
+    make_log.main(tmp_path)
+    for path in LOGS:
+        assert (tmp_path / path.name).read_bytes() == path.read_bytes()
+    assert sum(path.stat().st_size for path in EXAMPLE.iterdir()) < 400_000
+
+
+def test_logs_read_without_complaint(nominal):
+    log = read_logs(LOGS, nominal)
+    assert [(run.name, len(run), run.dt) for run in log.runs] == [
+        ("sweep", 2000, 0.01),
+        ("moves", 2000, 0.01),
+    ]
+    assert all("velocities estimated" in note for note in log.notes)
+
+
+def prediction_error(model: mujoco.MjModel, timestep: float) -> np.ndarray:
+    model.opt.timestep = timestep
+    data = mujoco.MjData(model)
+    errors = []
+    for run in read_logs(LOGS, model).runs:
+        steps = physics_steps(run.dt, timestep)
+        windows = make_windows(run, 0.2)
+        for w in range(len(windows.start_row)):
+            mujoco.mj_resetData(model, data)
+            data.qpos[:] = windows.start_qpos[w]
+            data.qvel[:] = windows.start_qvel[w]
+            for ctrl, target in zip(
+                windows.ctrl[w], windows.target_qpos[w], strict=True
+            ):
+                data.ctrl[:] = ctrl
+                mujoco.mj_step(model, data, nstep=steps)
+                errors.append(data.qpos - target)
+    return np.sqrt(np.mean(np.square(errors), axis=0))
+
+
+def test_truth_predicts_the_logs_and_the_model_does_not(make_log, nominal):
+    timestep = nominal.opt.timestep
+    truth = make_log.real_machine(EXAMPLE / "model.xml")
+    assert np.all(prediction_error(truth, timestep) < 0.002)
+    assert np.all(prediction_error(nominal, timestep) > 0.03)
+
+
+def test_parameter_file_holds_the_truth_inside_its_start(make_log):
+    listed = yaml.safe_load((EXAMPLE / "parameters.yaml").read_text())["parameters"]
+    assert [entry["name"] for entry in listed] == list(make_log.TRUTH)
+    readme = (EXAMPLE / "README.md").read_text()
+    for entry in listed:
+        truth = make_log.TRUTH[entry["name"]]
+        assert entry["initial"][0] < truth < entry["initial"][1]
+        assert f"| {truth} | {entry['unit']} |" in readme
