@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from easi_jax.errors import UserError, nearest
 from easi_jax.io.log_tables import Table
+from easi_jax.io.strict_yaml import read_yaml
 
 _KEYS = ("columns", "scale", "offset")
 
@@ -59,11 +59,12 @@ class LogMapping:
                     f'{self.source}: scale or offset of "{ours}", which {table.path} '
                     f"does not have{nearest(ours, renamed)}"
                 )
-        return Table(table.path, renamed)
+        return Table(table.path, renamed, table.notes)
 
     def apply(self, name: str, values: np.ndarray) -> np.ndarray:
         """``values`` of our column ``name`` in our units."""
-        return values * self.scale.get(name, 1.0) + self.offset.get(name, 0.0)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return values * self.scale.get(name, 1.0) + self.offset.get(name, 0.0)
 
 
 def read_mapping(path: str | os.PathLike[str]) -> LogMapping:
@@ -77,16 +78,7 @@ def read_mapping(path: str | os.PathLike[str]) -> LogMapping:
             finite number (a scale of zero included).
     """
     path = Path(path)
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise UserError(f"{path}: not UTF-8 text") from None
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" in line {mark.line + 1}" if mark else ""
-        raise UserError(f"{path}: not valid YAML{where}") from None
+    content = read_yaml(path)
     if not isinstance(content, dict):
         raise UserError(f'{path}: a mapping file has the key "columns:"')
     for key in content:

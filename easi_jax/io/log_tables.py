@@ -15,7 +15,7 @@ import pyarrow
 import pyarrow.parquet
 
 from easi_jax.errors import UserError
-from easi_jax.io.files import atomic_write
+from easi_jax.io.files import atomic_write, os_reason
 
 EXTENSIONS = (".csv", ".npz", ".parquet")
 
@@ -28,10 +28,12 @@ class Table:
         path: the file.
         columns: by name: cells of a CSV, a 1-D array, or (a ``str``) why the
             column cannot be used.
+        notes: what looked odd.
     """
 
     path: Path
     columns: Mapping[str, list[str] | np.ndarray | str]
+    notes: tuple[str, ...] = ()
 
     def rows(self, name: str) -> int:
         """Number of rows of column ``name``."""
@@ -52,8 +54,9 @@ class Table:
                 values[i] = float(cell) if cell.strip() else np.nan
             except ValueError:
                 hint = '; use "." as decimal point' if "," in cell else ""
+                text = " ".join(cell.split())[:40]
                 raise UserError(
-                    f'{self.path}: row {i + 1}, column "{name}" holds "{cell[:40]}" '
+                    f'{self.path}: row {i + 1}, column "{name}" holds "{text}" '
                     f"instead of a number{hint}"
                 ) from None
         return values
@@ -62,7 +65,7 @@ class Table:
         """Column ``name`` as text, ``(rows,)``; whole numbers without a point."""
         column = self._column(name)
         if isinstance(column, np.ndarray) and column.dtype.kind == "f":
-            texts = [str(int(x)) if x == np.floor(x) else str(x) for x in column]
+            texts = [f"{x:.17g}" for x in column.tolist()]
         else:
             texts = [str(cell).strip() for cell in column]
         missing = [i + 1 for i, text in enumerate(texts) if text in ("", "nan")]
@@ -101,15 +104,14 @@ def read_table(path: str | os.PathLike[str]) -> Table:
         if path.stat().st_size == 0:
             raise UserError(f"{path} is empty")
         if extension == ".csv":
-            return Table(path, _read_csv(path))
+            return Table(path, *_read_csv(path))
         if extension == ".npz":
             return Table(path, _read_npz(path))
         return Table(path, _read_parquet(path))
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None
     except OSError as error:
-        reason = error.strerror or str(error).splitlines()[0]
-        raise UserError(f"{path}: cannot be read ({reason})") from None
+        raise UserError(f"{path}: cannot be read ({os_reason(error)})") from None
 
 
 def write_table(
@@ -159,20 +161,19 @@ def _csv_text(columns: Mapping[str, np.ndarray], digits: int | None) -> str:
     return text.getvalue()
 
 
-def _read_csv(path: Path) -> dict[str, list[str] | np.ndarray | str]:
-    rows: list[list[str]] = []
+def _read_csv(path: Path) -> tuple[dict[str, list[str]], tuple[str, ...]]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            start = file.readline()
-            file.seek(0)
-            rows = [row for row in csv.reader(file, delimiter=_delimiter(start)) if row]
+            text = file.read()
+        lines = csv.reader(io.StringIO(text, newline=""), delimiter=_delimiter(text))
+        rows = [row for row in lines if row]
     except UnicodeDecodeError:
         raise UserError(f"{path}: not UTF-8 text; save it as UTF-8 CSV") from None
     except csv.Error as error:
         raise UserError(f"{path}: not a CSV file ({error})") from None
     if not rows:
         raise UserError(f"{path} is empty")
-    header = [name.strip() for name in rows.pop(0)]
+    header = [" ".join(name.split()) for name in rows.pop(0)]
     if all(_is_number(name) for name in header):
         raise UserError(f"{path}: the first row must name the columns")
     _refuse_duplicates(path, header)
@@ -183,7 +184,13 @@ def _read_csv(path: Path) -> dict[str, list[str] | np.ndarray | str]:
                 f"{path}: row {i + 1} has {len(row)} cells "
                 f"where the header has {len(header)}{cut}"
             )
-    return {name: [row[i] for row in rows] for i, name in enumerate(header)}
+    columns = {name: [row[i] for row in rows] for i, name in enumerate(header)}
+    if rows and not text.endswith(("\n", "\r")):
+        return columns, (
+            "the last line has no line end; if the file was cut short, "
+            "its last number is wrong",
+        )
+    return columns, ()
 
 
 def _read_npz(path: Path) -> dict[str, list[str] | np.ndarray | str]:
@@ -196,7 +203,9 @@ def _read_npz(path: Path) -> dict[str, list[str] | np.ndarray | str]:
                 raise broken
             _refuse_duplicates(path, archive.files)
             return {name: _npz_column(archive, name) for name in archive.files}
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, AttributeError):
+    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError):
+        raise broken from None
+    except (RuntimeError, MemoryError):  # encrypted; a size that cannot be true
         raise broken from None
 
 
@@ -217,14 +226,17 @@ def _npz_column(archive: np.lib.npyio.NpzFile, name: str) -> np.ndarray | str:
 
 
 def _read_parquet(path: Path) -> dict[str, list[str] | np.ndarray | str]:
+    broken = UserError(f"{path}: not a Parquet file, damaged or cut short")
     try:
         with pyarrow.parquet.ParquetFile(path) as file:
             _refuse_duplicates(path, file.schema_arrow.names)
             table = file.read()
-    except (pyarrow.ArrowException, OSError) as error:
-        if isinstance(error, OSError) and error.errno:
+    except OSError as error:
+        if error.errno:
             raise
-        raise UserError(f"{path}: not a Parquet file, damaged or cut short") from None
+        raise broken from None
+    except (pyarrow.ArrowException, ValueError, MemoryError):
+        raise broken from None
     return {
         name: _parquet_column(column)
         for name, column in zip(table.column_names, table.columns, strict=True)
@@ -246,7 +258,8 @@ def _parquet_column(column: pyarrow.ChunkedArray) -> np.ndarray | str:
     return column.cast(pyarrow.float64(), safe=False).to_numpy()
 
 
-def _delimiter(header: str) -> str:
+def _delimiter(text: str) -> str:
+    header = text.partition("\n")[0]
     if "," not in header:
         for other in (";", "\t"):
             if other in header:

@@ -135,12 +135,17 @@ class _Reader:
         self.name = name
         self.configuration = Configuration.of(model)
         self.notes: list[str] = []
+        self.uneven: list[tuple[float, str]] = []
 
     def note(self, text: str) -> None:
-        self.notes.append(f"{self.path}: {text}")
+        line = f"{self.path}: {text}"
+        if line not in self.notes:
+            self.notes.append(line)
 
     def read(self) -> list[Run]:
         table = self.mapping.rename(read_table(self.path))
+        for text in table.notes:
+            self.note(text)
         ignored = check_columns(self.path, table.columns, self.columns)
         if ignored:
             self.note(f"columns ignored: {', '.join(ignored)}")
@@ -175,6 +180,13 @@ class _Reader:
             raise UserError(
                 f"{self.path}: no two successive rows are whole and within "
                 f"{HOLE_STEPS:.0f} control steps of each other"
+            )
+        if self.uneven:
+            worst, name = max(self.uneven)
+            self.note(
+                f"time steps differ from the control step by up to {100 * worst:.0f} % "
+                f"({name}); brought to it by interpolation in {len(self.uneven)} of "
+                f"{len(runs)} runs"
             )
         estimated = [
             group[0].removesuffix(".0")
@@ -235,7 +247,8 @@ class _Reader:
         if len(timed) < 2:
             self.note(f"{name} left out: it has a single row")
             return []
-        gaps = np.diff(raw.time[timed])
+        with np.errstate(over="ignore"):
+            gaps = np.diff(raw.time[timed])
         back = np.flatnonzero(gaps <= 0)
         if len(back):
             a, b = timed[back[0]], timed[back[0] + 1]
@@ -251,7 +264,7 @@ class _Reader:
             self.note(rate_note)
         # a piece ends before every row that cannot follow the one before it
         time = raw.time[rows]
-        with np.errstate(invalid="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):
             follows = np.diff(time) <= dt * (HOLE_STEPS + EVEN)
         follows &= good[1:] & good[:-1]
         pieces = np.split(np.arange(len(rows)), np.flatnonzero(~follows) + 1)
@@ -273,11 +286,8 @@ class _Reader:
 
     def _run(self, name: str, rows: Rows, dt: float) -> Run:
         if not is_even(rows.time, dt):
-            worst = np.abs(np.diff(rows.time) / dt - 1).max()
-            self.note(
-                f"{name}: time steps differ from the control step of {dt:.6g} s by up "
-                f"to {100 * worst:.0f} %; brought to it by interpolation"
-            )
+            worst = float(np.abs(np.diff(rows.time) / dt - 1).max())
+            self.uneven.append((worst, name))
             rows = resampled(rows, dt, self.configuration)
         fitted = fitted_velocity(rows.qpos, dt, self.configuration)
         given = np.isfinite(rows.qvel)

@@ -6,9 +6,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-import yaml
 
 from easi_jax.io.logs import read_logs
+from easi_jax.io.parameter_file import read_parameter_file
 from easi_jax.recording import physics_steps
 from easi_jax.windows import make_windows
 
@@ -74,11 +74,13 @@ def test_truth_predicts_the_logs_and_the_model_does_not(make_log, nominal):
     assert np.all(prediction_error(nominal, timestep) > 0.03)
 
 
-def test_parameter_file_holds_the_truth_inside_its_start(make_log):
-    listed = yaml.safe_load((EXAMPLE / "parameters.yaml").read_text())["parameters"]
-    assert [entry["name"] for entry in listed] == list(make_log.TRUTH)
+def test_parameter_file_holds_the_truth_inside_its_start(make_log, nominal):
+    space = read_parameter_file(EXAMPLE / "parameters.yaml", nominal)
+    assert space.names == tuple(make_log.TRUTH)
+    truth = np.array(list(make_log.TRUTH.values()))
+    low, high = space.initial
+    assert np.all((low < truth) & (truth < high))
+    assert np.all(np.abs(truth / space.nominal - 1) > 0.05)
     readme = (EXAMPLE / "README.md").read_text()
-    for entry in listed:
-        truth = make_log.TRUTH[entry["name"]]
-        assert entry["initial"][0] < truth < entry["initial"][1]
-        assert f"| {truth} | {entry['unit']} |" in readme
+    for value, given, unit in zip(truth, space.nominal, space.units, strict=True):
+        assert f"| {given:g} | {value:g} | {unit} |" in readme
