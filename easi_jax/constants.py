@@ -72,9 +72,10 @@ def set_const(m: mjx.Model) -> mjx.Model:
         return m
     d = mjx.make_data(m).replace(qpos=m.qpos0)
     d = smooth.com_pos(m, smooth.kinematics(m, d))
-    d = smooth.tendon(m, smooth.camlight(m, d))
+    d = smooth.tendon(m, d)
     d = smooth.transmission(m, smooth.tendon_armature(m, smooth.crb(m, d)))
     full = support.full_m(m, d)
+    impl: Any = d._impl
     inverse = spd_inverse(full)
 
     def inverse_weight(jac: Any) -> jax.Array:
@@ -96,12 +97,13 @@ def set_const(m: mjx.Model) -> mjx.Model:
         "stat.meaninertia": jnp.diagonal(full).mean(),
     }
     if m.ntendon:
-        changes["tendon_invweight0"] = inverse_weight(d._impl.ten_J)
+        changes["tendon_invweight0"] = inverse_weight(impl.ten_J)
     if m.nu:
         changes["actuator_acc0"] = jnp.linalg.norm(
-            d._impl.actuator_moment @ inverse, axis=-1
+            impl.actuator_moment @ inverse, axis=-1
         )
     if m.ncam:
-        com = d.subtree_com[m.cam_bodyid]
-        changes["cam_poscom0"] = d.cam_xpos - com
+        b = m.cam_bodyid
+        place = d.xpos[b] + jnp.einsum("cij,cj->ci", d.xmat[b], m.cam_pos)
+        changes["cam_poscom0"] = place - d.subtree_com[b]
     return m.tree_replace(changes)  # type: ignore[return-value]

@@ -1,7 +1,7 @@
 """An MJX model whose physical parameters are an argument."""
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import flax.struct
 import jax
@@ -24,12 +24,17 @@ class Model:
         mjx: the MJX model.
         speed_limit: largest joint speed, ``(nv,)`` [m/s, rad/s]; inf where none.
         writers: which numbers follow which parameter (static).
+        long_axes: the axis of each geom that its length is measured along (static).
     """
 
     mjx: mjx.Model
     speed_limit: jax.Array
     writers: tuple[Writer, ...] = flax.struct.field(pytree_node=False, default=())
     long_axes: tuple[int, ...] = flax.struct.field(pytree_node=False, default=())
+
+    if TYPE_CHECKING:  # made by flax
+
+        def replace(self, **changes: Any) -> "Model": ...
 
 
 def _unsupported(m: mujoco.MjModel) -> str | None:

@@ -61,14 +61,14 @@ class Parameter:
             fail("nominal and initial must be finite numbers")
         if math.isnan(least) or math.isnan(most):
             fail("bounds must be numbers")
-        if not low < high:
-            fail(f"initial [{low:g}, {high:g}] is reversed or empty")
         if not least < most:
             fail(f"bounds [{least:g}, {most:g}] are reversed or empty")
         if not least <= self.nominal <= most:
             fail(
                 f"nominal {self.nominal:g} is outside its bounds [{least:g}, {most:g}]"
             )
+        if not low < high:
+            fail(f"initial [{low:g}, {high:g}] is reversed or empty")
         if low < least or high > most:
             fail(
                 f"initial [{low:g}, {high:g}] is outside its bounds "
@@ -157,13 +157,13 @@ class ParameterSpace:
         """d log(value) / d unit where logarithmic, 1 elsewhere, ``(n,)``."""
         return np.where(self.log, self._affine[1], 1.0)
 
-    def to_si(self, unit: jax.Array) -> jax.Array:
+    def to_si(self, unit: jax.Array | np.ndarray) -> jax.Array:
         """SI values of unit coordinates ``(..., n)``; not clipped."""
         offset, width = (jnp.asarray(a) for a in self._affine)
         x = offset + width * unit
         return jnp.where(self.log, jnp.exp(jnp.where(self.log, x, 0.0)), x)
 
-    def to_unit(self, si: jax.Array) -> jax.Array:
+    def to_unit(self, si: jax.Array | np.ndarray) -> jax.Array:
         """Unit coordinates of SI values ``(..., n)``; -inf for 0 on a log scale."""
         offset, width = (jnp.asarray(a) for a in self._affine)
         si = jnp.asarray(si)
