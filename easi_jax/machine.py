@@ -1,12 +1,13 @@
 """A robot as it is simulated: MuJoCo model, what may vary, control step."""
 
-import math
+import math as pymath
 from functools import cached_property
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from mujoco.mjx._src import math
 
 from easi_jax.errors import UserError
 from easi_jax.model import Model, put_model, with_parameters
@@ -36,7 +37,7 @@ class Machine:
         self.dt = float(dt) if dt is not None else step
         if not 0 < self.dt < 10:
             raise UserError(f"control step {self.dt} s: give one above 0 and below 10")
-        self.substeps = max(1, math.ceil(self.dt / step - 1e-6))
+        self.substeps = max(1, pymath.ceil(self.dt / step - 1e-6))
         self.mj_model = mj_model
         self.space = space
 
@@ -91,11 +92,24 @@ class Machine:
 
         Hinges are subtracted as they are: simulated angles do not wrap.
         """
-        if self._hinge_only:
-            dq = qpos_b - qpos_a
-        else:
-            dq = self._tangent(qpos_a, qpos_b)
+        dq = qpos_b - qpos_a if self._hinge_only else self._tangent(qpos_a, qpos_b)
         return jnp.concatenate([dq, qvel_b - qvel_a])
+
+    def move(self, qpos: jax.Array, tangent: jax.Array) -> jax.Array:
+        """Positions ``(nq,)`` moved by a tangent vector ``(nv,)``."""
+        if self._hinge_only:
+            return qpos + tangent
+        m, out = self.mj_model, []
+        for j in range(m.njnt):
+            a, v, kind = int(m.jnt_qposadr[j]), int(m.jnt_dofadr[j]), int(m.jnt_type[j])
+            if kind == 0:
+                out += [qpos[a : a + 3] + tangent[v : v + 3]]
+                a, v = a + 3, v + 3
+            if kind <= 1:
+                out += [_turned(qpos[a : a + 4], tangent[v : v + 3])]
+            else:
+                out += [qpos[a : a + 1] + tangent[v : v + 1]]
+        return jnp.concatenate(out)
 
     def _tangent(self, qa: jax.Array, qb: jax.Array) -> jax.Array:
         m, out = self.mj_model, []
@@ -109,6 +123,10 @@ class Machine:
             else:
                 out += [qb[a : a + 1] - qa[a : a + 1]]
         return jnp.concatenate(out)
+
+
+def _turned(quat: jax.Array, vector: jax.Array) -> jax.Array:
+    return math.quat_integrate(quat, vector, jnp.ones(()))
 
 
 def _rotation_between(qa: jax.Array, qb: jax.Array) -> jax.Array:

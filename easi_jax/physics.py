@@ -34,9 +34,7 @@ class Physics:
 def at_rest(model: Any, qpos: jax.Array, qvel: jax.Array) -> Physics:
     """A state with nothing known of what came before it."""
     m = model.mjx
-    return Physics(
-        qpos=qpos, qvel=qvel, act=jnp.zeros(m.na), warmstart=jnp.zeros(m.nv)
-    )
+    return Physics(qpos=qpos, qvel=qvel, act=jnp.zeros(m.na), warmstart=jnp.zeros(m.nv))
 
 
 def data_at(model: Any, state: Physics, ctrl: jax.Array) -> mjx.Data:
@@ -74,15 +72,31 @@ def mjx_step(m: mjx.Model, d: mjx.Data) -> mjx.Data:
     d = forward(m, d)
     if m.opt.integrator == IntegratorType.EULER:
         return mjx_forward.euler(m, d)
-    return mjx_forward.implicit(m, d)
+    return mjx_forward.implicit(_without_clamped(m, d), d)
+
+
+def _without_clamped(m: mjx.Model, d: mjx.Data) -> mjx.Model:
+    """The model as `implicit` must see it: no velocity feedback where it is cut off.
+
+    MuJoCo C (4.0) leaves an actuator at its force limit out of the derivative; MJX
+    3.17 does not, and a saturated servo then brakes too softly.
+    """
+    limited = m.actuator_forcelimited.astype(bool)
+    if not limited.any():
+        return m
+    force, edge = d.actuator_force, m.actuator_forcerange
+    clamped = limited & ((force <= edge[:, 0]) | (force >= edge[:, 1]))
+    free = jnp.where(clamped, 0.0, 1.0)
+    return m.replace(
+        actuator_gainprm=m.actuator_gainprm.at[:, 2].multiply(free),
+        actuator_biasprm=m.actuator_biasprm.at[:, 2].multiply(free),
+    )
 
 
 _unrolled_step = unroll_small(mjx_step)
 
 
-def control_step(
-    model: Any, state: Physics, ctrl: jax.Array, substeps: int
-) -> Physics:
+def control_step(model: Any, state: Physics, ctrl: jax.Array, substeps: int) -> Physics:
     """Holds ``ctrl`` ``(nu,)`` for ``substeps`` physics steps.
 
     The joint speed limit, which MuJoCo lacks, clips velocities after each substep.

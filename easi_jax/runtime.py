@@ -9,6 +9,7 @@ import io
 import logging
 import os
 from pathlib import Path
+from typing import Any
 
 _MIN_POOL = 8
 _state: dict[str, object] = {}
@@ -27,6 +28,12 @@ def backend_started() -> bool:
     from jax._src import xla_bridge
 
     return bool(xla_bridge.backends_are_initialized())
+
+
+def _setting(name: str) -> Any:
+    import jax
+
+    return getattr(jax.config, name)
 
 
 def cache_dir() -> Path:
@@ -62,9 +69,9 @@ def prepare() -> dict[str, object]:
             "JAX_NUM_CPU_DEVICES" in os.environ
             or "xla_force_host_platform_device_count" in flags
         )
-        if not own_count and jax.config.jax_num_cpu_devices == -1:
+        if not own_count and _setting("jax_num_cpu_devices") == -1:
             jax.config.update("jax_num_cpu_devices", cores())
-        if jax.config.jax_default_matmul_precision is None:
+        if _setting("jax_default_matmul_precision") is None:
             jax.config.update("jax_default_matmul_precision", "highest")
         _ready_cache()
     with contextlib.redirect_stdout(io.StringIO()):
@@ -77,7 +84,7 @@ def prepare() -> dict[str, object]:
 def _ready_cache() -> None:
     import jax
 
-    if jax.config.jax_compilation_cache_dir is None:
+    if _setting("jax_compilation_cache_dir") is None:
         path = cache_dir()
         try:
             path.mkdir(parents=True, exist_ok=True)
@@ -102,8 +109,8 @@ def status() -> dict[str, object]:
         "device_kind": devices[0].device_kind,
         "devices": len(devices),
         "one_device_per_core": devices[0].platform != "cpu" or len(devices) == cores(),
-        "compilation_cache": jax.config.jax_compilation_cache_dir,
-        "matmul_precision": jax.config.jax_default_matmul_precision,
-        "x64": bool(jax.config.jax_enable_x64),
+        "compilation_cache": _setting("jax_compilation_cache_dir"),
+        "matmul_precision": _setting("jax_default_matmul_precision"),
+        "x64": bool(_setting("jax_enable_x64")),
         "prepared_before_backend": not _state["late"],
     }

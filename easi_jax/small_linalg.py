@@ -63,7 +63,8 @@ def _closed(closed: Any) -> Callable[..., list[Any]]:
 def _apply(eqn: Any, vals: list[Any]) -> list[Any]:
     name, p = eqn.primitive.name, eqn.params
     if name == "dot_general" and _small_product(eqn):
-        return [_product(*vals, p["dimension_numbers"], eqn.outvars[0].aval.dtype)]
+        dtype = eqn.outvars[0].aval.dtype
+        return [_product(vals[0], vals[1], p["dimension_numbers"], dtype)]
     if name == "cholesky" and vals[0].ndim == 2 and vals[0].shape[-1] <= MAX_FACTOR:
         return [_cholesky(vals[0])]
     if (
@@ -142,7 +143,13 @@ def _product(a: Any, b: Any, dims: Any, dtype: Any) -> jax.Array:
         # One contracted axis of a few entries: explicit sums fuse, a reduce may not.
         k = int(np.prod(out.shape[out.ndim - nk :]))
         out = out.reshape((*out.shape[: out.ndim - nk], k))
-        out = sum((out[..., i] for i in range(1, k)), out[..., 0]) if k <= 8 else out.sum(-1)
+        if k <= 8:
+            total = out[..., 0]
+            for i in range(1, k):
+                total = total + out[..., i]
+            out = total
+        else:
+            out = out.sum(-1)
     return out.astype(dtype)
 
 

@@ -1,0 +1,206 @@
+"""What measured segments say about the parameters: Fisher information.
+
+Forward-mode derivatives through the simulation; the start state of each segment is
+unknown within its noise and eliminated (Schur complement). The inverse is the
+Cramer-Rao bound.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+
+from easi_jax import replay
+from easi_jax.machine import Machine
+from easi_jax.mesh import make_mesh, sharded_map
+from easi_jax.parameters import ParameterSpace
+from easi_jax.segments import Segments
+
+_WEAK = 0.5  # std of a log ratio beyond which a direction is called undetermined
+_NUMERIC = 1e-4  # relative singular value that single precision cannot resolve
+
+
+@flax.struct.dataclass
+class Normal:
+    """Normal equations of one Gauss-Newton step, the starts eliminated.
+
+    Attributes:
+        hessian: ``(n, n)``, information in unit coordinates.
+        gradient: ``(n,)``.
+        cost: half the weighted squared error, ``()``.
+        start_step: ``(M, 2 nv)`` correction of each start at zero parameter step.
+        start_gain: ``(M, 2 nv, n)``: correction per unit of parameter step.
+    """
+
+    hessian: jax.Array
+    gradient: jax.Array
+    cost: jax.Array
+    start_step: jax.Array
+    start_gain: jax.Array
+
+
+def shift_start(machine: Machine, seg: Segments, delta: jax.Array) -> Segments:
+    """Segments with starts moved by tangent vectors ``(M, 2 nv)``."""
+    import dataclasses
+
+    nv = machine.mj_model.nv
+    move = jax.vmap(machine.move)
+    return dataclasses.replace(
+        seg, qpos=move(seg.qpos, delta[:, :nv]), qvel=seg.qvel + delta[:, nv:]
+    )
+
+
+def normal_equations(
+    machine: Machine,
+    space: ParameterSpace,
+    unit: jax.Array,
+    delta: jax.Array,
+    segments: Segments,
+    noise: jax.Array,
+    weight: jax.Array,
+    mesh: Mesh | None = None,
+    chunk: int = 256,
+) -> Normal:
+    """Gauss-Newton system at parameters ``unit (n,)`` and start shifts ``delta``.
+
+    Args:
+        noise: standard deviations ``(2 nv,)`` of measured positions, velocities.
+        weight: ``(M, H, 2 nv)`` extra weights (robust fit; ones otherwise).
+    """
+    n, nv2 = space.size, 2 * machine.mj_model.nv
+
+    def outputs(u: jax.Array, d: jax.Array, s: Segments) -> jax.Array:
+        one = jax.tree.map(lambda x: x[None], s)
+        moved = shift_start(machine, one, d[None])
+        err = replay.errors_from(machine, machine.model(space.to_si(u)), moved, one)
+        return -err[0]  # predicted minus measured, (H, 2 nv)
+
+    directions = jnp.eye(n + nv2)
+
+    def one(item: Any) -> Any:
+        s, d, w = item
+
+        def f(x: jax.Array) -> jax.Array:
+            return outputs(unit + x[:n], d + x[n:], s)
+
+        zero = jnp.zeros(n + nv2)
+        r, push = f(zero), lambda v: jax.jvp(f, (zero,), (v,))[1]
+        jac = jnp.moveaxis(jax.vmap(push)(directions), 0, -1)  # (H, 2nv, n + nv2)
+        root = jnp.sqrt(w) / noise
+        rw = (r * root).reshape(-1)
+        jw = (jac * root[..., None]).reshape(-1, n + nv2)
+        a, b = jw[:, :n], jw[:, n:]
+        # The start was measured too: its own shift costs d / noise.
+        fxx = b.T @ b + jnp.diag(1 / noise**2)
+        fxu, gx = b.T @ a, b.T @ rw + d / noise**2
+        sol = jnp.linalg.solve(fxx, jnp.concatenate([fxu, gx[:, None]], 1))
+        hess = a.T @ a - fxu.T @ sol[:, :n]
+        grad = a.T @ rw - fxu.T @ sol[:, n]
+        cost = 0.5 * (rw @ rw + jnp.sum((d / noise) ** 2))
+        return hess, grad, cost, -sol[:, n], -sol[:, :n]
+
+    def local(items: Any) -> Any:
+        return jax.lax.map(one, items, batch_size=chunk)
+
+    out = sharded_map(local, mesh or make_mesh(), (segments, delta, weight))
+    hess, grad, cost, step, gain = out
+    return Normal(hess.sum(0), grad.sum(0), cost.sum(), step, gain)
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What data of this kind can determine, near one parameter vector.
+
+    Attributes:
+        names: parameters.
+        std: Cramer-Rao standard deviation of the log ratio (or, for a linear
+            parameter, as a share of its initial range); inf where undetermined.
+        rank: number of determined directions.
+        undetermined: each a dict name -> coefficient: the parameters that can move
+            together, in these proportions of their logarithms, unseen.
+        determined: per parameter, whether the data fix it by itself.
+        covariance: Cramer-Rao bound within the determined directions, unit
+            coordinates, ``(n, n)``.
+        null: orthonormal basis of the undetermined directions, scaled coordinates,
+            ``(n, n - rank)``.
+        scale: unit coordinate -> scaled coordinate factors, ``(n,)``.
+    """
+
+    names: tuple[str, ...]
+    std: np.ndarray
+    rank: int
+    undetermined: tuple[dict[str, float], ...]
+    determined: np.ndarray
+    covariance: np.ndarray
+    null: np.ndarray
+    scale: np.ndarray
+
+
+def identifiability(
+    space: ParameterSpace, hessian: np.ndarray, weak: float = _WEAK
+) -> Identifiability:
+    """Reads the Fisher information ``hessian (n, n)`` (unit coordinates).
+
+    Directions are judged in log ratios, where one unit is a factor e.
+    """
+    scale = space.log_width  # d log(xi) / d unit, or 1 for linear parameters
+    info = np.asarray(hessian, np.float64) / np.outer(scale, scale)
+    info = 0.5 * (info + info.T)
+    values, vectors = np.linalg.eigh(info)
+    top = max(values[-1], 1e-300)
+    seen = (values > (_NUMERIC**2) * top) & (values > 1.0 / weak**2)
+    null = vectors[:, ~seen]
+    safe = np.where(seen, values, np.inf)
+    cov = (vectors / safe) @ vectors.T
+    leak = np.sqrt((null**2).sum(1)) if null.size else np.zeros(len(scale))
+    std = np.sqrt(np.diag(cov))
+    determined = (leak < 0.05) & (std < weak)
+    std = np.where(leak < 0.05, std, np.inf)
+    return Identifiability(
+        names=space.names,
+        std=std,
+        rank=int(seen.sum()),
+        undetermined=tuple(
+            {
+                space.names[i]: float(v[i])
+                for i in np.argsort(-np.abs(v))
+                if abs(v[i]) > 0.05
+            }
+            for v in _sparse_basis(null)
+        ),
+        determined=determined,
+        covariance=cov / np.outer(scale, scale),
+        null=null,
+        scale=scale,
+    )
+
+
+def _sparse_basis(null: np.ndarray) -> list[np.ndarray]:
+    """A readable basis of a subspace: each vector rid of the others' pivots."""
+    rows = null.T.copy()
+    done: list[int] = []
+    for i in range(len(rows)):
+        free = np.abs(rows[i]).copy()
+        free[done] = 0
+        pivot = int(np.argmax(free))
+        rows[i] /= rows[i, pivot]
+        for k in range(len(rows)):
+            if k != i:
+                rows[k] -= rows[k, pivot] * rows[i]
+        done.append(pivot)
+    return [r / np.max(np.abs(r)) for r in rows]
+
+
+def describe(direction: dict[str, float]) -> str:
+    """A sentence about one undetermined direction."""
+    if len(direction) == 1:
+        return f"{next(iter(direction))} leaves no trace in these data"
+    rounded = {k: round(v, 2) for k, v in direction.items()}
+    if all(abs(v - 1) < 0.05 for v in direction.values()):
+        return f"{', '.join(rounded)} times one common factor change nothing"
+    terms = ", ".join(f"{k}^{v:g}" for k, v in rounded.items())
+    return f"moving together as {terms} changes nothing that these data show"

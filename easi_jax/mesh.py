@@ -1,0 +1,42 @@
+"""One mesh over all devices: CPU cores, GPUs or hosts alike."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+AXIS = "device"
+
+
+def make_mesh(devices: int | None = None) -> Mesh:
+    """A one-dimensional mesh over the first ``devices`` devices (default: all)."""
+    found = jax.devices()
+    return Mesh(np.array(found[: devices or len(found)]), (AXIS,))
+
+
+def sharded_map(fun: Callable[..., Any], mesh: Mesh, sharded: Any, *shared: Any) -> Any:
+    """``fun(sharded, *shared)`` with the leading axis of ``sharded`` split.
+
+    ``fun`` sees a slice of the leading axis and returns arrays with the same one;
+    ``shared`` goes whole to every device. The axis is padded by repetition where it
+    does not divide, so that no device count is a special case.
+    """
+    n = jax.tree.leaves(sharded)[0].shape[0]
+    pad = -n % mesh.size
+
+    def padded(x: jax.Array) -> jax.Array:
+        return jnp.concatenate([x, jnp.repeat(x[-1:], pad, axis=0)]) if pad else x
+
+    split, whole = PartitionSpec(AXIS), PartitionSpec()
+    mapped = jax.shard_map(
+        fun,
+        mesh=mesh,
+        in_specs=(split, *(whole for _ in shared)),
+        out_specs=split,
+        check_vma=False,
+    )
+    out = mapped(jax.tree.map(padded, sharded), *shared)
+    return jax.tree.map(lambda x: x[:n], out) if pad else out

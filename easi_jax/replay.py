@@ -1,0 +1,65 @@
+"""Simulating measured segments under a model: logged commands, logged starts."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from easi_jax.machine import Machine
+from easi_jax.segments import Segments
+
+
+def predict(
+    machine: Machine, model: Any, segments: Segments
+) -> tuple[jax.Array, jax.Array]:
+    """Open-loop prediction: ``qpos (M, H, nq)``, ``qvel (M, H, nv)``."""
+
+    def one(qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array) -> Any:
+        def step(state: Any, u: jax.Array) -> Any:
+            state = machine.step(model, state, u)
+            return state, (state.qpos, state.qvel)
+
+        return jax.lax.scan(step, machine.start(qpos, qvel), ctrl)[1]
+
+    return jax.vmap(one)(segments.qpos, segments.qvel, segments.ctrl)
+
+
+def innovations(
+    machine: Machine,
+    reference: tuple[jax.Array, jax.Array],
+    states: tuple[jax.Array, jax.Array],
+) -> jax.Array:
+    """States minus the reference prediction, ``(M, H, 2 nv)``."""
+    difference = jax.vmap(jax.vmap(machine.difference))
+    return difference(reference[0], reference[1], states[0], states[1])
+
+
+def errors(machine: Machine, model: Any, segments: Segments) -> jax.Array:
+    """Measured minus predicted, ``(M, H, 2 nv)``."""
+    return errors_from(machine, model, segments, segments)
+
+
+def errors_from(
+    machine: Machine, model: Any, starts: Segments, measured: Segments
+) -> jax.Array:
+    """Measured minus what is predicted from other starts, ``(M, H, 2 nv)``."""
+    target = (measured.next_qpos, measured.next_qvel)
+    return innovations(machine, predict(machine, model, starts), target)
+
+
+def motion(machine: Machine, segments: Segments) -> jax.Array:
+    """Measured change since the segment's start, ``(M, H, 2 nv)``."""
+
+    def one(s: Segments) -> jax.Array:
+        diff = jax.vmap(machine.difference, in_axes=(None, None, 0, 0))
+        return diff(s.qpos, s.qvel, s.next_qpos, s.next_qvel)
+
+    return jax.vmap(one)(segments)
+
+
+def features(machine: Machine, segments: Segments) -> jax.Array:
+    """Start state and commands of each segment, flat, ``(M, nq + nv + H nu)``."""
+    m = segments.qpos.shape[0]
+    return jnp.concatenate(
+        [segments.qpos, segments.qvel, segments.ctrl.reshape(m, -1)], axis=1
+    )

@@ -1,0 +1,77 @@
+"""Trajectories of a controller in an environment, as segments of one step."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from easi_jax.env import Env
+from easi_jax.segments import Segments
+
+Act = Callable[[jax.Array, jax.Array], jax.Array]
+
+
+def policy_rollout(
+    env: Any,
+    model: Any,
+    act: Act,
+    key: jax.Array,
+    steps: int,
+    auto_reset: bool = False,
+) -> tuple[Segments, jax.Array]:
+    """One trajectory of ``act(obs, key) -> action`` from a reset.
+
+    Returns:
+        Segments with horizon 1, ``(steps, 1, ...)``, and weights ``(steps,)``:
+        1 where the transition counts. Without ``auto_reset`` the trajectory ends at
+        termination and later weights are 0. With it, as in EASI's reference, the
+        state after a termination is that of the next episode, and the transition
+        across is kept.
+    """
+    k_reset, k_run = jax.random.split(key)
+
+    def step(carry: Any, k: jax.Array) -> Any:
+        state, alive = carry
+        k_act, k_again = jax.random.split(k)
+        action = act(state.obs, k_act)
+        new = env.step(model, state, action)
+        done = new.terminated > 0
+        after = new
+        if auto_reset:
+            fresh = env.reset(model, k_again)
+            after = jax.tree.map(lambda a, b: jnp.where(done, a, b), fresh, new)
+        seg = Segments(
+            qpos=state.physics.qpos,
+            qvel=state.physics.qvel,
+            ctrl=env.control(action)[None],
+            next_qpos=after.physics.qpos[None],
+            next_qvel=after.physics.qvel[None],
+        )
+        if auto_reset:
+            return (after, alive), (seg, alive)
+        # A finished episode stands still instead of running on into nonsense.
+        held = jax.tree.map(lambda a, b: jnp.where(alive > 0, a, b), after, state)
+        return (held, alive * (1.0 - done)), (seg, alive)
+
+    init = (env.reset(model, k_reset), jnp.ones(()))
+    _, out = jax.lax.scan(step, init, jax.random.split(k_run, steps))
+    return out
+
+
+def collect(
+    env: Env,
+    models: Any,
+    act: Act,
+    key: jax.Array,
+    trajectories: int,
+    steps: int,
+    models_axis: int | None = None,
+) -> tuple[Segments, jax.Array]:
+    """``trajectories`` independent rollouts: leaves ``(B, steps, ...)``."""
+
+    def one(model: Any, k: jax.Array) -> Any:
+        return policy_rollout(env, model, act, k, steps)
+
+    keys = jax.random.split(key, trajectories)
+    return jax.vmap(one, in_axes=(models_axis, 0))(models, keys)

@@ -1,0 +1,451 @@
+"""The EASI search: one generation as a pure function, all of them in one scan.
+
+Algorithm 1 of EASI (NeurIPS 2024): sample individuals, simulate them, train the
+discriminator on measured against simulated transitions, let its mean score be the
+fitness, update the distribution.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from easi_jax import discriminator as critic
+from easi_jax import replay
+from easi_jax.machine import Machine
+from easi_jax.mesh import make_mesh, sharded_map
+from easi_jax.rollout import policy_rollout
+from easi_jax.search_config import SearchConfig
+from easi_jax.segments import Segments
+from easi_jax.strategies import make_strategy
+
+_CHUNK = 2048  # simulations at once on a device: more leave the cache
+_CLIP = 4.0  # innovations beyond this many spreads say no more than "far"
+
+
+@flax.struct.dataclass
+class SearchData:
+    """What a search compares with.
+
+    Attributes:
+        segments: measured pieces of ``horizon`` steps (1 for policy rollouts).
+        noise: measurement noise of positions and velocities, ``(2 nv,)`` standard
+            deviations, added to what is simulated. Zero where there is none.
+        policy: parameters of the controller, for ``source="policy"``.
+    """
+
+    segments: Segments
+    noise: jax.Array
+    policy: Any = None
+
+
+@flax.struct.dataclass
+class SearchState:
+    """All that a search carries; saved in checkpoints.
+
+    Attributes:
+        mean, cov: the distribution in unit coordinates, ``(n,)``, ``(n, n)``.
+        result_mean, result_cov: what `last_evaluation` says is the result.
+    """
+
+    strategy: Any
+    critic: critic.CriticState
+    mean: jax.Array
+    cov: jax.Array
+    result_mean: jax.Array
+    result_cov: jax.Array
+    generation: jax.Array
+    key: jax.Array
+    training: Any
+
+
+@flax.struct.dataclass
+class SearchInfo:
+    """What one generation reports.
+
+    Attributes:
+        mean, std: the distribution after it, unit coordinates, ``(n,)``.
+        loss: discriminator loss of its last step.
+        score: mean score of the individuals; ``best`` the highest.
+        non_finite: individuals whose simulation was no longer finite.
+        at_bound: individuals clipped to a bound, per parameter, ``(n,)``.
+        training: info of policy training, where there is some.
+    """
+
+    mean: jax.Array
+    std: jax.Array
+    loss: jax.Array
+    score: jax.Array
+    best: jax.Array
+    non_finite: jax.Array
+    at_bound: jax.Array
+    training: Any
+
+
+class Search:
+    """EASI on a machine: ``init``, ``step`` and ``run`` are pure.
+
+    Args:
+        machine: what is simulated; its space starts where the search starts.
+        config: settings.
+        env: environment for ``source="policy"``.
+        act: ``act(policy, obs, key) -> action`` for ``source="policy"``.
+        trainer: policy training with ``init(key, dist)`` and ``step(state, dist)``
+            for ``policy_updates_per_generation``; dist is ``(mean, cov)`` in unit
+            coordinates.
+        mesh: devices to spread the population over (default: all).
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        config: SearchConfig,
+        env: Any = None,
+        act: Callable[..., jax.Array] | None = None,
+        trainer: Any = None,
+        mesh: Mesh | None = None,
+    ) -> None:
+        if config.source == "policy" and (env is None or act is None):
+            raise ValueError('source="policy" needs env and act')
+        if config.policy_updates_per_generation and trainer is None:
+            raise ValueError("policy_updates_per_generation needs a trainer")
+        self.machine, self.config, self.env, self.act = machine, config, env, act
+        self.trainer = trainer if config.policy_updates_per_generation else None
+        self.mesh = mesh or make_mesh()
+        self.space = machine.space.with_scale(config.log_scale)
+        self.strategy = make_strategy(
+            config.strategy,
+            config.population,
+            self.space.size,
+            config.elite_ratio,
+            config.spread_about,
+        )
+        self.critic_config = critic.CriticConfig(
+            hidden=config.hidden,
+            loss=config.loss,
+            regularizer=config.regularizer,
+            clip_after_update=config.clip_after_update,
+            learning_rate=config.learning_rate,
+        )
+
+    # -- state ---------------------------------------------------------------
+
+    def init(self, key: jax.Array, data: SearchData) -> SearchState:
+        """Starts from the space's initial range, moment-matched."""
+        n = self.space.size
+        k_es, k_critic, k_train, k_run = jax.random.split(key, 4)
+        mean, std = jnp.full(n, 0.5), jnp.full(n, 12.0**-0.5)
+        cov = jnp.diag(std**2)
+        seg = data.segments
+        width = seg.qpos.shape[1] + seg.qvel.shape[1] + seg.ctrl[0].size
+        width += jax.eval_shape(
+            lambda s: self._outcome(s, (s.next_qpos, s.next_qvel)), seg
+        ).shape[1]
+        return SearchState(
+            strategy=self.strategy.init(k_es, mean, std),
+            critic=critic.init(self.critic_config, k_critic, width),
+            mean=mean,
+            cov=cov,
+            result_mean=mean,
+            result_cov=cov,
+            generation=jnp.zeros((), jnp.int32),
+            key=k_run,
+            training=self.trainer.init(k_train, (mean, cov)) if self.trainer else (),
+        )
+
+    def run(
+        self, state: SearchState, data: SearchData, generations: int
+    ) -> tuple[SearchState, SearchInfo]:
+        """``generations`` steps in one scan; info stacked along the first axis."""
+        return jax.lax.scan(
+            lambda s, _: self.step(s, data), state, None, length=generations
+        )
+
+    # -- one generation ------------------------------------------------------
+
+    def step(
+        self, state: SearchState, data: SearchData
+    ) -> tuple[SearchState, SearchInfo]:
+        """One generation of Algorithm 1."""
+        c = self.config
+        key, k_ask, k_sim, k_critic, k_tell = jax.random.split(state.key, 5)
+        raw, es = self.strategy.ask(k_ask, state.strategy)
+        if c.uniform_first_generation:
+            uniform = jax.random.uniform(k_ask, raw.shape)
+            raw = jnp.where(state.generation == 0, uniform, raw)
+        low, high = self.space.unit_bounds
+        population = jnp.clip(raw, low, high) if c.respect_bounds else raw
+
+        real, fake, weight, finite = self._simulate(state, data, population, k_sim)
+        trained, loss = self._train_critic(state.critic, k_critic, real, fake, weight)
+        scores = critic.score(self.critic_config, trained, fake)
+        total = jnp.maximum(weight.sum(1), 1.0)
+        fitness = (scores * weight).sum(1) / total
+        told, cost = _only_finite(population, -fitness, finite)
+        es_new = self.strategy.tell(k_tell, told, cost, es)
+        mean, cov = self.strategy.moments(es_new, told, cost)
+        # A generation without one finite simulation teaches nothing.
+        some = finite.any()
+        keep = lambda new, old: jax.tree.map(  # noqa: E731
+            lambda a, b: jnp.where(some, a, b), new, old
+        )
+        es_new, mean, cov, trained = keep(
+            (es_new, mean, cov, trained), (es, state.mean, state.cov, state.critic)
+        )
+        if c.respect_bounds:
+            mean = jnp.clip(mean, low, high)
+        training, training_info = state.training, ()
+        if self.trainer:
+            train_step = self.trainer.step
+            training, training_info = jax.lax.scan(
+                lambda s, _: train_step(s, (mean, cov)),
+                training,
+                None,
+                length=c.policy_updates_per_generation,
+            )
+        result = (mean, cov) if c.last_evaluation else (state.mean, state.cov)
+        new = SearchState(
+            strategy=es_new,
+            critic=trained,
+            mean=mean,
+            cov=cov,
+            result_mean=result[0],
+            result_cov=result[1],
+            generation=state.generation + 1,
+            key=key,
+            training=training,
+        )
+        info = SearchInfo(
+            mean=mean,
+            std=jnp.sqrt(jnp.diag(cov)),
+            loss=loss,
+            score=jnp.where(finite, fitness, 0.0).sum() / jnp.maximum(finite.sum(), 1),
+            best=jnp.max(jnp.where(finite, fitness, -jnp.inf)),
+            non_finite=jnp.sum(~finite),
+            at_bound=jnp.sum(raw != population, axis=0),
+            training=training_info,
+        )
+        return new, info
+
+    def _train_critic(
+        self,
+        state: critic.CriticState,
+        key: jax.Array,
+        real: jax.Array,
+        fake: jax.Array,
+        weight: jax.Array,
+    ) -> tuple[critic.CriticState, jax.Array]:
+        c = self.config
+        n, k = fake.shape[:2]
+        take = min(c.fake_per_individual, k)
+        batch = min(c.real_batch, real.shape[0])
+
+        def update(s: Any, k_step: jax.Array) -> Any:
+            k_real, k_fake, k_loss = jax.random.split(k_step, 3)
+            if batch < real.shape[0]:
+                rows = jax.random.randint(k_real, (batch,), 0, real.shape[0])
+                chosen = real[rows]
+            else:
+                chosen = real
+            cols = jax.random.randint(k_fake, (n, take), 0, k)
+            some = jnp.take_along_axis(fake, cols[..., None], axis=1)
+            w = jnp.take_along_axis(weight, cols, axis=1)
+            return critic.update(
+                self.critic_config,
+                s,
+                k_loss,
+                chosen,
+                some.reshape(n * take, -1),
+                w.reshape(-1),
+            )
+
+        keys = jax.random.split(key, max(1, c.discriminator_updates))
+        if not c.discriminator_updates:
+            return state, jnp.zeros(())
+        state, losses = jax.lax.scan(update, state, keys)
+        return state, losses[-1]
+
+    # -- simulation ----------------------------------------------------------
+
+    def _simulate(
+        self, state: SearchState, data: SearchData, population: jax.Array, key: Any
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """Discriminator inputs: real ``(K, F)``, simulated ``(N, K', F)``, weights
+        ``(N, K')`` and which individuals stayed finite ``(N,)``."""
+        theta = self.space.to_si(population)
+        center = self.space.to_si(state.mean)
+        simulate = self._replay if self.config.source == "replay" else self._roll
+        simulated = simulate(data, theta, center, key)
+        real_seg, real_ref, fake_seg, fake_ref, weight = simulated
+        real_out = self._outcome(real_seg, real_ref)
+        fake_out = jax.vmap(self._outcome)(fake_seg, fake_ref)
+        ok = jnp.isfinite(fake_out).all(-1)
+        # Masked, counted and ranked last; zeros only keep NaN out of the sums.
+        fake_out = jnp.where(ok[..., None], fake_out, 0.0)
+        weight = weight * ok
+        real_out, fake_out = self._scaled(data, real_out, fake_out, weight)
+        base = self._base_inputs(data)
+        real = jnp.concatenate([base(real_seg), real_out], -1)
+        fake = jnp.concatenate([jax.vmap(base)(fake_seg), fake_out], -1)
+        fake = jnp.where(ok[..., None], fake, 0.0)
+        return real, fake, weight, ok.all(1)
+
+    def _replay(
+        self, data: SearchData, theta: jax.Array, center: jax.Array, key: Any
+    ) -> tuple[Segments, Any, Segments, Any, jax.Array]:
+        """Every individual replays the same measured pieces."""
+        c, nv = self.config, self.machine.mj_model.nv
+        k_pick, k_start, k_end = jax.random.split(key, 3)
+        count = data.segments.count
+        seg = data.segments
+        if c.segments < count:
+            rows = jax.random.choice(k_pick, count, (c.segments,), replace=False)
+            seg = seg.take(rows)
+        m, n = seg.qpos.shape[0], theta.shape[0]
+        # What is simulated gets the noise that what is measured has: in its start
+        # (the log's start is off by it) and in its end, the same for everybody.
+        z = data.noise * jax.random.normal(k_start, (m, 2 * nv))
+        noise = data.noise * jax.random.normal(k_end, (m, c.horizon, 2 * nv))
+        starts = (self._noisy(seg, z), seg)
+
+        def states(chunk: Any, starts: Any) -> Any:
+            def one(item: Any) -> Any:
+                t, exact = item
+                start = jax.tree.map(
+                    lambda a, b: jnp.where(exact, b, a), starts[0], starts[1]
+                )
+                return replay.predict(self.machine, self.machine.model(t), start)
+
+            return jax.lax.map(one, chunk, batch_size=max(1, _CHUNK // m))
+
+        # The mean model goes along as one more individual, from the starts as
+        # measured: one compiled simulation serves both.
+        everyone = jnp.concatenate([theta, center[None]])
+        exact = jnp.arange(n + 1) == n
+        out = sharded_map(states, self.mesh, (everyone, exact), starts)
+        (qpos, qvel), reference = (
+            jax.tree.map(lambda x, s=s: x[s], out) for s in (slice(n), n)
+        )
+        if seg.qpos.shape[1] == nv:
+            qpos = qpos + noise[..., :nv]
+        tile = lambda x: jnp.broadcast_to(x, (n, *x.shape))  # noqa: E731
+        fake = Segments(
+            qpos=tile(seg.qpos),
+            qvel=tile(seg.qvel),
+            ctrl=tile(seg.ctrl),
+            next_qpos=qpos,
+            next_qvel=qvel + noise[..., nv:],
+        )
+        return seg, reference, fake, jax.tree.map(tile, reference), jnp.ones((n, m))
+
+    def _roll(
+        self, data: SearchData, theta: jax.Array, center: jax.Array, key: Any
+    ) -> tuple[Segments, Any, Segments, Any, jax.Array]:
+        """Every individual runs the controller from a reset."""
+        c, n = self.config, theta.shape[0]
+        k_pick, k_roll = jax.random.split(key)
+        keys = jax.random.split(k_roll, n)
+        if c.common_random_numbers:
+            keys = jnp.broadcast_to(keys[:1], keys.shape)
+        model = self.machine.model(center)
+
+        def trajectories(chunk: Any, policy: Any, model: Any) -> Any:
+            def one(item: Any) -> Any:
+                t, k = item
+                seg, weight = policy_rollout(
+                    self.env,
+                    self.machine.model(t),
+                    lambda obs, kk: self.act(policy, obs, kk),  # type: ignore[misc]
+                    k,
+                    c.rollout_steps,
+                    auto_reset=not c.mask_resets,
+                )
+                return seg, self._reference(model, seg), weight
+
+            return jax.lax.map(one, chunk, batch_size=_CHUNK)
+
+        fake, reference, weight = sharded_map(
+            trajectories, self.mesh, (theta, keys), data.policy, model
+        )
+        count = data.segments.count
+        rows = jax.random.randint(k_pick, (min(c.real_batch, count),), 0, count)
+        real = data.segments.take(rows)
+        return real, self._reference(model, real), fake, reference, weight
+
+    def _noisy(self, seg: Segments, z: jax.Array) -> Segments:
+        """Starts moved by tangent vectors ``z (M, 2 nv)``."""
+        nv = self.machine.mj_model.nv
+        return dataclasses.replace(
+            seg,
+            qpos=jax.vmap(self.machine.move)(seg.qpos, z[:, :nv]),
+            qvel=seg.qvel + z[:, nv:],
+        )
+
+    # -- discriminator inputs ------------------------------------------------
+
+    def _reference(self, center: Any, seg: Segments) -> Any:
+        """The mean model's prediction, where the inputs need it."""
+        if not self.config.innovation_inputs:
+            return ()
+        return replay.predict(self.machine, center, seg)
+
+    def _outcome(self, seg: Segments, reference: Any) -> jax.Array:
+        """Innovation, s' - s or s', flat ``(M, H 2 nv)``."""
+        if self.config.innovation_inputs:
+            states = (seg.next_qpos, seg.next_qvel)
+            out = replay.innovations(self.machine, reference, states)
+        elif self.config.delta_inputs:
+            out = replay.motion(self.machine, seg)
+        else:
+            out = jnp.concatenate([seg.next_qpos, seg.next_qvel], axis=-1)
+        return out.reshape(seg.qpos.shape[0], -1)
+
+    def _scaled(
+        self, data: SearchData, real: jax.Array, fake: jax.Array, weight: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Outcomes in units of order one."""
+        c = self.config
+        if c.innovation_inputs:
+            # The population's own spread, anew each generation: the discriminator
+            # sees differences of order one however narrow the population is.
+            square = (fake**2 * weight[..., None]).sum((0, 1))
+            spread = jnp.sqrt(square / jnp.maximum(weight.sum(), 1.0))
+            spread = jnp.where(spread > 0, spread, 1.0)
+            return (
+                jnp.clip(real / spread, -_CLIP, _CLIP),
+                jnp.clip(fake / spread, -_CLIP, _CLIP),
+            )
+        if c.standardize_inputs:
+            known = self._outcome(data.segments, ())
+            mid, std = known.mean(0), known.std(0)
+            std = jnp.where(std > 1e-9, std, 1.0)
+            return (real - mid) / std, (fake - mid) / std
+        return real, fake
+
+    def _base_inputs(self, data: SearchData) -> Callable[[Segments], jax.Array]:
+        if not self.config.standardize_inputs:
+            return lambda seg: replay.features(self.machine, seg)
+        known = replay.features(self.machine, data.segments)
+        mid, std = known.mean(0), known.std(0)
+        std = jnp.where(std > 1e-9, std, 1.0)
+        return lambda seg: (replay.features(self.machine, seg) - mid) / std
+
+
+def _only_finite(
+    population: jax.Array, cost: jax.Array, finite: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Ranks non-finite individuals last, in places where they pull nothing.
+
+    Their coordinates become those of finite individuals in turn, so that a strategy
+    which recombines many never moves towards a failure.
+    """
+    order = jnp.argsort(jnp.where(finite, cost, jnp.inf))
+    count = jnp.maximum(finite.sum(), 1)
+    stand_in = order[jnp.arange(cost.shape[0]) % count]
+    worst = jnp.max(jnp.where(finite, cost, -jnp.inf))
+    population = jnp.where(finite[:, None], population, population[stand_in])
+    return population, jnp.where(finite, cost, worst + 1.0)

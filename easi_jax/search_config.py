@@ -1,0 +1,140 @@
+"""What a search is made of; every mended defect of the reference is a switch."""
+
+from dataclasses import dataclass, replace
+
+from easi_jax.errors import UserError, nearest
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """Settings of the EASI search (Algorithm 1). Presets: `default`, `paper`."""
+
+    strategy: str = "mu_lambda"
+    """Evolution strategy: mu_lambda, or a name of evosax's registry (CMA_ES, ...)."""
+    population: int = 300
+    """Individuals in a generation."""
+    generations: int = 50
+    """Generations to run."""
+    elite_ratio: float = 0.5
+    """Share of the population that is recombined (mu / lambda), for mu_lambda."""
+    source: str = "replay"
+    """replay: logged commands from logged states; policy: roll the controller out."""
+    horizon: int = 1
+    """Control steps in a replayed piece."""
+    segments: int = 128
+    """Measured pieces replayed by every individual of a generation."""
+    rollout_steps: int = 200
+    """Control steps of a policy rollout."""
+    discriminator_updates: int = 20
+    """Gradient steps of the discriminator in a generation."""
+    real_batch: int = 4800
+    """Measured transitions in one discriminator step."""
+    fake_per_individual: int = 8
+    """Simulated transitions per individual in one discriminator step."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Widths of the discriminator's layers."""
+    loss: str = "wasserstein"
+    """wasserstein (Eq. 4) or gan (Eq. 3)."""
+    regularizer: str = "clip"
+    """clip (weights to +-0.01), gradient_penalty, or none."""
+    learning_rate: float = 3e-4
+    """RMSprop step of the discriminator."""
+    policy_updates_per_generation: int = 0
+    """Policy training steps under the current distribution in each generation."""
+
+    innovation_inputs: bool = True
+    """Show the discriminator s' minus the mean model's prediction, in units of the
+    population's own spread, instead of s'."""
+    delta_inputs: bool = True
+    """Show s' - s instead of s' (where innovation_inputs is off)."""
+    standardize_inputs: bool = True
+    """Standardize the discriminator's inputs by the measured data."""
+    clip_after_update: bool = True
+    """Clip discriminator weights after each step (Algorithm 1), not before."""
+    uniform_first_generation: bool = True
+    """Evaluate a truly uniform first generation, not a moment-matched Gaussian."""
+    last_evaluation: bool = True
+    """Let the result use the last generation's evaluation."""
+    respect_bounds: bool = True
+    """Keep individuals and samples of the result inside the physical bounds."""
+    mask_resets: bool = True
+    """No transition crosses a reset."""
+    common_random_numbers: bool = True
+    """Same starts and noise for all individuals of a generation."""
+    spread_about: str = "old_mean"
+    """Measure the spread about the old_mean (keeps it while moving) or new_mean."""
+    log_scale: bool = True
+    """Search positive parameters on a logarithmic scale."""
+
+    def __post_init__(self) -> None:
+        """Checks names and sizes; raises UserError."""
+        choices = {
+            "source": ("replay", "policy"),
+            "loss": ("wasserstein", "gan"),
+            "regularizer": ("clip", "gradient_penalty", "none"),
+            "spread_about": ("old_mean", "new_mean"),
+        }
+        for field, known in choices.items():
+            value = getattr(self, field)
+            if value not in known:
+                raise UserError(
+                    f'search {field} is "{value}" (known: {", ".join(known)})'
+                    f"{nearest(value, known)}"
+                )
+        for field in (
+            "population",
+            "generations",
+            "horizon",
+            "segments",
+            "rollout_steps",
+            "real_batch",
+            "fake_per_individual",
+        ):
+            if getattr(self, field) < 1:
+                raise UserError(
+                    f"search {field} is {getattr(self, field)}: give at least 1"
+                )
+        if self.population < 4:
+            raise UserError(f"search population is {self.population}: give at least 4")
+        if not 0 < self.elite_ratio <= 1:
+            raise UserError(
+                f"search elite_ratio is {self.elite_ratio}: give a share in (0, 1]"
+            )
+
+
+DEFAULT = SearchConfig()
+
+PAPER = SearchConfig(
+    source="policy",
+    hidden=(128, 128),
+    fake_per_individual=16,
+    discriminator_updates=10,
+    innovation_inputs=False,
+    delta_inputs=False,
+    standardize_inputs=False,
+    clip_after_update=False,
+    uniform_first_generation=False,
+    last_evaluation=False,
+    respect_bounds=True,
+    mask_resets=False,
+    common_random_numbers=False,
+    spread_about="new_mean",
+    log_scale=False,
+)
+"""The reference's recipe, defects included (Cartpole: 10 discriminator steps)."""
+
+PRESETS = {"default": DEFAULT, "paper": PAPER}
+
+
+def preset(name: str, **changes: object) -> SearchConfig:
+    """A preset with some fields changed.
+
+    Raises:
+        UserError: no preset of that name.
+    """
+    if name not in PRESETS:
+        raise UserError(
+            f'unknown preset "{name}" (known: {", ".join(PRESETS)})'
+            f"{nearest(name, PRESETS)}"
+        )
+    return replace(PRESETS[name], **changes)  # type: ignore[arg-type]
