@@ -169,7 +169,8 @@ def _scale_inertia(writers: Iterable[Writer], old: mjx.Model, m: Any) -> Any:
     if not bodies.size:
         return m
     ratio = m.body_mass[bodies] / old.body_mass[bodies]
-    return m.replace(body_inertia=m.body_inertia.at[bodies].multiply(ratio[:, None]))
+    inertia = m.body_inertia[bodies] * ratio[:, None]
+    return m.replace(body_inertia=m.body_inertia.at[bodies].set(inertia))
 
 
 def _write_length(m: Any, w: Writer, axis: int, theta: jax.Array) -> Any:

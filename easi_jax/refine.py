@@ -61,8 +61,8 @@ def refine(
     low, high = space.unit_bounds
     anchor = unit
     pull = jnp.full(space.size, 1.0 / prior_std**2)
-    weight = jnp.ones_like(segments.next_qvel[..., :1])
-    weight = jnp.broadcast_to(weight, (*weight.shape[:2], 2 * machine.mj_model.nv))
+    shape = (segments.count, segments.horizon, 2 * machine.mj_model.nv)
+    weight = jnp.broadcast_to(segments.weight[:, None, None], shape)
 
     def equations(u: jax.Array, delta: jax.Array) -> tuple[Normal, jax.Array]:
         eq = normal_equations(machine, space, u, delta, segments, noise, weight, mesh)

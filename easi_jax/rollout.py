@@ -19,13 +19,13 @@ def policy_rollout(
     key: jax.Array,
     steps: int,
     auto_reset: bool = False,
-) -> tuple[Segments, jax.Array]:
+) -> Segments:
     """One trajectory of ``act(obs, key) -> action`` from a reset.
 
     Returns:
-        Segments with horizon 1, ``(steps, 1, ...)``, and weights ``(steps,)``:
-        1 where the transition counts. Without ``auto_reset`` the trajectory ends at
-        termination and later weights are 0. With it, as in EASI's reference, the
+        Segments with horizon 1, ``(steps, 1, ...)``, weight 1 where the transition
+        counts. Without ``auto_reset`` the trajectory ends at termination and later
+        weights are 0. With it, as in EASI's reference, the
         state after a termination is that of the next episode, and the transition
         across is kept.
     """
@@ -47,12 +47,13 @@ def policy_rollout(
             ctrl=env.control(action)[None],
             next_qpos=after.physics.qpos[None],
             next_qvel=after.physics.qvel[None],
+            weight=alive,
         )
         if auto_reset:
-            return (after, alive), (seg, alive)
+            return (after, alive), seg
         # A finished episode stands still instead of running on into nonsense.
         held = jax.tree.map(lambda a, b: jnp.where(alive > 0, a, b), after, state)
-        return (held, alive * (1.0 - done)), (seg, alive)
+        return (held, alive * (1.0 - done)), seg
 
     init = (env.reset(model, k_reset), jnp.ones(()))
     _, out = jax.lax.scan(step, init, jax.random.split(k_run, steps))
@@ -60,18 +61,32 @@ def policy_rollout(
 
 
 def collect(
-    env: Env,
-    models: Any,
-    act: Act,
-    key: jax.Array,
-    trajectories: int,
-    steps: int,
-    models_axis: int | None = None,
-) -> tuple[Segments, jax.Array]:
-    """``trajectories`` independent rollouts: leaves ``(B, steps, ...)``."""
-
-    def one(model: Any, k: jax.Array) -> Any:
-        return policy_rollout(env, model, act, k, steps)
-
+    env: Env, model: Any, act: Act, key: jax.Array, trajectories: int, steps: int
+) -> Segments:
+    """``trajectories`` rollouts of one model: leaves ``(B, steps, ...)``."""
     keys = jax.random.split(key, trajectories)
-    return jax.vmap(one, in_axes=(models_axis, 0))(models, keys)
+    return jax.vmap(lambda k: policy_rollout(env, model, act, k, steps))(keys)
+
+
+def measured(trajectories: Segments, noise: jax.Array, key: jax.Array) -> Segments:
+    """What sensors would have recorded of trajectories ``(B, T, 1, ...)``.
+
+    Noise ``(2 nv,)`` [standard deviations of positions and velocities] is drawn once
+    per row: the end of a step and the start of the next are one measurement.
+    Positions of free and ball joints stay as they are.
+    """
+    t = trajectories
+    b, steps = t.weight.shape
+    nv = t.qvel.shape[-1]
+    z = noise * jax.random.normal(key, (b, steps + 1, 2 * nv))
+    pos, vel = z[..., :nv], z[..., nv:]
+    start, end = slice(0, steps), slice(1, steps + 1)
+    moved = t.qpos.shape[-1] == nv
+    return Segments(
+        qpos=t.qpos + pos[:, start] if moved else t.qpos,
+        qvel=t.qvel + vel[:, start],
+        ctrl=t.ctrl,
+        next_qpos=t.next_qpos + pos[:, end, None] if moved else t.next_qpos,
+        next_qvel=t.next_qvel + vel[:, end, None],
+        weight=t.weight,
+    )

@@ -183,8 +183,7 @@ class Search:
         real, fake, weight, finite = self._simulate(state, data, population, k_sim)
         trained, loss = self._train_critic(state.critic, k_critic, real, fake, weight)
         scores = critic.score(self.critic_config, trained, fake)
-        total = jnp.maximum(weight.sum(1), 1.0)
-        fitness = (scores * weight).sum(1) / total
+        fitness = (scores * weight).sum(1) / jnp.maximum(weight.sum(1), 1.0)
         told, cost = _only_finite(population, -fitness, finite)
         es_new = self.strategy.tell(k_tell, told, cost, es)
         mean, cov = self.strategy.moments(es_new, told, cost)
@@ -280,13 +279,13 @@ class Search:
         center = self.space.to_si(state.mean)
         simulate = self._replay if self.config.source == "replay" else self._roll
         simulated = simulate(data, theta, center, key)
-        real_seg, real_ref, fake_seg, fake_ref, weight = simulated
+        real_seg, real_ref, fake_seg, fake_ref = simulated
         real_out = self._outcome(real_seg, real_ref)
         fake_out = jax.vmap(self._outcome)(fake_seg, fake_ref)
         ok = jnp.isfinite(fake_out).all(-1)
         # Masked, counted and ranked last; zeros only keep NaN out of the sums.
         fake_out = jnp.where(ok[..., None], fake_out, 0.0)
-        weight = weight * ok
+        weight = fake_seg.weight * ok
         real_out, fake_out = self._scaled(data, real_out, fake_out, weight)
         base = self._base_inputs(data)
         real = jnp.concatenate([base(real_seg), real_out], -1)
@@ -296,15 +295,14 @@ class Search:
 
     def _replay(
         self, data: SearchData, theta: jax.Array, center: jax.Array, key: Any
-    ) -> tuple[Segments, Any, Segments, Any, jax.Array]:
+    ) -> tuple[Segments, Any, Segments, Any]:
         """Every individual replays the same measured pieces."""
         c, nv = self.config, self.machine.mj_model.nv
         k_pick, k_start, k_end = jax.random.split(key, 3)
         count = data.segments.count
         seg = data.segments
         if c.segments < count:
-            rows = jax.random.choice(k_pick, count, (c.segments,), replace=False)
-            seg = seg.take(rows)
+            seg = seg.take(_pick(k_pick, seg.weight, c.segments))
         m, n = seg.qpos.shape[0], theta.shape[0]
         # What is simulated gets the noise that what is measured has: in its start
         # (the log's start is off by it) and in its end, the same for everybody.
@@ -339,12 +337,13 @@ class Search:
             ctrl=tile(seg.ctrl),
             next_qpos=qpos,
             next_qvel=qvel + noise[..., nv:],
+            weight=tile(seg.weight),
         )
-        return seg, reference, fake, jax.tree.map(tile, reference), jnp.ones((n, m))
+        return seg, reference, fake, jax.tree.map(tile, reference)
 
     def _roll(
         self, data: SearchData, theta: jax.Array, center: jax.Array, key: Any
-    ) -> tuple[Segments, Any, Segments, Any, jax.Array]:
+    ) -> tuple[Segments, Any, Segments, Any]:
         """Every individual runs the controller from a reset."""
         c, n = self.config, theta.shape[0]
         k_pick, k_roll = jax.random.split(key)
@@ -356,7 +355,7 @@ class Search:
         def trajectories(chunk: Any, policy: Any, model: Any) -> Any:
             def one(item: Any) -> Any:
                 t, k = item
-                seg, weight = policy_rollout(
+                seg = policy_rollout(
                     self.env,
                     self.machine.model(t),
                     lambda obs, kk: self.act(policy, obs, kk),  # type: ignore[misc]
@@ -364,17 +363,16 @@ class Search:
                     c.rollout_steps,
                     auto_reset=not c.mask_resets,
                 )
-                return seg, self._reference(model, seg), weight
+                return seg, self._reference(model, seg)
 
             return jax.lax.map(one, chunk, batch_size=_CHUNK)
 
-        fake, reference, weight = sharded_map(
+        fake, reference = sharded_map(
             trajectories, self.mesh, (theta, keys), data.policy, model
         )
-        count = data.segments.count
-        rows = jax.random.randint(k_pick, (min(c.real_batch, count),), 0, count)
-        real = data.segments.take(rows)
-        return real, self._reference(model, real), fake, reference, weight
+        count = min(c.real_batch, data.segments.count)
+        real = data.segments.take(_pick(k_pick, data.segments.weight, count))
+        return real, self._reference(model, real), fake, reference
 
     def _noisy(self, seg: Segments, z: jax.Array) -> Segments:
         """Starts moved by tangent vectors ``z (M, 2 nv)``."""
@@ -421,8 +419,7 @@ class Search:
             )
         if c.standardize_inputs:
             known = self._outcome(data.segments, ())
-            mid, std = known.mean(0), known.std(0)
-            std = jnp.where(std > 1e-9, std, 1.0)
+            mid, std = _moments(known, data.segments.weight)
             return (real - mid) / std, (fake - mid) / std
         return real, fake
 
@@ -430,9 +427,27 @@ class Search:
         if not self.config.standardize_inputs:
             return lambda seg: replay.features(self.machine, seg)
         known = replay.features(self.machine, data.segments)
-        mid, std = known.mean(0), known.std(0)
-        std = jnp.where(std > 1e-9, std, 1.0)
+        mid, std = _moments(known, data.segments.weight)
         return lambda seg: (replay.features(self.machine, seg) - mid) / std
+
+
+def _pick(key: jax.Array, weight: jax.Array, count: int) -> jax.Array:
+    """``count`` different rows among those of weight above zero.
+
+    Where there are fewer, some come twice: rows are drawn by their Gumbel keys.
+    """
+    keys = jax.random.gumbel(key, weight.shape)
+    rows = jax.lax.top_k(jnp.where(weight > 0, keys, -jnp.inf), count)[1]
+    good = jnp.maximum((weight > 0).sum(), 1)
+    return rows[jnp.arange(count) % good]
+
+
+def _moments(x: jax.Array, weight: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Weighted mean and standard deviation ``(F,)`` of ``(M, F)``; 1 for constants."""
+    w = weight / jnp.maximum(weight.sum(), 1.0)
+    mid = w @ x
+    std = jnp.sqrt(w @ (x - mid) ** 2)
+    return mid, jnp.where(std > 1e-9, std, 1.0)
 
 
 def _only_finite(

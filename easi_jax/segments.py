@@ -17,6 +17,9 @@ class Segments:
         ctrl: commands, ``(M, H, nu)``; row h is held from row h to h + 1.
         next_qpos, next_qvel: measured states after each step, ``(M, H, nq)``,
             ``(M, H, nv)``.
+        weight: ``(M,)``, 1 where the piece counts, 0 beyond an episode's end.
+        weight: 1 where the piece counts, 0 where its episode was already over,
+            ``(M,)``.
     """
 
     qpos: Any
@@ -24,6 +27,7 @@ class Segments:
     ctrl: Any
     next_qpos: Any
     next_qvel: Any
+    weight: Any
 
     @property
     def count(self) -> int:
@@ -56,12 +60,42 @@ def cut(
         ctrl=ctrl[steps],
         next_qpos=qpos[steps + 1],
         next_qvel=qvel[steps + 1],
+        weight=np.ones(len(starts)),
     )
 
 
 def join(parts: list[Segments]) -> Segments:
     """All segments of ``parts`` (one horizon) as one."""
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+def windows(trajectories: Segments, horizon: int, every: int) -> Segments:
+    """Pieces of ``horizon`` steps from trajectories of single steps; jit-friendly.
+
+    Args:
+        trajectories: leaves ``(B, T, 1, ...)``, weights ``(B, T)``, as from
+            `rollout.collect`.
+
+    Returns:
+        Segments with leaves ``(B * starts, ...)``; a piece counts where all its
+        steps do.
+    """
+    t = trajectories
+    steps = t.weight.shape[1]
+    starts = np.arange(0, steps - horizon + 1, every)
+    rows = starts[:, None] + np.arange(horizon)
+
+    def flat(x: jax.Array) -> jax.Array:
+        return x.reshape(-1, *x.shape[2:])
+
+    return Segments(
+        qpos=flat(t.qpos[:, starts]),
+        qvel=flat(t.qvel[:, starts]),
+        ctrl=flat(t.ctrl[:, rows, 0]),
+        next_qpos=flat(t.next_qpos[:, rows, 0]),
+        next_qvel=flat(t.next_qvel[:, rows, 0]),
+        weight=flat(t.weight[:, rows].min(-1)),
+    )
 
 
 def to_device(segments: Segments) -> Segments:
