@@ -1,0 +1,116 @@
+"""Several trainings at once: the seeds are split over all devices.
+
+Distributions are shared by all seeds, or with ``dist_axis=0`` (``eval_axis=0``)
+each seed has its own and every leaf has a leading axis ``seeds``. ``mesh`` is all
+devices where None. Call these inside ``jax.jit``.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from easi_jax.mesh import make_mesh, sharded_map
+from easi_jax.rl.learner import Info
+from easi_jax.rl.sac import Sac, SacState
+
+
+def init_seeds(
+    sac: Sac,
+    keys: jax.Array,
+    dist: Any,
+    dist_axis: int | None = None,
+    mesh: Mesh | None = None,
+) -> SacState:
+    """``sac.init`` for each of ``keys`` ``(seeds,)``; leaves ``(seeds, ...)``."""
+    inputs = (keys, _per_seed(dist, dist_axis, len(keys)))
+    return _over_seeds(sac.init, inputs, mesh)
+
+
+def run_seeds(
+    sac: Sac,
+    states: SacState,
+    dist: Any,
+    n: int,
+    eval_dist: Any = None,
+    dist_axis: int | None = None,
+    eval_axis: int | None = None,
+    mesh: Mesh | None = None,
+) -> tuple[SacState, Info]:
+    """``sac.run_chunk`` for each seed; history ``(seeds, n)``.
+
+    All seeds must have done the same number of steps.
+    """
+    seeds = states.iteration.shape[0]
+
+    def local(inputs: Any) -> Any:
+        states, dist, eval_dist = inputs
+        clock = jax.tree.map(lambda x: x[0], _clock(states))
+
+        def run(args: Any) -> Any:
+            state, dist, eval_dist = args
+            # Counters are the same for all seeds; as such they keep conditionals
+            # real and writes to the memory contiguous under vmap.
+            return sac.run_chunk(_with_clock(state, clock), dist, n, eval_dist)
+
+        return _map(run, (states, dist, eval_dist))
+
+    inputs = (
+        states,
+        _per_seed(dist, dist_axis, seeds),
+        _per_seed(eval_dist, eval_axis, seeds),
+    )
+    return sharded_map(local, mesh or make_mesh(), inputs)
+
+
+def train_seeds(
+    sac: Sac,
+    keys: jax.Array,
+    dist: Any,
+    eval_dist: Any = None,
+    dist_axis: int | None = None,
+    eval_axis: int | None = None,
+    mesh: Mesh | None = None,
+) -> tuple[SacState, Info]:
+    """``sac.train`` for each of ``keys`` ``(seeds,)``; history ``(seeds, n)``."""
+    seeds = len(keys)
+    inputs = (
+        keys,
+        _per_seed(dist, dist_axis, seeds),
+        _per_seed(eval_dist, eval_axis, seeds),
+    )
+    return _over_seeds(sac.train, inputs, mesh)
+
+
+def _over_seeds(fun: Callable[..., Any], inputs: Any, mesh: Mesh | None) -> Any:
+    return sharded_map(
+        lambda local: _map(lambda args: fun(*args), local), mesh or make_mesh(), inputs
+    )
+
+
+def _map(fun: Callable[[Any], Any], inputs: Any) -> Any:
+    """``fun`` over the leading axis; a single entry needs no batching."""
+    if jax.tree.leaves(inputs)[0].shape[0] > 1:
+        return jax.vmap(fun)(inputs)
+    out = fun(jax.tree.map(lambda x: x[0], inputs))
+    return jax.tree.map(lambda x: x[None], out)
+
+
+def _per_seed(dist: Any, axis: int | None, seeds: int) -> Any:
+    if axis is not None:
+        return dist
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds, *jnp.shape(x))), dist)
+
+
+def _clock(state: SacState) -> tuple[jax.Array, jax.Array, jax.Array]:
+    buffer = state.buffer
+    return state.iteration, buffer.insert_position, buffer.sample_position
+
+
+def _with_clock(state: SacState, clock: tuple[jax.Array, ...]) -> SacState:
+    iteration, insert, sample = clock
+    buffer = replace(state.buffer, insert_position=insert, sample_position=sample)
+    return replace(state, iteration=iteration, buffer=buffer)
