@@ -21,6 +21,7 @@ class Machine:
     Attributes:
         mj_model: the model as given, nominal values in it.
         space: the parameters that may vary.
+        base: the model on the device, nominal values in it, gates opened.
         dt: control step [s].
         substeps: physics steps in a control step. The physics step is ``dt``
             divided by the smallest whole number that brings it to the model's own
@@ -40,16 +41,14 @@ class Machine:
         self.substeps = max(1, pymath.ceil(self.dt / step - 1e-6))
         self.mj_model = mj_model
         self.space = space
+        self.base = self._put()
 
-    @cached_property
-    def base(self) -> Model:
-        """The model at its nominal parameters, on the device, gates opened."""
-        model = put_model(self.mj_model, self.space.addresses)
-        physics_dt = self.dt / self.substeps
-        option = model.mjx.opt.replace(
-            timestep=jnp.asarray(physics_dt, model.mjx.opt.timestep.dtype)
-        )
-        return model.replace(mjx=model.mjx.replace(opt=option))
+    def _put(self) -> Model:
+        # Eagerly, also where a machine is made while something is traced.
+        with jax.ensure_compile_time_eval():
+            model = put_model(self.mj_model, self.space.addresses)
+            step = jnp.asarray(self.dt / self.substeps, model.mjx.opt.timestep.dtype)
+            return model.replace(mjx=model.mjx.tree_replace({"opt.timestep": step}))
 
     def model(self, theta: jax.Array) -> Model:
         """The model at parameters ``theta`` ``(n,)`` in SI units."""

@@ -88,8 +88,12 @@ def _without_clamped(m: mjx.Model, d: mjx.Data) -> mjx.Model:
     clamped = limited & ((force <= edge[:, 0]) | (force >= edge[:, 1]))
     free = jnp.where(clamped, 0.0, 1.0)
     return m.replace(
-        actuator_gainprm=m.actuator_gainprm.at[:, 2].multiply(free),
-        actuator_biasprm=m.actuator_biasprm.at[:, 2].multiply(free),
+        actuator_gainprm=m.actuator_gainprm.at[:, 2].set(
+            m.actuator_gainprm[:, 2] * free
+        ),
+        actuator_biasprm=m.actuator_biasprm.at[:, 2].set(
+            m.actuator_biasprm[:, 2] * free
+        ),
     )
 
 

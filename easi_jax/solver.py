@@ -12,7 +12,7 @@ derivatives are those of the converged solution. Elliptic cones and tendon frict
 stay with MJX's own solver.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,61 +34,81 @@ def solve(model: Any, data: Any, iterations: int) -> Any:
         iterations: Newton steps, all taken.
     """
     impl = data._impl
-    jac, dd, aref = impl.efc_J, impl.efc_D, impl.efc_aref
-    ne, nf = impl.ne, impl.nf
     mass = support.full_m(model, data)
-    smooth = data.qfrc_smooth
+    rows = jnp.arange(impl.efc_J.shape[0])
+    dry = (rows >= impl.ne) & (rows < impl.ne + impl.nf)
+    dry &= not model.opt.disableflags & DisableBit.FRICTIONLOSS
     floss = impl.efc_frictionloss
-    nefc = jac.shape[0]
-    rows = jnp.arange(nefc)
-    is_fri = (rows >= ne) & (rows < ne + nf)
-    if model.opt.disableflags & DisableBit.FRICTIONLOSS:
-        is_fri = jnp.zeros_like(is_fri)
-    inf = jnp.asarray(jnp.inf, dd.dtype)
     # Force on a row is clip(-D x, low, high): two-sided, Huber or one-sided.
-    high = jnp.where(is_fri, floss, inf)
-    low = jnp.where(is_fri, -floss, jnp.where(rows < ne, -inf, 0.0))
-
-    def force_of(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        raw = -dd * x
-        active = (raw > low) & (raw < high)
-        return jnp.clip(raw, low, high), active
-
-    def cost_of(a: jax.Array) -> jax.Array:
-        x = jac @ a - aref
-        force, _ = force_of(x)
-        # s(x) = -(f x) - f^2/(2 D) holds on every piece, f being the clipped force.
-        rows_cost = -force * x - 0.5 * force * force / dd
-        da = a - data.qacc_smooth
-        return 0.5 * da @ (mass @ da) + rows_cost.sum()
-
-    start = data.qacc_smooth
+    high = jnp.where(dry, floss, jnp.inf)
+    low = jnp.where(dry, -floss, jnp.where(rows < impl.ne, -jnp.inf, 0.0))
+    problem = _Problem(
+        mass, data.qfrc_smooth, impl.efc_J, impl.efc_D, impl.efc_aref, low, high
+    )
+    fixed = jax.lax.stop_gradient(problem)
+    smooth, warm = jax.lax.stop_gradient((data.qacc_smooth, data.qacc_warmstart))
+    qacc = smooth
     if not model.opt.disableflags & DisableBit.WARMSTART:
-        warm = data.qacc_warmstart
-        start = jnp.where(cost_of(warm) < cost_of(start), warm, start)
-
-    def newton(a: jax.Array) -> jax.Array:
-        x = jac @ a - aref
-        force, active = force_of(x)
-        grad = mass @ a - smooth - jac.T @ force
-        hess = mass + (jac.T * (dd * active)) @ jac
-        chol = jax.scipy.linalg.cho_factor(hess)
-        p = -jax.scipy.linalg.cho_solve(chol, grad)
-        jv = jac @ p
-        slope0, curve0 = p @ grad + jv @ force, p @ (mass @ p)
-        return a + p * _exact_step(x, jv, dd, low, high, slope0, curve0)
-
-    qacc = start
+        better = fixed.cost(warm, smooth) < fixed.cost(smooth, smooth)
+        qacc = jnp.where(better, warm, smooth)
     for _ in range(iterations):
-        qacc = newton(qacc)
-    force, _ = force_of(jac @ qacc - aref)
+        qacc = fixed.newton(qacc)
+    # Implicit function theorem: one more step from the solution is zero in value
+    # and has the solution's derivative. The iterations need none.
+    grad, _ = problem.gradient(qacc)
+    step = -_solve_spd(fixed.hessian(qacc), grad)
+    qacc = qacc + step - jax.lax.stop_gradient(step)
+    _, force = problem.gradient(qacc)
     return data.tree_replace(
         {
             "qacc": qacc,
-            "qfrc_constraint": jac.T @ force,
+            "qfrc_constraint": impl.efc_J.T @ force,
             "_impl.efc_force": force,
         }
     )
+
+
+class _Problem(NamedTuple):
+    """The convex problem: mass ``(nv, nv)``, constraint rows ``(nefc, ...)``."""
+
+    mass: jax.Array
+    smooth: jax.Array
+    jac: jax.Array
+    stiff: jax.Array
+    aref: jax.Array
+    low: jax.Array
+    high: jax.Array
+
+    def force(self, x: jax.Array) -> jax.Array:
+        return jnp.clip(-self.stiff * x, self.low, self.high)
+
+    def gradient(self, a: jax.Array) -> tuple[jax.Array, jax.Array]:
+        force = self.force(self.jac @ a - self.aref)
+        return self.mass @ a - self.smooth - self.jac.T @ force, force
+
+    def hessian(self, a: jax.Array) -> jax.Array:
+        raw = -self.stiff * (self.jac @ a - self.aref)
+        active = (raw > self.low) & (raw < self.high)
+        return self.mass + (self.jac.T * (self.stiff * active)) @ self.jac
+
+    def cost(self, a: jax.Array, center: jax.Array) -> jax.Array:
+        x = self.jac @ a - self.aref
+        force, da = self.force(x), a - center
+        # s(x) = -f x - f^2 / (2 D) on every piece, f being the clipped force.
+        rows = -force * x - 0.5 * force * force / self.stiff
+        return 0.5 * da @ (self.mass @ da) + rows.sum()
+
+    def newton(self, a: jax.Array) -> jax.Array:
+        grad, force = self.gradient(a)
+        p = -_solve_spd(self.hessian(a), grad)
+        x, jv = self.jac @ a - self.aref, self.jac @ p
+        slope0, curve0 = p @ grad + jv @ force, p @ (self.mass @ p)
+        args = (x, jv, self.stiff, self.low, self.high, slope0, curve0)
+        return a + p * _exact_step(*args)
+
+
+def _solve_spd(a: jax.Array, b: jax.Array) -> jax.Array:
+    return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(a), b)
 
 
 def _exact_step(
@@ -117,12 +137,12 @@ def _exact_step(
     finite = jnp.concatenate([moving, moving]) & jnp.isfinite(limits)
     at = -(jnp.where(finite, limits, 0.0) / jnp.tile(dd, 2) + jnp.tile(x, 2))
     at = at / jnp.tile(safe, 2)
-    at = jax.lax.stop_gradient(jnp.where(finite & (at > 0), at, jnp.inf))
+    at = jnp.where(finite & (at > 0), at, jnp.inf)
     below = jax.vmap(slope)(jnp.where(jnp.isfinite(at), at, 0.0)) <= 0
     known = jnp.isfinite(at)
     lo = jnp.max(jnp.where(known & below, at, 0.0), initial=0.0)
     hi = jnp.min(jnp.where(known & ~below, at, jnp.inf), initial=jnp.inf)
-    mid = jax.lax.stop_gradient(jnp.where(jnp.isfinite(hi), 0.5 * (lo + hi), lo + 1.0))
+    mid = jnp.where(jnp.isfinite(hi), 0.5 * (lo + hi), lo + 1.0)
     raw = -dd * (x + mid * jv)
     inside = (raw > low) & (raw < high)
     curve = curve0 + (jv * jv * dd * inside).sum()
