@@ -91,8 +91,11 @@ def normal_equations(
         r, push = f(zero), lambda v: jax.jvp(f, (zero,), (v,))[1]
         jac = jnp.moveaxis(jax.vmap(push)(directions), 0, -1)  # (H, 2nv, n + nv2)
         root = jnp.sqrt(w) / noise
-        rw = (r * root).reshape(-1)
-        jw = (jac * root[..., None]).reshape(-1, n + nv2)
+        # A piece of weight zero may hold anything, not finite included.
+        on = w > 0
+        rw = jnp.where(on, r * root, 0.0).reshape(-1)
+        jw = jnp.where(on[..., None], jac * root[..., None], 0.0)
+        jw = jw.reshape(-1, n + nv2)
         a, b = jw[:, :n], jw[:, n:]
         # The start was measured too: its own shift costs d / noise.
         fxx = b.T @ b + jnp.diag(1 / noise**2)

@@ -16,6 +16,7 @@ from jax.sharding import Mesh
 
 from easi_jax import discriminator as critic
 from easi_jax import replay
+from easi_jax.distribution import gaussian
 from easi_jax.machine import Machine
 from easi_jax.mesh import make_mesh, sharded_map
 from easi_jax.rollout import policy_rollout
@@ -94,9 +95,8 @@ class Search:
         config: settings.
         env: environment for ``source="policy"``.
         act: ``act(policy, obs, key) -> action`` for ``source="policy"``.
-        trainer: policy training with ``init(key, dist)`` and ``step(state, dist)``
-            for ``policy_updates_per_generation``; dist is ``(mean, cov)`` in unit
-            coordinates.
+        trainer: ``step(state, distribution) -> (state, info)`` of policy training,
+            for ``policy_updates_per_generation``.
         mesh: devices to spread the population over (default: all).
     """
 
@@ -106,7 +106,7 @@ class Search:
         config: SearchConfig,
         env: Any = None,
         act: Callable[..., jax.Array] | None = None,
-        trainer: Any = None,
+        trainer: Callable[..., Any] | None = None,
         mesh: Mesh | None = None,
     ) -> None:
         if config.source == "policy" and (env is None or act is None):
@@ -134,10 +134,13 @@ class Search:
 
     # -- state ---------------------------------------------------------------
 
-    def init(self, key: jax.Array, data: SearchData) -> SearchState:
-        """Starts from the space's initial range, moment-matched."""
+    def init(self, key: jax.Array, data: SearchData, training: Any = ()) -> SearchState:
+        """Starts from the space's initial range, moment-matched.
+
+        ``training`` is the trainer's state, where the search trains a policy too.
+        """
         n = self.space.size
-        k_es, k_critic, k_train, k_run = jax.random.split(key, 4)
+        k_es, k_critic, k_run = jax.random.split(key, 3)
         mean, std = jnp.full(n, 0.5), jnp.full(n, 12.0**-0.5)
         cov = jnp.diag(std**2)
         seg = data.segments
@@ -154,7 +157,7 @@ class Search:
             result_cov=cov,
             generation=jnp.zeros((), jnp.int32),
             key=k_run,
-            training=self.trainer.init(k_train, (mean, cov)) if self.trainer else (),
+            training=training if self.trainer else (),
         )
 
     def run(
@@ -199,9 +202,9 @@ class Search:
             mean = jnp.clip(mean, low, high)
         training, training_info = state.training, ()
         if self.trainer:
-            train_step = self.trainer.step
+            train_step, dist = self.trainer, gaussian(self.space, mean, cov)
             training, training_info = jax.lax.scan(
-                lambda s, _: train_step(s, (mean, cov)),
+                lambda s, _: train_step(s, dist),
                 training,
                 None,
                 length=c.policy_updates_per_generation,

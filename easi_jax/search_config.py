@@ -63,6 +63,8 @@ class SearchConfig:
     """Same starts and noise for all individuals of a generation."""
     spread_about: str = "old_mean"
     """Measure the spread about the old_mean (keeps it while moving) or new_mean."""
+    informed_spread: bool = True
+    """Give the result the initial spread along what the data leave open."""
     log_scale: bool = True
     """Search positive parameters on a logarithmic scale."""
 
@@ -119,6 +121,7 @@ PAPER = SearchConfig(
     mask_resets=False,
     common_random_numbers=False,
     spread_about="new_mean",
+    informed_spread=False,
     log_scale=False,
 )
 """The reference's recipe, defects included (Cartpole: 10 discriminator steps)."""

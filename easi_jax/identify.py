@@ -1,0 +1,103 @@
+"""From the end of a search to an honest distribution over parameters."""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from easi_jax.distribution import Distribution, gaussian
+from easi_jax.information import normal_equations
+from easi_jax.machine import Machine
+from easi_jax.parameters import ParameterSpace
+from easi_jax.refine import refine
+from easi_jax.replay import motion
+from easi_jax.segments import Segments
+
+FLOOR = 1e-3  # of the motion: what a model is never trusted to be better than
+_INITIAL_VARIANCE = 1.0 / 12.0  # of a uniform initial range, unit coordinates
+
+
+@flax.struct.dataclass
+class Estimate:
+    """What a search, and the refinement after it, say about the parameters.
+
+    Attributes:
+        distribution: the Gaussian that training samples from.
+        search_mean: mean found by the adversarial search, unit coordinates, ``(n,)``.
+        search_cov: its covariance, ``(n, n)``.
+        hessian: Fisher information of the data at the final mean, ``(n, n)``.
+        noise: standard deviations that the information was computed with.
+        cost: weighted error after each step of refinement (empty without).
+    """
+
+    distribution: Distribution
+    search_mean: jax.Array
+    search_cov: jax.Array
+    hessian: jax.Array
+    noise: jax.Array
+    cost: jax.Array
+
+
+def effective_noise(
+    machine: Machine, segments: Segments, noise: jax.Array
+) -> jax.Array:
+    """Noise ``(2 nv,)``, not below a thousandth of the motion's RMS per channel."""
+    moved = motion(machine, segments)
+    w = segments.weight[:, None, None]
+    square = (moved**2 * w).sum((0, 1)) / jnp.maximum(w.sum() * moved.shape[1], 1.0)
+    return jnp.maximum(noise, jnp.maximum(FLOOR * jnp.sqrt(square), 1e-9))
+
+
+def estimate(
+    machine: Machine,
+    space: ParameterSpace,
+    mean: jax.Array,
+    cov: jax.Array,
+    pieces: Segments,
+    noise: jax.Array,
+    refined: bool,
+    informed: bool = True,
+    mesh: Mesh | None = None,
+) -> Estimate:
+    """The result of a search at ``mean``, ``cov`` (unit coordinates); pure.
+
+    The covariance joins two sources: the search's own spread, and what the data leave
+    open, ``(F + prior)^-1`` with F the Fisher information of ``pieces`` and the
+    initial range as prior. A direction that the data do not show keeps the initial
+    spread, whatever the search has drifted to. Without ``informed`` it is the search's
+    own covariance alone.
+    """
+    assumed = effective_noise(machine, pieces, noise)
+    n = space.size
+    if refined:
+        fit = refine(machine, space, mean, pieces, assumed, mesh=mesh)
+        center, hessian, cost = fit.unit, fit.hessian, fit.cost
+    else:
+        weight = jnp.broadcast_to(
+            pieces.weight[:, None, None], pieces.next_qvel.shape[:2] + (len(noise),)
+        )
+        zero = jnp.zeros((pieces.count, len(noise)))
+        hessian = normal_equations(
+            machine, space, mean, zero, pieces, assumed, weight, mesh
+        ).hessian
+        center, cost = mean, jnp.zeros(0)
+    prior = jnp.eye(n) / _INITIAL_VARIANCE
+    open_cov = jnp.linalg.inv(hessian + prior)
+    own = jnp.zeros((n, n)) if refined else _seen_part(cov, hessian)
+    total = open_cov + own if informed else cov
+    return Estimate(
+        distribution=gaussian(space, center, 0.5 * (total + total.T)),
+        search_mean=mean,
+        search_cov=cov,
+        hessian=hessian,
+        noise=assumed,
+        cost=cost,
+    )
+
+
+def _seen_part(cov: jax.Array, hessian: jax.Array) -> jax.Array:
+    """The share of ``cov`` in directions where the data say more than the prior."""
+    values, vectors = jnp.linalg.eigh(hessian)
+    seen = values / (values + 1.0 / _INITIAL_VARIANCE)
+    filter_ = (vectors * seen) @ vectors.T
+    return filter_ @ cov @ filter_.T
