@@ -74,7 +74,7 @@ def estimate(
         center, hessian, cost = fit.unit, fit.hessian, fit.cost
     else:
         weight = jnp.broadcast_to(
-            pieces.weight[:, None, None], pieces.next_qvel.shape[:2] + (len(noise),)
+            pieces.weight[:, None, None], (*pieces.next_qvel.shape[:2], len(noise))
         )
         zero = jnp.zeros((pieces.count, len(noise)))
         hessian = normal_equations(

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from easi_jax.information import Normal, normal_equations
+from easi_jax.information import normal_equations
 from easi_jax.machine import Machine
 from easi_jax.mesh import make_mesh
 from easi_jax.parameters import ParameterSpace
@@ -28,8 +28,9 @@ class RefineResult:
     Attributes:
         unit: parameters, unit coordinates, ``(n,)``.
         hessian: information at them, without the prior, ``(n, n)``.
-        cost: half the weighted squared error after each iteration, ``(I,)``.
-        accepted: whether each step lowered it, ``(I,)``.
+        cost: half the weighted squared error, at the start and after each iteration,
+            ``(I + 1,)``.
+        accepted: whether each lowered it, ``(I + 1,)``.
         delta: corrections of the starts, ``(M, 2 nv)``.
     """
 
@@ -64,32 +65,37 @@ def refine(
     shape = (segments.count, segments.horizon, 2 * machine.mj_model.nv)
     weight = jnp.broadcast_to(segments.weight[:, None, None], shape)
 
-    def equations(u: jax.Array, delta: jax.Array) -> tuple[Normal, jax.Array]:
-        eq = normal_equations(machine, space, u, delta, segments, noise, weight, mesh)
-        return eq, eq.cost + 0.5 * jnp.sum(pull * (u - anchor) ** 2)
-
     def step(carry: Any, _: None) -> Any:
-        u, delta, eq, cost, damp = carry
-        hess = eq.hessian + jnp.diag(pull)
-        grad = eq.gradient + pull * (u - anchor)
-        du = -jnp.linalg.solve(hess + jnp.diag(damp * jnp.diag(hess)), grad)
-        trial = jnp.clip(u + du, low, high)
-        shift = (
-            delta + eq.start_step + jnp.einsum("mdn,n->md", eq.start_gain, trial - u)
-        )
-        new_eq, new_cost = equations(trial, shift)
-        better = jnp.isfinite(new_cost) & (new_cost < cost)
-        pick = lambda a, b: jax.tree.map(  # noqa: E731
-            lambda x, y: jnp.where(better, x, y), a, b
-        )
-        carry = pick((trial, shift, new_eq, new_cost), (u, delta, eq, cost))
+        # Evaluates a trial, keeps the better, proposes the next: the simulation is
+        # in the program once.
+        u, shift, best_u, best_shift, best, best_cost, damp = carry
+        eq = normal_equations(machine, space, u, shift, segments, noise, weight, mesh)
+        cost = eq.cost + 0.5 * jnp.sum(pull * (u - anchor) ** 2)
+        better = jnp.isfinite(cost) & (cost < best_cost)
+        new, old = (u, shift, eq, cost), (best_u, best_shift, best, best_cost)
+        kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
+        best_u, best_shift, best, best_cost = kept
         damp = jnp.clip(jnp.where(better, damp * 0.2, damp * 8.0), 1e-9, 1e6)
-        return (*carry, damp), (carry[3], better)
+        hess = best.hessian + jnp.diag(pull)
+        grad = best.gradient + pull * (best_u - anchor)
+        du = -jnp.linalg.solve(hess + jnp.diag(damp * jnp.diag(hess)), grad)
+        u = jnp.clip(best_u + du, low, high)
+        gain = jnp.einsum("mdn,n->md", best.start_gain, u - best_u)
+        shift = best_shift + best.start_step + gain
+        return (u, shift, *kept, damp), (best_cost, better)
 
-    delta0 = jnp.zeros((segments.qpos.shape[0], 2 * machine.mj_model.nv))
-    eq0, cost0 = equations(unit, delta0)
-    init = (unit, delta0, eq0, cost0, jnp.asarray(1e-3))
-    (u, delta, eq, _, _), (costs, better) = jax.lax.scan(
-        step, init, None, length=iterations
+    shift = jnp.zeros((segments.qpos.shape[0], 2 * machine.mj_model.nv))
+    blank = jax.tree.map(
+        lambda x: jnp.zeros(x.shape, x.dtype),
+        jax.eval_shape(
+            lambda u: normal_equations(
+                machine, space, u, shift, segments, noise, weight, mesh
+            ),
+            unit,
+        ),
     )
-    return RefineResult(u, eq.hessian, costs, better, delta)
+    init = (unit, shift, unit, shift, blank, jnp.asarray(jnp.inf), jnp.asarray(1e-3))
+    (_, _, u, shift, eq, _, _), (costs, better) = jax.lax.scan(
+        step, init, None, length=iterations + 1
+    )
+    return RefineResult(u, eq.hessian, costs, better, shift)

@@ -74,6 +74,8 @@ class SearchInfo:
         score: mean score of the individuals; ``best`` the highest.
         non_finite: individuals whose simulation was no longer finite.
         at_bound: individuals clipped to a bound, per parameter, ``(n,)``.
+        suspects: how far the non-finite individuals are from the others (or, where
+            there are no others, from the nominal values), per parameter, ``(n,)``.
         training: info of policy training, where there is some.
     """
 
@@ -84,6 +86,7 @@ class SearchInfo:
     best: jax.Array
     non_finite: jax.Array
     at_bound: jax.Array
+    suspects: jax.Array
     training: Any
 
 
@@ -229,9 +232,18 @@ class Search:
             best=jnp.max(jnp.where(finite, fitness, -jnp.inf)),
             non_finite=jnp.sum(~finite),
             at_bound=jnp.sum(raw != population, axis=0),
+            suspects=self._suspects(population, finite),
             training=training_info,
         )
         return new, info
+
+    def _suspects(self, population: jax.Array, finite: jax.Array) -> jax.Array:
+        good = finite.astype(population.dtype)
+        lost = (1.0 - good) @ population / jnp.maximum((1.0 - good).sum(), 1.0)
+        kept = good @ population / jnp.maximum(good.sum(), 1.0)
+        nominal = self.space.to_unit(jnp.asarray(self.space.nominal))
+        apart = lost - jnp.where(finite.any(), kept, nominal)
+        return jnp.where(finite.all(), 0.0, apart)
 
     def _train_critic(
         self,

@@ -16,15 +16,13 @@ from evosax.algorithms.distribution_based.simple_es import SimpleES
 from easi_jax.errors import UserError, nearest
 
 MU_LAMBDA = "mu_lambda"
-# Built around several populations or a learned optimizer's own protocol.
-_EXTRA: dict[str, dict[str, Any]] = {
-    "SV_CMA_ES": {"num_populations": 1},
-    "SV_Open_ES": {"num_populations": 1},
-}
 _LEFT_OUT = {
     "PersistentES": "unrolls truncated inner problems, which a simulation is not",
     "NoiseReuseES": "unrolls truncated inner problems, which a simulation is not",
+    "SV_CMA_ES": "keeps several populations apart; with a search's one it is CMA_ES",
+    "SV_Open_ES": "keeps several populations apart; with a search's one it is Open_ES",
 }
+_UNKNOWN = 1e6  # cost of individuals not yet evaluated; inf would spread as NaN
 
 
 class _MuLambda(SimpleES):
@@ -116,8 +114,10 @@ def make_strategy(
         )
         base = es.default_params
     else:
-        es = algorithms[name](population_size, blank, **_EXTRA.get(name, {}))
+        es = algorithms[name](population_size, blank)
         base = es.default_params
+        if name == "LM_MA_ES":  # a rate, made for far more parameters than individuals
+            base = base.replace(c_c=jnp.minimum(base.c_c, 1.0))
 
     population_based = not isinstance(es, DistributionBasedAlgorithm)
 
@@ -132,8 +132,8 @@ def make_strategy(
         if population_based:
             z = jax.random.normal(key, (population_size, size))
             start = jnp.clip(mean + std * z, 0.0, 1.0)
-            worst = jnp.full((population_size,), jnp.inf)
-            state = es.init(key, start, worst, params)
+            unknown = jnp.full((population_size,), _UNKNOWN)
+            state = es.init(key, start, unknown, params)
         else:
             state = es.init(key, mean, params)
         return _strong(state), params

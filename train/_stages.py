@@ -1,0 +1,182 @@
+"""A long stage in chunks: progress, metrics, checkpoints, resume."""
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from train._command import progress
+
+if TYPE_CHECKING:
+    from easi_jax.io.runs import RunFolder
+
+Rows = list[tuple[int, dict[str, float]]]
+
+
+def run_stage(
+    run: "RunFolder",
+    name: str,
+    total: int,
+    chunk: int,
+    init: Callable[[], Any],
+    advance: Callable[[Any, int], tuple[Any, Any]],
+    rows: Callable[[int, Any], Rows],
+    notes: list[str] | None = None,
+    check: Callable[[int, Any], None] | None = None,
+) -> Any:
+    """Takes ``total`` steps in chunks and returns the last state.
+
+    After each chunk its metrics are written and a checkpoint saved; a folder that
+    holds checkpoints of this stage goes on from the last good one.
+
+    Args:
+        name: of the stage; names its metrics and checkpoints.
+        init: the state before the first step.
+        advance: ``advance(state, n) -> (state, info)``.
+        rows: ``rows(first_step, info)``: metrics as ``(step, {name: value})``.
+        notes: where remarks of a resume are added.
+        check: ``check(first_step, info)`` raises where going on is useless; called
+            before the checkpoint is written.
+    """
+    import jax
+
+    from easi_jax.io import checkpoints
+
+    folder = run.checkpoints / name
+    found = checkpoints.restore(
+        folder, jax.eval_shape(init), config_hash=run.config_hash
+    )
+    if found is None:
+        state, done = jax.jit(init)(), 0
+    else:
+        state, done = found.state, found.step
+        if notes is not None:
+            notes.extend(found.notes)
+            notes.append(f"{name}: went on after step {done}")
+    if run.resumed:
+        run.rewind(name, done)
+    with progress(name, total, done) as meter:
+        while done < total:
+            n = min(chunk, total - done)
+            state, info = advance(state, n)
+            info = jax.device_get(info)
+            if check is not None:
+                check(done, info)
+            lines = rows(done, info)
+            for step, values in lines:
+                run.log(name, step, values)
+            done += n
+            checkpoints.save(folder, done, state, config_hash=run.config_hash)
+            last = lines[-1][1] if lines else {}
+            shown = {k: v for k, v in last.items() if "/" not in k}
+            meter.advance(n, **shown)
+    return state
+
+
+def training_rows(seeds: Sequence[int], per_step: int) -> Callable[[int, Any], Rows]:
+    """Metrics of policy training: one line for each evaluation.
+
+    ``step`` counts environment steps; ``return`` is the median over seeds.
+    """
+    import numpy as np
+
+    def rows(first: int, info: Any) -> Rows:
+        value = np.asarray(info["eval_return"])
+        out: Rows = []
+        for i in np.flatnonzero(np.isfinite(value).any(0)):
+            column = value[:, i]
+            line = {"return": float(np.nanmedian(column))}
+            line |= {
+                f"seed{s}/return": float(v) for s, v in zip(seeds, column, strict=True)
+            }
+            out.append(((first + int(i) + 1) * per_step, line))
+        return out
+
+    return rows
+
+
+def training_curve(
+    folder: Path, stage: str, seeds: Sequence[int]
+) -> tuple[list[int], list[list[float]]]:
+    """``(steps, returns[step][seed])`` of a stage from its metrics."""
+    from easi_jax.io.metrics import read_metrics
+
+    lines = read_metrics(folder / "metrics.jsonl", stage)
+    steps = [line["step"] for line in lines]
+    return steps, [
+        [line.get(f"seed{s}/return", math.nan) for s in seeds] for line in lines
+    ]
+
+
+def search_rows(
+    seeds: Sequence[int], names: Sequence[str], to_si: Callable[[Any], Any]
+) -> Callable[[int, Any], Rows]:
+    """Metrics of a search: one line for each generation.
+
+    ``seedS/NAME/mean`` and ``seedS/NAME/std`` are in SI units; the standard deviation
+    of a log parameter is that of its logarithm times the mean.
+    """
+    import numpy as np
+
+    def rows(first: int, info: Any) -> Rows:
+        mean, std = np.asarray(info.mean), np.asarray(info.std)
+        center = np.asarray(to_si(mean))
+        above = np.asarray(to_si(mean + std)) - center
+        out: Rows = []
+        for i in range(mean.shape[1]):
+            line = {
+                "score": float(np.median(info.score[:, i])),
+                "loss": float(np.median(info.loss[:, i])),
+                "non_finite": float(np.sum(info.non_finite[:, i])),
+            }
+            for s, seed in enumerate(seeds):
+                line[f"seed{seed}/non_finite"] = float(info.non_finite[s, i])
+                for j, name in enumerate(names):
+                    line[f"seed{seed}/{name}/mean"] = float(center[s, i, j])
+                    line[f"seed{seed}/{name}/std"] = float(above[s, i, j])
+                    line[f"seed{seed}/{name}/at_bound"] = float(info.at_bound[s, i, j])
+            out.append((first + i + 1, line))
+        return out
+
+    return rows
+
+
+def search_check(
+    seeds: Sequence[int], names: Sequence[str], population: int
+) -> Callable[[int, Any], None]:
+    """Stops a search none of whose simulations stayed finite, with the reason."""
+    import numpy as np
+
+    from easi_jax.errors import UserError
+
+    def check(first: int, info: Any) -> None:
+        lost = np.asarray(info.non_finite) >= population
+        for s, seed in enumerate(seeds):
+            dead = np.flatnonzero(lost[s])
+            if dead.size:
+                worst = np.asarray(info.suspects)[s, dead[0]]
+                order = np.argsort(-np.abs(worst))[:3]
+                blamed = ", ".join(names[j] for j in order)
+                raise UserError(
+                    f"seed {seed}, generation {first + int(dead[0]) + 1}: all "
+                    f"{population} simulations became non-finite; look first at "
+                    f"{blamed} (narrow initial or bounds, or lower the model's "
+                    "timestep)"
+                )
+
+    return check
+
+
+def jit_chunks(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """``fun(*arrays, n)`` compiled once for each chunk length."""
+    import jax
+
+    compiled: dict[int, Any] = {}
+
+    def call(*args: Any) -> Any:
+        *arrays, n = args
+        if n not in compiled:
+            compiled[n] = jax.jit(lambda *a: fun(*a, n))
+        return compiled[n](*arrays)
+
+    return call
