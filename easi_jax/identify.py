@@ -9,7 +9,7 @@ from easi_jax.distribution import Distribution, gaussian
 from easi_jax.information import normal_equations
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
-from easi_jax.refine import refine
+from easi_jax.refine import refine, step_weights
 from easi_jax.replay import motion
 from easi_jax.segments import Segments
 
@@ -58,6 +58,7 @@ def estimate(
     refined: bool,
     informed: bool = True,
     mesh: Mesh | None = None,
+    misfit: jax.Array | None = None,
 ) -> Estimate:
     """The result of a search at ``mean``, ``cov`` (unit coordinates); pure.
 
@@ -65,17 +66,16 @@ def estimate(
     open, ``(F + prior)^-1`` with F the Fisher information of ``pieces`` and the
     initial range as prior. A direction that the data do not show keeps the initial
     spread, whatever the search has drifted to. Without ``informed`` it is the search's
-    own covariance alone.
+    own covariance alone. ``misfit (2 nv,)`` is what the model itself errs by in every
+    step, on top of the noise (see `easi_jax.refine.refine`).
     """
     assumed = effective_noise(machine, pieces, noise)
     n = space.size
     if refined:
-        fit = refine(machine, space, mean, pieces, assumed, mesh=mesh)
+        fit = refine(machine, space, mean, pieces, assumed, mesh=mesh, misfit=misfit)
         center, hessian, cost = fit.unit, fit.hessian, fit.cost
     else:
-        weight = jnp.broadcast_to(
-            pieces.weight[:, None, None], (*pieces.next_qvel.shape[:2], len(noise))
-        )
+        weight = step_weights(pieces, assumed, misfit)
         zero = jnp.zeros((pieces.count, len(noise)))
         hessian = normal_equations(
             machine, space, mean, zero, pieces, assumed, weight, mesh

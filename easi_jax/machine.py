@@ -1,6 +1,5 @@
 """A robot as it is simulated: MuJoCo model, what may vary, control step."""
 
-import math as pymath
 from functools import cached_property
 
 import jax
@@ -13,6 +12,7 @@ from easi_jax.errors import UserError
 from easi_jax.model import Model, put_model, with_parameters
 from easi_jax.parameters import ParameterSpace
 from easi_jax.physics import Physics, at_rest, control_step
+from easi_jax.recording import physics_steps
 
 
 class Machine:
@@ -38,7 +38,7 @@ class Machine:
         self.dt = float(dt) if dt is not None else step
         if not 0 < self.dt < 10:
             raise UserError(f"control step {self.dt} s: give one above 0 and below 10")
-        self.substeps = max(1, pymath.ceil(self.dt / step - 1e-6))
+        self.substeps = physics_steps(self.dt, step)
         self.mj_model = mj_model
         self.space = space
         self.base = self._put()

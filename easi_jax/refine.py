@@ -50,6 +50,7 @@ def refine(
     iterations: int = 12,
     prior_std: float = 3.0,
     mesh: Mesh | None = None,
+    misfit: jax.Array | None = None,
 ) -> RefineResult:
     """Levenberg-Marquardt from ``unit (n,)``; pure, for use inside jit.
 
@@ -57,13 +58,14 @@ def refine(
         noise: standard deviations of the measurement, ``(2 nv,)``, above zero.
         prior_std: weak pull towards the start, in initial ranges, so that
             directions without any information stay where they are.
+        misfit: what the model itself errs by in every step, standard deviations
+            ``(2 nv,)`` on top of the noise; inf leaves a channel's steps out.
     """
     mesh = mesh or make_mesh()
     low, high = space.unit_bounds
     anchor = unit
     pull = jnp.full(space.size, 1.0 / prior_std**2)
-    shape = (segments.count, segments.horizon, 2 * machine.mj_model.nv)
-    weight = jnp.broadcast_to(segments.weight[:, None, None], shape)
+    weight = step_weights(segments, noise, misfit)
 
     def step(carry: Any, _: None) -> Any:
         # Evaluates a trial, keeps the better, proposes the next: the simulation is
@@ -99,3 +101,14 @@ def refine(
         step, init, None, length=iterations + 1
     )
     return RefineResult(u, eq.hessian, costs, better, shift)
+
+
+def step_weights(
+    segments: Segments, noise: jax.Array, misfit: jax.Array | None = None
+) -> jax.Array:
+    """Weight of each measured number, ``(M, H, 2 nv)``: 1 where the model is exact."""
+    share = jnp.ones_like(noise)
+    if misfit is not None:
+        share = 1.0 / (1.0 + (misfit / noise) ** 2)
+    shape = (segments.count, segments.horizon, noise.shape[0])
+    return jnp.broadcast_to(segments.weight[:, None, None] * share, shape)

@@ -1,0 +1,261 @@
+"""Measured runs as data of a search: noise, splits, segments, open-loop error."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from easi_jax import replay
+from easi_jax.configuration import Configuration
+from easi_jax.errors import UserError
+from easi_jax.io.log_rows import Rows, resampled
+from easi_jax.machine import Machine
+from easi_jax.recording import Run
+from easi_jax.segments import Segments, cut, join
+from easi_jax.windows import fitted_velocity
+
+HELD_OUT = 0.25  # of the rows, where whole runs are held out
+LAST = 0.3  # of a single run
+_ORDERS = range(2, 7)
+_MAD = 1.4826  # median absolute deviation -> standard deviation, Gaussian
+_JITTER = 1e-6  # rounding of a written number, as a share of the largest
+_STEPS_AGREE = 1e-3
+_AGREES = 0.1
+_SCALAR = Configuration(1, 1, (0,), (0,), ())
+
+
+def estimate_noise(run: Run) -> np.ndarray:
+    """Measurement noise of a run, standard deviations ``(2 nv,)``.
+
+    Positions: differences of order 2 to 6, in which smooth motion vanishes and white
+    noise grows by ``sqrt(binomial(2k, k))``; the median absolute value keeps jerks
+    out, and the order with the least motion left in it counts. Never below what the
+    resolution of the readings makes, ``step / sqrt(12)``. Velocities: the same where
+    they were measured, else the positions' noise through the quadratic fit.
+    """
+    steps = run.configuration.difference(run.qpos[:-1], run.qpos[1:])
+    sigma = _difference_noise(steps, 1)
+    scalar = list(run.configuration.scalar_qvel)
+    readings = run.qpos[:, list(run.configuration.scalar_qpos)]
+    sigma[scalar] = np.maximum(sigma[scalar], _resolution(readings) / math.sqrt(12.0))
+    if run.qvel_measured:
+        speed = np.maximum(
+            _difference_noise(run.qvel, 0), _resolution(run.qvel) / math.sqrt(12.0)
+        )
+    else:
+        speed = sigma * _fit_gain(len(run), run.dt)
+    return np.concatenate([sigma, speed])
+
+
+def _difference_noise(x: np.ndarray, done: int) -> np.ndarray:
+    """Noise of ``x (T, n)``, which was differenced ``done`` times already."""
+    found = []
+    for order in _ORDERS:
+        if len(x) - (order - done) < 3:
+            break
+        d = np.diff(x, order - done, axis=0)
+        found.append(
+            _MAD * np.median(np.abs(d), 0) / math.sqrt(math.comb(2 * order, order))
+        )
+    return np.min(found, axis=0) if found else np.zeros(x.shape[1])
+
+
+def _resolution(x: np.ndarray) -> np.ndarray:
+    """Smallest step between two readings of each column of ``x (T, n)``."""
+    out = np.zeros(x.shape[1])
+    for i, column in enumerate(x.T):
+        gaps = np.diff(np.unique(column))
+        gaps = gaps[gaps > _JITTER * max(float(np.abs(column).max()), 1e-300)]
+        out[i] = gaps.min() if gaps.size else 0.0
+    return out
+
+
+def _fit_gain(rows: int, dt: float) -> float:
+    """Noise of a fitted velocity per unit of position noise [1/s]."""
+    impulse = np.zeros((rows, 1))
+    impulse[rows // 2] = 1.0
+    return float(np.linalg.norm(fitted_velocity(impulse, dt, _SCALAR)))
+
+
+def pooled_noise(runs: Sequence[Run]) -> np.ndarray:
+    """Median over runs of `estimate_noise`, ``(2 nv,)``."""
+    return np.median([estimate_noise(run) for run in runs], axis=0)
+
+
+def to_common_step(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """Runs at the smallest of their control steps, and notes of what was changed.
+
+    Commands are held, positions and velocities interpolated linearly.
+    """
+    dt = min(run.dt for run in runs)
+    out, notes = [], []
+    for run in runs:
+        if abs(run.dt / dt - 1) <= _STEPS_AGREE:
+            out.append(replace(run, dt=dt))
+            continue
+        rows = Rows(
+            run.time, np.full(len(run), ""), run.qpos, run.qvel, run.ctrl, run.sensors
+        )
+        even = resampled(rows, dt, run.configuration)
+        qvel = even.qvel
+        if not run.qvel_measured:
+            qvel = fitted_velocity(even.qpos, dt, run.configuration)
+        out.append(
+            replace(
+                run,
+                dt=dt,
+                time=even.time,
+                qpos=even.qpos,
+                qvel=qvel,
+                ctrl=even.ctrl,
+                sensors=even.sensors,
+            )
+        )
+        notes.append(
+            f"{run.name}: control step of {run.dt:.6g} s brought to {dt:.6g} s, the "
+            "smallest of all runs, by interpolation"
+        )
+    return out, notes
+
+
+def split_held_out(
+    runs: Sequence[Run], gap_s: float
+) -> tuple[list[Run], list[Run], str]:
+    """Runs to fit, runs held out, and a sentence that says which.
+
+    Of two runs or more, whole runs: the shortest one that has a quarter of the rows
+    (the last of several), or as many of the last as make a quarter. Of a single run
+    its last 30 % behind a gap of ``gap_s`` seconds.
+
+    Raises:
+        UserError: a single run too short to be split.
+    """
+    if len(runs) == 1:
+        run = runs[0]
+        first = round((1 - LAST) * len(run))
+        last = first - math.ceil(gap_s / run.dt)
+        if last < 2 or len(run) - first < 2:
+            raise UserError(
+                f"{run.source}: {len(run)} rows are too few to hold some out behind a "
+                f"gap of {gap_s:g} s: record more, or shorten --horizon"
+            )
+        return (
+            [_rows(run, 0, last)],
+            [_rows(run, first, len(run))],
+            f"the last {100 * LAST:.0f} % of {run.name}",
+        )
+    total = sum(len(run) for run in runs)
+    enough = [i for i, run in enumerate(runs) if len(run) >= HELD_OUT * total]
+    if enough:
+        chosen = {min(enough, key=lambda i: (len(runs[i]), -i))}
+    else:
+        chosen, rows = set(), 0
+        for i in reversed(range(len(runs))):
+            if rows < HELD_OUT * total:
+                chosen.add(i)
+                rows += len(runs[i])
+    held = [run for i, run in enumerate(runs) if i in chosen]
+    return (
+        [run for i, run in enumerate(runs) if i not in chosen],
+        held,
+        ", ".join(run.name for run in held),
+    )
+
+
+def _rows(run: Run, first: int, last: int) -> Run:
+    part = slice(first, last)
+    return replace(
+        run,
+        time=run.time[part],
+        qpos=run.qpos[part],
+        qvel=run.qvel[part],
+        ctrl=run.ctrl[part],
+        sensors={k: v[part] for k, v in run.sensors.items()},
+    )
+
+
+def trusted_velocity(run: Run) -> np.ndarray:
+    """Velocities ``(T, nv)``: those measured where they are the positions' derivative
+    (within a tenth of its RMS and three times its noise), else the derivative."""
+    fitted = fitted_velocity(run.qpos, run.dt, run.configuration)
+    if not run.qvel_measured:
+        return fitted
+    nv = run.qvel.shape[1]
+    slack = 3 * estimate_noise(replace(run, qvel_measured=False))[nv:]
+    rms = np.sqrt(np.mean(fitted**2, 0))
+    off = np.sqrt(np.mean((run.qvel - fitted) ** 2, 0))
+    return np.where(off <= np.maximum(_AGREES * rms, slack), run.qvel, fitted)
+
+
+def segments_from_runs(
+    machine: Machine,
+    runs: Sequence[Run],
+    horizon: int,
+    every: int,
+    fitted: bool = False,
+) -> Segments:
+    """Segments of ``horizon`` control steps, none across two runs.
+
+    Args:
+        machine: its control step is that of the runs.
+        every: steps from one start to the next.
+        fitted: take all velocities from the positions, measured ones too, as the
+            error measure of the log format does.
+
+    Raises:
+        UserError: no run is longer than ``horizon`` steps.
+        ValueError: a run of another control step.
+    """
+    parts = []
+    for run in runs:
+        if abs(run.dt / machine.dt - 1) > _STEPS_AGREE:
+            raise ValueError(f"{run.name}: control step {run.dt}, not {machine.dt}")
+        qvel = (
+            fitted_velocity(run.qpos, run.dt, run.configuration)
+            if fitted
+            else trusted_velocity(run)
+        )
+        parts.append(cut(run.qpos, qvel, run.ctrl, horizon, every))
+    whole = [p for p in parts if p is not None]
+    if not whole:
+        longest = max(runs, key=len)
+        raise UserError(
+            f"no run is longer than {horizon} steps ({horizon * machine.dt:g} s); the "
+            f"longest, {longest.name}, has {len(longest)} rows: record more, or "
+            "shorten --horizon"
+        )
+    return join(whole)
+
+
+def open_loop_error(machine: Machine, model: Any, segments: Segments) -> jax.Array:
+    """RMS over all steps of all segments of the position error, ``(nv,)``."""
+    nv = machine.mj_model.nv
+    error = replay.errors(machine, model, segments)[..., :nv]
+    return jnp.sqrt(jnp.mean(error**2, axis=(0, 1)))
+
+
+def noise_floor(
+    machine: Machine, model: Any, segments: Segments, noise: jax.Array, key: jax.Array
+) -> jax.Array:
+    """What `open_loop_error` of a perfect model would be, ``(nv,)``.
+
+    Noise ``(2 nv,)`` is drawn for starts and targets and pushed through the model.
+    """
+    nv = machine.mj_model.nv
+    k_start, k_end = jax.random.split(key)
+    z = noise * jax.random.normal(k_start, (segments.count, 2 * nv))
+    moved = replace(
+        segments,
+        qpos=jax.vmap(machine.move)(segments.qpos, z[:, :nv]),
+        qvel=segments.qvel + z[:, nv:],
+    )
+    states = replay.predict(machine, model, moved)
+    shift = replay.innovations(
+        machine, replay.predict(machine, model, segments), states
+    )[..., :nv]
+    shift = shift + noise[:nv] * jax.random.normal(k_end, shift.shape)
+    return jnp.sqrt(jnp.mean(shift**2, axis=(0, 1)))
