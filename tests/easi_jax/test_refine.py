@@ -1,0 +1,68 @@
+"""The least-squares finish finds Cartpole, without noise and as well as can be."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from easi_jax import rollout
+from easi_jax.information import identifiability
+from easi_jax.machine import Machine
+from easi_jax.parameters import ParameterSpace
+from easi_jax.refine import RefineResult, refine
+from easi_jax.segments import Segments, windows
+from envs.cartpole import Cartpole
+
+NOISE = jnp.array([5e-4, 2e-3, 1e-2, 2e-2])
+WEIGHED = ("pole_length", "pole_mass", "cart_mass")
+
+
+@pytest.fixture(scope="module")
+def space(cartpole: Cartpole) -> ParameterSpace:
+    return cartpole.space.select([n for n in cartpole.space.names if n not in WEIGHED])
+
+
+@pytest.fixture(scope="module")
+def fit(cartpole: Cartpole, space: ParameterSpace) -> Any:
+    machine = Machine(cartpole.mj_model, space, cartpole.dt)
+
+    @jax.jit
+    def run(unit: jax.Array, seg: Segments, noise: jax.Array) -> RefineResult:
+        return refine(machine, space, unit, seg, noise, iterations=15)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def start(space: ParameterSpace) -> jax.Array:
+    off = np.where(np.arange(space.size) % 2, 0.7, 1.3)
+    return space.to_unit(jnp.asarray(off * space.nominal))
+
+
+def test_recovers_the_truth_without_noise(
+    fit: Any, start: jax.Array, space: ParameterSpace, trajectories: Segments
+) -> None:
+    out = fit(start, windows(trajectories, 10, 10), 1e-2 * NOISE)
+    found = np.asarray(space.to_si(out.unit))
+    ratio = dict(zip(space.names, found / space.nominal, strict=True))
+    for name, r in ratio.items():
+        assert r == pytest.approx(1.0, abs=1e-3), (name, ratio)
+    assert out.cost[-1] < 1e-4 * out.cost[0]
+
+
+def test_is_as_good_as_the_cramer_rao_bound(
+    fit: Any, start: jax.Array, space: ParameterSpace, trajectories: Segments
+) -> None:
+    seen = rollout.measured(trajectories, NOISE, jax.random.key(7))
+    out = fit(start, windows(seen, 10, 10), NOISE)
+    known = identifiability(space, np.asarray(out.hessian))
+    error = np.log(np.asarray(space.to_si(out.unit)) / space.nominal)
+    z = (error / known.std)[known.determined]
+    assert known.determined.sum() >= 5
+    assert np.abs(z).max() < 4
+    # Neither far better than the bound: then the bound would be wrong.
+    assert np.sqrt(np.mean(z**2)) > 0.2
+    assert not (np.diff(np.asarray(out.cost)) > 0).any()
+    assert np.abs(out.delta).max() < 6 * float(NOISE.max())

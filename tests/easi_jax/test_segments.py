@@ -1,0 +1,60 @@
+"""Pieces of recordings start, end and count where they should."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from easi_jax import segments
+
+
+def record(steps: int, offset: float = 0.0) -> tuple[np.ndarray, ...]:
+    """Every entry tells its row: qpos = row, qvel = row / 10, ctrl = -row."""
+    row = np.arange(steps, dtype=float)[:, None] + offset
+    return row, row / 10, -row
+
+
+def test_cut_pairs_commands_with_what_follows_them() -> None:
+    s = segments.cut(*record(10), horizon=3, every=2)
+    assert s is not None
+    assert (s.count, s.horizon) == (4, 3)
+    np.testing.assert_array_equal(s.qpos[:, 0], [0, 2, 4, 6])
+    np.testing.assert_array_equal(s.ctrl[1, :, 0], [-2, -3, -4])
+    np.testing.assert_array_equal(s.next_qpos[1, :, 0], [3, 4, 5])
+    np.testing.assert_allclose(s.next_qvel[3, :, 0], [0.7, 0.8, 0.9])
+    # The last row is an end and never a start.
+    assert s.next_qpos.max() == 9 and s.qpos.max() == 6
+
+
+def test_the_shortest_recording_that_can_be_cut() -> None:
+    assert segments.cut(*record(3), horizon=3, every=1) is None
+    one = segments.cut(*record(4), horizon=3, every=1)
+    assert one is not None and one.count == 1
+
+
+def test_join_and_take() -> None:
+    a = segments.cut(*record(6), horizon=2, every=2)
+    b = segments.cut(*record(5, 100.0), horizon=2, every=1)
+    assert a is not None and b is not None
+    both = segments.join([a, b])
+    np.testing.assert_array_equal(both.qpos[:, 0], [0, 2, 100, 101, 102])
+    some = segments.to_device(both).take(jnp.array([4, 0]))
+    assert some.qpos.dtype == jnp.float32
+    np.testing.assert_array_equal(some.next_qpos[..., 0], [[103, 104], [1, 2]])
+
+
+def test_windows_of_trajectories_count_only_where_all_their_steps_do() -> None:
+    b, t = 2, 7
+    row = jnp.arange(t, dtype=float) + 10 * jnp.arange(b)[:, None]
+    weight = jnp.ones((b, t)).at[1, 4:].set(0.0)
+    single = segments.Segments(
+        qpos=row[..., None],
+        qvel=row[..., None],
+        ctrl=-row[..., None, None],
+        next_qpos=row[..., None, None] + 1,
+        next_qvel=row[..., None, None] + 1,
+        weight=weight,
+    )
+    w = segments.windows(single, horizon=3, every=2)
+    np.testing.assert_array_equal(w.qpos[:, 0], [0, 2, 4, 10, 12, 14])
+    np.testing.assert_array_equal(w.ctrl[1, :, 0], [-2, -3, -4])
+    np.testing.assert_array_equal(w.next_qvel[4, :, 0], [13, 14, 15])
+    np.testing.assert_array_equal(w.weight, [1, 1, 1, 1, 0, 0])
