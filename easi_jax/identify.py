@@ -28,6 +28,7 @@ class Estimate:
         hessian: Fisher information of the data at the final mean, ``(n, n)``.
         noise: standard deviations that the information was computed with.
         cost: weighted error after each step of refinement (empty without).
+        delta: corrections of the pieces' starts within their noise, ``(M, 2 nv)``.
     """
 
     distribution: Distribution
@@ -36,6 +37,7 @@ class Estimate:
     hessian: jax.Array
     noise: jax.Array
     cost: jax.Array
+    delta: jax.Array
 
 
 def effective_noise(
@@ -73,14 +75,14 @@ def estimate(
     n = space.size
     if refined:
         fit = refine(machine, space, mean, pieces, assumed, mesh=mesh, misfit=misfit)
-        center, hessian, cost = fit.unit, fit.hessian, fit.cost
+        center, hessian = fit.unit, fit.hessian
+        cost, delta = fit.cost, fit.delta
     else:
         weight = step_weights(pieces, assumed, misfit)
         zero = jnp.zeros((pieces.count, len(noise)))
-        hessian = normal_equations(
-            machine, space, mean, zero, pieces, assumed, weight, mesh
-        ).hessian
-        center, cost = mean, jnp.zeros(0)
+        eq = normal_equations(machine, space, mean, zero, pieces, assumed, weight, mesh)
+        center, hessian = mean, eq.hessian
+        cost, delta = jnp.zeros(0), eq.start_step
     prior = jnp.eye(n) / _INITIAL_VARIANCE
     open_cov = jnp.linalg.inv(hessian + prior)
     own = jnp.zeros((n, n)) if refined else _seen_part(cov, hessian)
@@ -92,6 +94,7 @@ def estimate(
         hessian=hessian,
         noise=assumed,
         cost=cost,
+        delta=delta,
     )
 
 

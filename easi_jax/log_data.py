@@ -68,7 +68,7 @@ def _resolution(x: np.ndarray) -> np.ndarray:
     """Smallest step between two readings of each column of ``x (T, n)``."""
     out = np.zeros(x.shape[1])
     for i, column in enumerate(x.T):
-        gaps = np.diff(np.unique(column))
+        gaps = np.asarray(np.diff(np.unique(column)), float)
         gaps = gaps[gaps > _JITTER * max(float(np.abs(column).max()), 1e-300)]
         out[i] = gaps.min() if gaps.size else 0.0
     return out
@@ -259,3 +259,33 @@ def noise_floor(
     )[..., :nv]
     shift = shift + noise[:nv] * jax.random.normal(k_end, shift.shape)
     return jnp.sqrt(jnp.mean(shift**2, axis=(0, 1)))
+
+
+def misfit_of(error: jax.Array, noise: jax.Array, weight: jax.Array) -> jax.Array:
+    """What a model errs by beyond the noise, standard deviations ``(2 nv,)``.
+
+    Errors of a model hang together within a segment, so that its steps count for less
+    than as many independent ones: the variance is scaled up by the number of steps
+    that count as one, ``H var(mean of a segment) / var(step)``.
+
+    Args:
+        error: ``(M, H, 2 nv)``.
+        weight: of each segment, ``(M,)``.
+    """
+    share = weight / weight.sum()
+    square = jnp.einsum("m,mhc->c", share, error**2) / error.shape[1]
+    together = error.shape[1] * (share @ error.mean(1) ** 2)
+    alike = jnp.clip(together / jnp.maximum(square, 1e-30), 1.0, error.shape[1])
+    return jnp.sqrt(jnp.maximum(square - noise**2, 0.0) * alike)
+
+
+def outlier_weights(
+    error: jax.Array, noise: jax.Array, misfit: jax.Array, limit: float
+) -> jax.Array:
+    """Weight of each segment ``(M,)``: 1, or less beyond ``limit`` median errors.
+
+    Huber's weight on the RMS over a segment of the error in units of its expectation.
+    """
+    expected = noise**2 + misfit**2
+    size = jnp.sqrt((error**2 / expected).mean((1, 2)))
+    return jnp.minimum(1.0, limit * jnp.median(size) / jnp.maximum(size, 1e-30))

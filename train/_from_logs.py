@@ -1,0 +1,169 @@
+"""Identifies a machine from measured logs; what ``train.easi --data`` does."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from train._command import say, show_table
+from train._log_problem import FINISH, Problem, read_problem
+
+_STEPS = 1_000_000  # physics steps in a generation that are worth their time
+_PASSES = 3  # of the finish: the model's own error is learned from the one before
+_OUTLIER = 2.5  # times the median error: windows beyond it weigh less
+
+
+def run(config: Any) -> None:
+    """Reads, searches, finishes and reports; ``config`` is that of ``train.easi``."""
+    problem = read_problem(config)
+    settings = _settings(config, problem)
+    seeds = config.seeds or (0,)
+    from easi_jax.io.runs import RunFolder
+
+    with RunFolder.open(
+        config.out,
+        config,
+        command="train.easi",
+        resume=config.resume,
+        overwrite=config.overwrite,
+    ) as folder:
+        from train._log_results import write
+
+        states, search = _search(folder, config, settings, problem, seeds)
+        estimates, outliers = _finish(problem, search, states, config.refine)
+        problem.notes.extend(outliers)
+        columns, rows, errors = write(folder, problem, search, estimates, seeds)
+    show_table(f"Parameters of {problem.name}", columns, rows)
+    show_table(*errors)
+    for note in problem.notes:
+        say(f"note: {note}")
+    say(f"report: {config.out / 'report.html'}")
+
+
+def _settings(config: Any, problem: Problem) -> Any:
+    """Search settings; as many pieces a generation as their length lets pay."""
+    from dataclasses import replace
+
+    from easi_jax.errors import UserError
+    from train._robots import search_config
+
+    chosen = search_config(
+        config.preset,
+        config.set,
+        strategy=config.strategy,
+        generations=config.generations,
+        population=config.population,
+        source="replay",
+        horizon=problem.steps,
+    )
+    if chosen.source != "replay" or chosen.policy_updates_per_generation:
+        raise UserError(
+            "logs come without their controller: leave source and "
+            "policy_updates_per_generation alone with --data"
+        )
+    if any(s.startswith("segments=") for s in config.set):
+        return chosen
+    cost = chosen.population * problem.steps * problem.machine.substeps
+    segments = max(16, min(chosen.segments, _STEPS // cost))
+    return replace(chosen, segments=segments)
+
+
+def _search(
+    folder: Any, config: Any, settings: Any, problem: Problem, seeds: Sequence[int]
+) -> Any:
+    import jax
+    import jax.numpy as jnp
+
+    from easi_jax.log_data import segments_from_runs
+    from easi_jax.pipeline import seed_keys
+    from easi_jax.search import Search, SearchData
+    from easi_jax.segments import to_device
+    from train._stages import jit_chunks, run_stage, search_check, search_rows
+
+    search = Search(problem.machine, settings)
+    pieces = segments_from_runs(
+        problem.machine, problem.fit, problem.steps, max(1, problem.steps // 2)
+    )
+    noise = jnp.asarray(problem.noise, jnp.result_type(float))
+    data = SearchData(segments=to_device(pieces), noise=noise)
+    keys = seed_keys(list(seeds))
+    advance = jit_chunks(
+        lambda states, data, n: jax.lax.map(lambda s: search.run(s, data, n), states)
+    )
+    states = run_stage(
+        folder,
+        "search",
+        settings.generations,
+        config.search_chunk,
+        lambda: jax.lax.map(lambda k: search.init(k, data), keys),
+        lambda states, n: advance(states, data, n),
+        search_rows(seeds, search.space.names, search.space.to_si),
+        problem.notes,
+        search_check(seeds, search.space.names, settings.population),
+    )
+    return states, search
+
+
+def _finish(
+    problem: Problem, search: Any, states: Any, refined: bool
+) -> tuple[list[Any], list[str]]:
+    """An `Estimate` a seed, and notes on pieces that fit badly."""
+    from dataclasses import replace
+
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from easi_jax import replay
+    from easi_jax.identify import effective_noise, estimate
+    from easi_jax.information import shift_start
+    from easi_jax.log_data import misfit_of, outlier_weights, segments_from_runs
+    from easi_jax.segments import to_device
+
+    machine, space = problem.machine, search.space
+    steps = max(problem.steps, round(FINISH / machine.dt))
+    steps = min(steps, max(len(r) for r in problem.fit) - 1)
+    pieces = to_device(segments_from_runs(machine, problem.fit, steps, steps))
+    noise = jnp.asarray(problem.noise, jnp.result_type(float))
+    # Velocities derived from the positions say nothing that those do not.
+    seen = jnp.asarray(np.concatenate([np.ones(machine.mj_model.nv), problem.measured]))
+    hidden = jnp.where(seen > 0, 0.0, jnp.inf)
+
+    @jax.jit
+    def finish(mean: Any, cov: Any, pieces: Any, misfit: Any) -> Any:
+        found = estimate(
+            machine,
+            space,
+            mean,
+            cov,
+            pieces,
+            noise,
+            refined,
+            search.config.informed_spread,
+            search.mesh,
+            misfit,
+        )
+        model = machine.model(space.to_si(found.distribution.mean))
+        starts = shift_start(machine, pieces, found.delta)
+        return found, replay.errors_from(machine, model, starts, pieces)
+
+    assumed = effective_noise(machine, pieces, noise)
+    estimates, notes = [], []
+    for i in range(states.result_mean.shape[0]):
+        mean, cov = states.result_mean[i], states.result_cov[i]
+        misfit, weighed, center = hidden, pieces, mean
+        for _ in range(_PASSES):
+            found, error = finish(center, cov, weighed, misfit)
+            misfit = jnp.maximum(misfit_of(error, assumed, weighed.weight), hidden)
+            weight = outlier_weights(error, assumed, misfit, _OUTLIER)
+            weighed = replace(pieces, weight=pieces.weight * weight)
+            center = found.distribution.mean
+        found = found.replace(search_mean=mean, search_cov=cov)
+        estimates.append(found)
+        if i == 0:
+            odd = np.flatnonzero(np.asarray(weight) < 0.5)
+            if odd.size:
+                notes.append(
+                    f"{odd.size} of {pieces.count} pieces of {steps * machine.dt:g} s "
+                    "fit much worse than the rest and weigh less than half "
+                    "(a bump, a wrong reading, or motion that the model lacks)"
+                )
+    return estimates, notes

@@ -1,0 +1,180 @@
+"""What ``train.easi --data`` is asked: model, parameters, logs, all checked."""
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+HORIZON = 0.2  # s, of pieces and of the error that is reported
+FINISH = 0.5  # s, of pieces in the least-squares finish
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """A machine and its measured motion.
+
+    Attributes:
+        name: of the model.
+        machine: with the parameters, at the logs' control step.
+        fit, held: runs.
+        held_name: which data are held out.
+        noise: standard deviations of positions and velocities, ``(2 nv,)``.
+        measured: velocities that were measured and can be trusted, ``(nv,)`` bool.
+        steps: control steps of a piece.
+        horizon: the same in seconds.
+        notes: what the user should know of the data.
+    """
+
+    name: str
+    machine: Any
+    fit: list[Any]
+    held: list[Any]
+    held_name: str
+    noise: Any
+    measured: Any
+    steps: int
+    horizon: float
+    notes: list[str]
+
+
+def read_problem(config: Any) -> Problem:
+    """Reads and checks everything; nothing is written yet.
+
+    Raises:
+        UserError: whatever is wrong with the files or the options.
+    """
+    import numpy as np
+
+    from easi_jax.errors import UserError
+    from easi_jax.io.logs import read_logs
+    from easi_jax.log_data import (
+        pooled_noise,
+        split_held_out,
+        to_common_step,
+        trusted_velocity,
+    )
+    from easi_jax.machine import Machine
+
+    name, mj_model, space = _model_and_space(config)
+    if config.start is not None:
+        space = space.scaled(*config.start)
+    horizon = HORIZON if config.horizon is None else config.horizon
+    if not (math.isfinite(horizon) and horizon > 0):
+        raise UserError(f"--horizon is {horizon:g}: give seconds above 0")
+    fit_files = [p for p in config.data if p not in config.held_out]
+    if not fit_files:
+        raise UserError("--held-out names all of --data: leave a log to fit")
+    log = read_logs(fit_files, mj_model, config.mapping)
+    notes = list(log.notes)
+    held_log = None
+    if config.held_out:
+        held_log = read_logs(list(config.held_out), mj_model, config.mapping)
+        notes += held_log.notes
+    # Before interpolation, which would smooth the noise.
+    noise = pooled_noise(log.runs)
+    every = [*log.runs, *(held_log.runs if held_log else ())]
+    runs, changed = to_common_step(every)
+    notes += changed
+    fit = runs[: len(log.runs)]
+    if held_log is None:
+        fit, held, held_name = split_held_out(fit, horizon)
+    else:
+        held = runs[len(log.runs) :]
+        held_name = ", ".join(run.name for run in held)
+    nv = mj_model.nv
+    if config.noise:
+        noise = np.asarray(config.noise, float)
+    if noise.shape != (2 * nv,) or not np.all(np.isfinite(noise) & (noise >= 0)):
+        raise UserError(
+            f"--noise is {list(config.noise)}: {name} needs {2 * nv} numbers, 0 or "
+            "more: positions, then velocities"
+        )
+    machine = Machine(mj_model, space, fit[0].dt)
+    measured = np.array([run.qvel_measured for run in fit]).all() & np.all(
+        [(trusted_velocity(run) == run.qvel).all(0) for run in fit], axis=0
+    )
+    if any(run.qvel_measured for run in fit) and not measured.all():
+        joints = [n for n, m in zip(machine.state_names[nv:], measured, strict=True)]
+        doubted = [n for n, m in zip(joints, measured, strict=True) if not m]
+        notes.append(
+            f"{', '.join(doubted)}: not the derivative of the positions (filtered or "
+            "late?), so velocities are taken from the positions"
+        )
+    steps = max(1, round(horizon / machine.dt))
+    _check_lengths(fit, held, steps, machine.dt)
+    return Problem(
+        name,
+        machine,
+        fit,
+        held,
+        held_name,
+        noise,
+        measured,
+        steps,
+        steps * machine.dt,
+        notes,
+    )
+
+
+def _check_lengths(fit: list[Any], held: list[Any], steps: int, dt: float) -> None:
+    from easi_jax.errors import UserError
+
+    for runs, what in ((fit, "to fit"), (held, "held out")):
+        longest = max(runs, key=len)
+        if len(longest) <= steps:
+            raise UserError(
+                f"the longest run {what} ({longest.name}) has {len(longest)} rows, too "
+                f"few for a horizon of {steps} steps ({steps * dt:g} s): record more, "
+                "or shorten --horizon"
+            )
+
+
+def _model_and_space(config: Any) -> tuple[str, Any, Any]:
+    from easi_jax.errors import UserError
+    from easi_jax.io.parameter_file import read_parameter_file
+
+    if config.model is None:
+        if config.robot is None:
+            raise UserError(
+                "--data needs --model M.xml and --parameters P.yaml, or --robot NAME "
+                "for a built-in robot"
+            )
+        from envs import make
+
+        env = make(config.robot)
+        space = env.space
+        if config.parameters is not None:
+            space = read_parameter_file(config.parameters, env.mj_model)
+        return env.name, env.mj_model, space
+    if config.robot is not None:
+        raise UserError("--model and --robot exclude each other: choose one")
+    if config.parameters is None:
+        raise UserError(
+            "--model needs --parameters P.yaml: say what may vary in the model (see "
+            "docs/your_own_robot.md)"
+        )
+    mj_model = load_model(config.model)
+    space = read_parameter_file(config.parameters, mj_model)
+    return config.model.stem, mj_model, space
+
+
+def load_model(path: Path) -> Any:
+    """The MuJoCo model in ``path``.
+
+    Raises:
+        UserError: the file cannot be read, or MuJoCo does not accept it.
+    """
+    import mujoco
+
+    from easi_jax.errors import UserError
+
+    if not path.is_file():
+        raise UserError(f"{path}: no such model file")
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"{path}: MuJoCo cannot read this model: {reason}") from None
+    if model.nv == 0:
+        raise UserError(f"{path}: the model has no joint, so nothing can be identified")
+    return model
