@@ -68,7 +68,9 @@ def draw(space: ParameterSpace, dist: Distribution, key: jax.Array) -> jax.Array
     flat = dist.low + (dist.high - dist.low) * jax.random.uniform(k_u, (space.size,))
     low, high = space.unit_bounds
     z = dist.mean + dist.chol @ jax.random.normal(k_g, (space.size,))
-    return jnp.where(dist.uniform > 0, flat, space.to_si(jnp.clip(z, low, high)))
+    # Again in SI units: rounding must not make a zero negative.
+    si = jnp.clip(space.to_si(jnp.clip(z, low, high)), *space.bounds)
+    return jnp.where(dist.uniform > 0, flat, si)
 
 
 def covariance(dist: Distribution) -> np.ndarray:

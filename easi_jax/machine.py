@@ -125,7 +125,12 @@ class Machine:
 
 
 def _turned(quat: jax.Array, vector: jax.Array) -> jax.Array:
-    return math.quat_integrate(quat, vector, jnp.ones(()))
+    # Exponential map with its slope at zero, which `math.quat_integrate` lacks.
+    n2 = vector @ vector
+    n = jnp.sqrt(jnp.where(n2 > 1e-16, n2, 1.0))
+    scale = jnp.where(n2 > 1e-16, jnp.sin(n / 2) / n, 0.5)
+    real = jnp.where(n2 > 1e-16, jnp.cos(n / 2), 1.0)
+    return math.quat_mul(quat, jnp.concatenate([real[None], scale * vector]))
 
 
 def _rotation_between(qa: jax.Array, qb: jax.Array) -> jax.Array:
