@@ -30,6 +30,9 @@ class SacConfig:
     hidden: tuple[int, ...] = (256, 256)
     """Hidden layer sizes of policy and critics."""
 
+    critic_layer_norm: bool = False
+    """Layer normalization in the critics."""
+
     learning_rate: float = 3e-4
     """Of Adam, for policy, critics and temperature."""
 

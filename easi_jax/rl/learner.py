@@ -43,7 +43,9 @@ class Learner:
 
     def __init__(self, config: SacConfig, obs_size: int, action_size: int) -> None:
         self._config = config
-        self._networks = make_networks(obs_size, action_size, config.hidden)
+        self._networks = make_networks(
+            obs_size, action_size, config.hidden, config.critic_layer_norm
+        )
         # One flat vector instead of many small arrays: fewer kernels, 5-10 % faster.
         self._optimizer = optax.flatten(optax.adam(config.learning_rate))
         # brax's target entropy is minus half of the size given here.

@@ -30,7 +30,10 @@ def _standardize(observation: Any, preprocessor_params: Any) -> Any:
 
 
 def make_networks(
-    obs_size: int, action_size: int, hidden: tuple[int, ...]
+    obs_size: int,
+    action_size: int,
+    hidden: tuple[int, ...],
+    critic_layer_norm: bool = False,
 ) -> sac_networks.SACNetworks:
     """Tanh-normal policy and twin critics, ReLU, observations standardized."""
     return sac_networks.make_sac_networks(
@@ -38,6 +41,7 @@ def make_networks(
         action_size,
         preprocess_observations_fn=_standardize,
         hidden_layer_sizes=hidden,
+        q_network_layer_norm=critic_layer_norm,
         # brax hands its keyword dict over as the first argument.
         policy_network_kernel_init_fn=lambda _: jax.nn.initializers.lecun_uniform(),
     )
