@@ -156,7 +156,7 @@ def search_check(
             if dead.size:
                 worst = np.asarray(info.suspects)[s, dead[0]]
                 order = np.argsort(-np.abs(worst))[:3]
-                blamed = ", ".join(names[j] for j in order)
+                blamed = ", ".join(str(names[int(j)]) for j in order)
                 raise UserError(
                     f"seed {seed}, generation {first + int(dead[0]) + 1}: all "
                     f"{population} simulations became non-finite; look first at "

@@ -1,0 +1,64 @@
+"""Prediction errors on motion that no search has seen."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from easi_jax import replay
+from easi_jax.rl.networks import act
+from easi_jax.rollout import collect
+from easi_jax.segments import Segments, windows
+
+OPEN_LOOP = 0.2  # s
+TRAJECTORIES = 20
+
+
+def relative_errors(
+    machine: Any, model: Any, pieces: Segments, speed_limit: Any
+) -> jax.Array:
+    """RMS error at each piece's end, as a share of the RMS motion, ``(2 nv,)``.
+
+    Pieces that touch a joint's speed limit ``(nv,)`` are left out: there the share
+    says whether the limit was met, not how good the model is.
+    """
+    error = replay.errors(machine, model, pieces)[:, -1]
+    moved = replay.motion(machine, pieces)[:, -1]
+    fast = jnp.concatenate([pieces.qvel[:, None], pieces.next_qvel], 1)
+    slow = (jnp.abs(fast) < 0.98 * speed_limit).all((1, 2))
+    w = (pieces.weight * slow)[:, None]
+    return jnp.sqrt((w * error**2).sum(0) / jnp.maximum((w * moved**2).sum(0), 1e-30))
+
+
+def shares(
+    pipe: Any, policies: Any, target: jax.Array, theta: jax.Array, keys: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Relative errors of models ``theta (S, n)`` in the target, noise-free.
+
+    Returns:
+        One-step and 0.2 s open-loop errors, ``(S, 2 nv)`` each.
+    """
+    env = pipe.env
+    truth = env.model(target)
+    steps = max(1, round(OPEN_LOOP / env.dt))
+
+    def one(item: Any) -> tuple[jax.Array, jax.Array]:
+        policy, t, key = item
+        trajectories = collect(
+            env,
+            truth,
+            lambda obs, k: act(policy, obs, k),
+            key,
+            TRAJECTORIES,
+            env.episode_length,
+        )
+        limit = truth.speed_limit
+        model = env.model(t)
+        short = windows(trajectories, 1, 1)
+        long = windows(trajectories, steps, steps)
+        return (
+            relative_errors(env.machine, model, short, limit),
+            relative_errors(env.machine, model, long, limit),
+        )
+
+    return jax.lax.map(one, (policies, theta, keys))

@@ -1,0 +1,176 @@
+"""Building a robot's pipeline from what commands are given."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+
+def sac_config(robot: str, env_steps: int | None = None) -> Any:
+    """SAC settings of a robot, with another budget where given."""
+    from dataclasses import replace
+
+    from easi_jax.rl.presets import sac_preset
+
+    config = sac_preset(robot)
+    return config if env_steps is None else replace(config, env_steps=env_steps)
+
+
+def search_config(preset: str, settings: tuple[str, ...], **changes: Any) -> Any:
+    """A search preset with ``NAME=VALUE`` settings and keyword changes (not None).
+
+    Raises:
+        UserError: unknown preset or name, or a value of the wrong kind.
+    """
+    from easi_jax.errors import UserError, nearest
+    from easi_jax.search_config import preset as make
+
+    base = make(preset)
+    known = asdict(base)
+    chosen = {k: v for k, v in changes.items() if v is not None}
+    for setting in settings:
+        name, sign, text = setting.partition("=")
+        if not sign or name not in known:
+            raise UserError(
+                f"--set {setting}: write NAME=VALUE with a name of the search "
+                f"settings{nearest(name, known)}"
+            )
+        chosen[name] = _value(setting, text, known[name])
+    return make(preset, **chosen)
+
+
+def _value(setting: str, text: str, like: Any) -> Any:
+    from easi_jax.errors import UserError
+
+    try:
+        if isinstance(like, bool):
+            return {"true": True, "1": True, "false": False, "0": False}[text.lower()]
+        if isinstance(like, tuple):
+            return tuple(int(x) for x in text.split(",") if x)
+        return type(like)(text)
+    except (KeyError, ValueError):
+        kind = {bool: "true or false", tuple: "whole numbers with commas"}
+        wanted = kind.get(type(like), f"a {type(like).__name__}")
+        raise UserError(f"--set {setting}: the value must be {wanted}") from None
+
+
+def check_seeds(seeds: tuple[int, ...]) -> None:
+    """Raises UserError for an empty list, negative or repeated seeds."""
+    from easi_jax.errors import UserError
+
+    if not seeds or len(set(seeds)) != len(seeds) or min(seeds) < 0:
+        raise UserError(
+            f"seeds are {list(seeds)}: give at least one, each 0 or more and once"
+        )
+
+
+def check_chunk(chunk: int) -> None:
+    """Raises UserError for a chunk below one."""
+    from easi_jax.errors import UserError
+
+    if chunk < 1:
+        raise UserError(f"--chunk is {chunk}: give at least 1")
+
+
+def save_policies(folder: Any, method: str, policies: Any) -> None:
+    """Keeps the policies ``(S, ...)`` of one method in a run folder."""
+    from easi_jax.io import checkpoints
+
+    place = folder.checkpoints / f"policy_{method}"
+    checkpoints.save(place, 0, policies, config_hash=folder.config_hash)
+
+
+def load_policies(folder: Path, method: str | None = None) -> dict[str, Any]:
+    """Policies of a finished run of train.udr, train.easi or train.pipeline.
+
+    Args:
+        folder: the run folder.
+        method: UDR, EASI or Oracle; the run's own where not given.
+
+    Returns:
+        ``robot``, ``seeds``, ``sac``, ``method`` and ``policies`` ``(S, ...)``.
+
+    Raises:
+        UserError: no finished run, or none of that method.
+    """
+    import jax
+
+    from easi_jax.errors import UserError, nearest
+    from easi_jax.io import checkpoints
+    from easi_jax.io.files import read_json
+    from easi_jax.io.runs import read_config
+    from easi_jax.pipeline import Pipeline, PipelineConfig
+    from envs import make
+
+    read_config(folder)
+    if not (folder / "results.json").exists():
+        raise UserError(f"{folder} holds an unfinished run: finish it with --resume")
+    result = read_json(folder / "results.json")
+    if "methods" not in result:
+        raise UserError(
+            f"{folder} holds no policies: it identified a machine from logs"
+        )
+    own = "EASI" if "EASI" in result["methods"] else "UDR"
+    chosen = method or own
+    if chosen not in result["methods"]:
+        raise UserError(
+            f'{folder} has no policy "{chosen}" (it has '
+            f"{', '.join(result['methods'])}){nearest(chosen, result['methods'])}"
+        )
+    robot, seeds = result["robot"], tuple(result["seeds"])
+    sac = sac_config(robot, result["env_steps"])
+    pipe = Pipeline(make(robot), PipelineConfig(sac=sac))
+    keys = jax.random.split(jax.random.key(0), len(seeds))
+    target = jax.eval_shape(
+        lambda k: pipe.policies(pipe.train_init(k, pipe.udr())), keys
+    )
+    found = checkpoints.restore(folder / "checkpoints" / f"policy_{chosen}", target)
+    if found is None:
+        raise UserError(f"{folder} has lost its policies: run it again")
+    return {
+        "robot": robot,
+        "seeds": seeds,
+        "sac": sac,
+        "method": chosen,
+        "policies": found.state,
+    }
+
+
+def load_udr(folder: Path) -> dict[str, Any]:
+    """What ``train.udr`` left: robot, seeds, settings, target, training states.
+
+    Raises:
+        UserError: the folder holds no finished UDR run.
+    """
+    import jax
+
+    from easi_jax.errors import UserError
+    from easi_jax.io import checkpoints
+    from easi_jax.io.runs import config_hash, read_config
+    from easi_jax.pipeline import Pipeline, PipelineConfig, seed_keys
+    from envs import make
+
+    config = read_config(folder)
+    if "robot" not in config or "env_steps" not in config or "udr" in config:
+        raise UserError(f"{folder} holds no run of train.udr; give one with --udr")
+    if not (folder / "results.json").exists():
+        raise UserError(
+            f"{folder} holds an unfinished run of train.udr: finish it with --resume"
+        )
+    env = make(config["robot"])
+    sac = sac_config(config["robot"], config["env_steps"])
+    pipe = Pipeline(env, PipelineConfig(sac=sac))
+    seeds = tuple(int(s) for s in config["seeds"])
+    keys = seed_keys(list(seeds))
+    target = jax.eval_shape(lambda k: pipe.train_init(k, pipe.udr()), keys)
+    found = checkpoints.restore(
+        folder / "checkpoints" / "train", target, config_hash=config_hash(config)
+    )
+    if found is None:
+        raise UserError(f"{folder} has lost its checkpoint: run train.udr again")
+    return {
+        "robot": config["robot"],
+        "seeds": seeds,
+        "sac": sac,
+        "states": found.state,
+        "config": config,
+    }

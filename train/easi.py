@@ -1,0 +1,104 @@
+"""``python -m train.easi``: identify a simulator, then train the policy in it."""
+
+import dataclasses
+from pathlib import Path
+
+from train._command import main
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Finds the distribution of physical parameters under which simulation looks like
+    the measured motion (EASI), and trains the final policy under it.
+
+    With a built-in robot, the policy of ``train.udr`` records demonstrations in a
+    pseudo-real target, the search never sees the target's parameters, and the final
+    policy is tested there against UDR (and, with --oracle, against a policy trained in
+    the target itself). With --data, logs of a real machine take the target's place:
+    give --model and --parameters for a machine of your own.
+    """
+
+    udr: Path = Path("results/udr")
+    """Run folder of train.udr: its policy records the demonstrations."""
+    out: Path = Path("results/easi")
+    """Folder of the run."""
+    target: tuple[str, ...] = ("cart_kp*0.5",)
+    """The pseudo-real robot: parameters that differ from the nominal ones, as
+    NAME*FACTOR or NAME=VALUE."""
+    data: tuple[Path, ...] = ()
+    """Measured logs (CSV, NPZ or Parquet) in place of a pseudo-real target."""
+    held_out: tuple[Path, ...] = ()
+    """Logs kept out of the search, to test the result on."""
+    model: Path | None = None
+    """MuJoCo model (MJCF) of the machine that the logs are of."""
+    parameters: Path | None = None
+    """Parameter file (YAML): what may vary in the model, and in which range."""
+    mapping: Path | None = None
+    """Mapping file (YAML) for logs with foreign column names."""
+    robot: str | None = None
+    """Built-in robot that the logs are of, in place of --model and --parameters."""
+    preset: str = "default"
+    """Search settings: default, or paper (the reference's recipe, defects included)."""
+    strategy: str | None = None
+    """Evolution strategy: mu_lambda, CMA_ES, Sep_CMA_ES, SNES, ..."""
+    generations: int | None = None
+    """Generations of the search (preset: 50)."""
+    population: int | None = None
+    """Individuals in a generation (preset: 300)."""
+    set: tuple[str, ...] = ()
+    """Further search settings, NAME=VALUE: loss=gan, regularizer=gradient_penalty,
+    innovation_inputs=false, policy_updates_per_generation=20, ..."""
+    start: tuple[float, float] | None = None
+    """Where the search starts, as factors on the nominal values; not given: where UDR
+    trained."""
+    refine: bool = True
+    """Finish with least squares on the paired data."""
+    trajectories: int = 200
+    """Demonstration trajectories."""
+    noise: tuple[float, ...] = ()
+    """Sensor noise (standard deviations of positions, then velocities, SI): added to
+    pseudo-real demonstrations; for logs it is estimated where not given."""
+    horizon: float | None = None
+    """Seconds of motion that a measured piece holds; not given: one control step for
+    clean demonstrations, as many as the noise asks for otherwise."""
+    oracle: bool = False
+    """Train the Oracle too: a policy trained in the target itself."""
+    seeds: tuple[int, ...] = ()
+    """Seeds; not given: those of the UDR run (0 for logs)."""
+    eval_episodes: int = 100
+    """Episodes of the final evaluation."""
+    chunk: int = 500
+    """Training steps between checkpoints."""
+    search_chunk: int = 10
+    """Generations between checkpoints."""
+    resume: bool = False
+    """Go on with the run in the folder."""
+    overwrite: bool = False
+    """Delete the run in the folder first."""
+
+
+def run(config: Config) -> None:
+    """Identifies from logs, or from a pseudo-real target."""
+    from easi_jax.errors import UserError
+    from train._robots import check_chunk, check_seeds
+
+    check_chunk(config.chunk)
+    check_chunk(config.search_chunk)
+    if config.seeds:
+        check_seeds(config.seeds)
+    if config.data:
+        from train import _from_logs
+
+        _from_logs.run(config)
+        return
+    for option in ("model", "parameters", "mapping", "held_out", "robot"):
+        if getattr(config, option):
+            flag = "--" + option.replace("_", "-")
+            raise UserError(f"{flag} goes with --data LOG: give the measured logs too")
+    from train import _pseudo_real
+
+    _pseudo_real.run(config)
+
+
+if __name__ == "__main__":
+    main(Config, run, name="train.easi")

@@ -1,0 +1,162 @@
+"""``python -m train.pipeline``: UDR, search and retraining as one compiled program."""
+
+import dataclasses
+import time
+from pathlib import Path
+
+from train._command import main, say, show_table
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Runs UDR training, demonstrations, search, final training and evaluation as ONE
+    compiled program.
+
+    The same functions as train.udr and train.easi, composed into one jit: no transfer
+    to the host in between, and nothing to see until it ends. For long runs that show
+    progress and can be resumed, take the two commands.
+    """
+
+    robot: str = "cartpole"
+    """Built-in robot."""
+    out: Path = Path("results/pipeline")
+    """Folder of the run."""
+    target: tuple[str, ...] = ("cart_kp*0.5",)
+    """The pseudo-real robot: parameters that differ from the nominal ones, as
+    NAME*FACTOR or NAME=VALUE."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds, each an independent chain."""
+    env_steps: int | None = None
+    """Control steps of each training; the robot's preset where not given."""
+    preset: str = "default"
+    """Search settings: default or paper."""
+    strategy: str | None = None
+    """Evolution strategy: mu_lambda, CMA_ES, ..."""
+    generations: int | None = None
+    """Generations of the search (preset: 50)."""
+    population: int | None = None
+    """Individuals in a generation (preset: 300)."""
+    set: tuple[str, ...] = ()
+    """Further search settings, NAME=VALUE."""
+    start: tuple[float, float] | None = None
+    """Where the search starts, as factors on the nominal values."""
+    refine: bool = True
+    """Finish with least squares on the paired data."""
+    trajectories: int = 200
+    """Demonstration trajectories."""
+    noise: tuple[float, ...] = ()
+    """Sensor noise of the demonstrations (positions, then velocities, SI)."""
+    eval_episodes: int = 100
+    """Episodes of the final evaluation."""
+    overwrite: bool = False
+    """Delete the run in the folder first."""
+
+
+def run(config: Config) -> None:
+    """Compiles, runs and reports."""
+    from train._pseudo_real import steps_of
+    from train._robots import check_seeds, sac_config, save_policies, search_config
+
+    check_seeds(config.seeds)
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from easi_jax.errors import UserError
+    from easi_jax.io.runs import RunFolder
+    from easi_jax.pipeline import (
+        Pipeline,
+        PipelineConfig,
+        seed_keys,
+        stage_keys,
+        target_parameters,
+    )
+    from envs import make
+    from train._pseudo_real import held_out_errors
+    from train._results import write_pseudo_real
+    from train._stages import search_rows, training_rows
+
+    env = make(config.robot)
+    theta = target_parameters(env.space, config.target)
+    noisy = any(x > 0 for x in config.noise)
+    search = search_config(
+        config.preset,
+        config.set,
+        strategy=config.strategy,
+        generations=config.generations,
+        population=config.population,
+        horizon=steps_of(None, env.dt, noisy) if config.preset != "paper" else None,
+    )
+    pipe = Pipeline(
+        env,
+        PipelineConfig(
+            search=search,
+            sac=sac_config(config.robot, config.env_steps),
+            trajectories=config.trajectories,
+            noise=config.noise,
+            refine=config.refine,
+            eval_episodes=config.eval_episodes,
+        ),
+        start=config.start,
+    )
+    target, keys = jnp.asarray(theta, jnp.float32), seed_keys(list(config.seeds))
+    with RunFolder.open(
+        config.out, config, command="train.pipeline", overwrite=config.overwrite
+    ) as folder:
+        say("compiling one program for the whole chain ...")
+        begin = time.monotonic()
+        program = jax.jit(pipe.run).lower(keys, target).compile()
+        compiled = time.monotonic()
+        say(f"compiled in {compiled - begin:.0f} s; running ...")
+        out = jax.block_until_ready(program(keys, target))
+        seconds = time.monotonic() - compiled
+        info = jax.device_get(out["search"])
+        for step, row in search_rows(config.seeds, env.space.names, pipe.space.to_si)(
+            0, info
+        ):
+            folder.log("search", step, row)
+        rows_of = training_rows(config.seeds, pipe.sac.config.num_envs)
+        curves = {}
+        for stage, method in (("udr", "UDR"), ("easi", "EASI")):
+            lines = rows_of(0, jax.device_get(out[f"{stage}_history"]))
+            for step, row in lines:
+                folder.log(stage, step, row)
+            curves[method] = (
+                [step for step, _ in lines],
+                [[r[f"seed{s}/return"] for s in config.seeds] for _, r in lines],
+            )
+        if (np.asarray(info.non_finite) >= search.population).any():
+            raise UserError(
+                "a generation had no finite simulation: run train.udr and train.easi, "
+                "which stop there and name the parameters"
+            )
+        for method in ("UDR", "EASI"):
+            save_policies(folder, method, out[method.lower()])
+        returns = {
+            m: np.asarray(out[f"{m.lower()}_returns"]).mean(1) for m in ("UDR", "EASI")
+        }
+        evaluate_keys = stage_keys(keys)["evaluate"]
+        errors = held_out_errors(
+            pipe, out["estimate"], theta, out["udr"], evaluate_keys
+        )
+        folder.write_json(
+            "timing.json", {"compile_s": compiled - begin, "run_s": seconds}
+        )
+        write_pseudo_real(
+            folder, pipe, out["estimate"], theta, config.seeds, returns, errors, curves,
+            [f"one program: compiled in {compiled - begin:.0f} s, ran {seconds:.0f} s"],
+        )  # fmt: skip
+    show_table(
+        f"Return in the target ({', '.join(config.target) or 'nominal'})",
+        ("method", "median", *(f"seed {s}" for s in config.seeds)),
+        [
+            (name, f"{np.median(r):.1f}", *(f"{x:.1f}" for x in r))
+            for name, r in returns.items()
+        ],
+    )
+    say(f"compiled in {compiled - begin:.0f} s, ran in {seconds:.0f} s")
+    say(f"report: {config.out / 'report.html'}")
+
+
+if __name__ == "__main__":
+    main(Config, run, name="train.pipeline")

@@ -1,0 +1,141 @@
+"""``python -m train.udr``: a rough policy by uniform domain randomization."""
+
+import dataclasses
+from pathlib import Path
+
+from train._command import main, say, show_table
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Trains a policy under uniformly random physics (UDR), the rough start of EASI.
+
+    Each episode draws the robot's parameters from [nominal / k, k nominal]. The policy
+    is what ``train.easi`` then records demonstrations with. Several seeds train side
+    by side, one on each device.
+    """
+
+    robot: str = "cartpole"
+    """Built-in robot."""
+    out: Path = Path("results/udr")
+    """Folder of the run."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds, each an independent training."""
+    target: tuple[str, ...] = ()
+    """Where the policy is evaluated: the nominal robot with parameters changed, as
+    NAME*FACTOR or NAME=VALUE."""
+    env_steps: int | None = None
+    """Control steps of training; the robot's preset where not given."""
+    eval_episodes: int = 100
+    """Episodes of the final evaluation."""
+    chunk: int = 500
+    """Steps of all environments between checkpoints."""
+    resume: bool = False
+    """Go on with the run in the folder."""
+    overwrite: bool = False
+    """Delete the run in the folder first."""
+
+
+def run(config: Config) -> None:
+    """Trains, evaluates and writes the run folder."""
+    from train._results import per_seed_json
+    from train._robots import check_chunk, check_seeds, sac_config, save_policies
+
+    check_seeds(config.seeds)
+    check_chunk(config.chunk)
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from easi_jax.io.figures import returns_by_step
+    from easi_jax.io.report import Picture, Report, Table, write_report
+    from easi_jax.io.runs import RunFolder
+    from easi_jax.io.versions import versions
+    from easi_jax.pipeline import (
+        Pipeline,
+        PipelineConfig,
+        seed_keys,
+        stage_keys,
+        target_parameters,
+    )
+    from envs import make
+    from train._stages import jit_chunks, run_stage, training_curve, training_rows
+
+    env = make(config.robot)
+    sac = sac_config(config.robot, config.env_steps)
+    theta = target_parameters(env.space, config.target)
+    pipe = Pipeline(env, PipelineConfig(sac=sac, eval_episodes=config.eval_episodes))
+    target = jnp.asarray(theta, jnp.float32)
+    keys = stage_keys(seed_keys(list(config.seeds)))
+    with RunFolder.open(
+        config.out,
+        config,
+        command="train.udr",
+        resume=config.resume,
+        overwrite=config.overwrite,
+    ) as folder:
+        notes: list[str] = []
+        step = jit_chunks(
+            lambda states, dist, target, n: pipe.train_chunk(states, dist, target, n)
+        )
+        states = run_stage(
+            folder,
+            "train",
+            sac.iterations,
+            config.chunk,
+            lambda: pipe.train_init(keys["udr"], pipe.udr()),
+            lambda s, n: step(s, pipe.udr(), target, n),
+            training_rows(config.seeds, sac.num_envs),
+            notes,
+        )
+        policies = pipe.policies(states)
+        returns = np.asarray(jax.jit(pipe.returns)(policies, target, keys["evaluate"]))
+        per_seed = returns.mean(1)
+        save_policies(folder, "UDR", policies)
+        results = {
+            "robot": config.robot,
+            "seeds": list(config.seeds),
+            "env_steps": sac.env_steps,
+            "methods": ["UDR"],
+            "target": dict(zip(env.space.names, theta.tolist(), strict=True)),
+            "returns": {"UDR": per_seed_json(config.seeds, per_seed)},
+        }
+        folder.write_json("results.json", results)
+        steps, curve = training_curve(folder.path, "train", config.seeds)
+        pictures = []
+        if steps:
+            svg = returns_by_step({"UDR": (steps, curve)})
+            folder.write("figures/returns.svg", svg)
+            pictures.append(
+                Picture(
+                    "Return by training step",
+                    svg,
+                    "Return of the UDR policy in the target against training steps",
+                    "Deterministic policy in the target, every seed and their median.",
+                )
+            )
+        rows = [(s, f"{r:.1f}") for s, r in zip(config.seeds, per_seed, strict=True)]
+        title = f"UDR on {config.robot}: return in the target"
+        write_report(
+            folder.path / "report.html",
+            Report(
+                title=f"UDR on {config.robot}",
+                headline=[
+                    f"The policy trained under uniform randomization returns "
+                    f"{np.median(per_seed):.1f} in the target (median of "
+                    f"{len(config.seeds)} seeds, {config.eval_episodes} episodes each)."
+                ],
+                command="python -m train.udr",
+                tables=[Table(title, ("seed", "return"), rows)],
+                pictures=pictures,
+                notes=notes,
+                config=folder.config,
+                versions=versions(),
+            ),
+        )
+    show_table(title, ("seed", "return"), rows)
+    say(f"report: {config.out / 'report.html'}")
+
+
+if __name__ == "__main__":
+    main(Config, run, name="train.udr")
