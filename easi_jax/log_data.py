@@ -144,8 +144,8 @@ def split_held_out(
                 f"gap of {gap_s:g} s: record more, or shorten --horizon"
             )
         return (
-            [_rows(run, 0, last)],
-            [_rows(run, first, len(run))],
+            [rows_of(run, 0, last)],
+            [rows_of(run, first, len(run))],
             f"the last {100 * LAST:.0f} % of {run.name}",
         )
     total = sum(len(run) for run in runs)
@@ -166,7 +166,7 @@ def split_held_out(
     )
 
 
-def _rows(run: Run, first: int, last: int) -> Run:
+def rows_of(run: Run, first: int, last: int) -> Run:
     part = slice(first, last)
     return replace(
         run,
@@ -189,6 +189,30 @@ def trusted_velocity(run: Run) -> np.ndarray:
     rms = np.sqrt(np.mean(fitted**2, 0))
     off = np.sqrt(np.mean((run.qvel - fitted) ** 2, 0))
     return np.where(off <= np.maximum(_AGREES * rms, slack), run.qvel, fitted)
+
+
+def visible_steps(
+    runs: Sequence[Run], noise: np.ndarray, most: int, ratio: float
+) -> int:
+    """Fewest steps over which motion stands out of the noise, at most ``most``.
+
+    RMS change of every position and velocity, at least ``ratio``
+    times its noise ``(2 nv,)``: in shorter pieces a search would see mostly noise.
+    """
+    states = [(run, trusted_velocity(run)) for run in runs]
+    for steps in range(1, most):
+        square, rows = np.zeros(len(noise)), 0
+        for run, qvel in states:
+            if len(run) <= steps:
+                continue
+            moved = run.configuration.difference(run.qpos[:-steps], run.qpos[steps:])
+            change = np.concatenate([moved, qvel[steps:] - qvel[:-steps]], 1)
+            square += (change**2).sum(0)
+            rows += len(change)
+        rms = np.sqrt(square / max(rows, 1))
+        if np.all(rms >= ratio * noise):
+            return steps
+    return most
 
 
 def segments_from_runs(

@@ -6,7 +6,7 @@ from typing import Any
 from train._command import say, show_table
 from train._log_problem import FINISH, Problem, read_problem
 
-_STEPS = 1_000_000  # physics steps in a generation that are worth their time
+_STEPS = 500_000  # physics steps in a generation that are worth their time
 _PASSES = 3  # of the finish: the model's own error is learned from the one before
 _OUTLIER = 2.5  # times the median error: windows beyond it weigh less
 
@@ -14,9 +14,11 @@ _OUTLIER = 2.5  # times the median error: windows beyond it weigh less
 def run(config: Any) -> None:
     """Reads, searches, finishes and reports; ``config`` is that of ``train.easi``."""
     problem = read_problem(config)
-    settings = _settings(config, problem)
     seeds = config.seeds or (0,)
     from easi_jax.io.runs import RunFolder
+    from easi_jax.search import Search
+
+    search = Search(problem.machine, _settings(config, problem))
 
     with RunFolder.open(
         config.out,
@@ -27,7 +29,7 @@ def run(config: Any) -> None:
     ) as folder:
         from train._log_results import write
 
-        states, search = _search(folder, config, settings, problem, seeds)
+        states = _search(folder, config, search, problem, seeds)
         estimates, outliers = _finish(problem, search, states, config.refine)
         problem.notes.extend(outliers)
         columns, rows, errors = write(folder, problem, search, estimates, seeds)
@@ -52,7 +54,7 @@ def _settings(config: Any, problem: Problem) -> Any:
         generations=config.generations,
         population=config.population,
         source="replay",
-        horizon=problem.steps,
+        horizon=problem.piece,
     )
     if chosen.source != "replay" or chosen.policy_updates_per_generation:
         raise UserError(
@@ -61,26 +63,25 @@ def _settings(config: Any, problem: Problem) -> Any:
         )
     if any(s.startswith("segments=") for s in config.set):
         return chosen
-    cost = chosen.population * problem.steps * problem.machine.substeps
+    cost = chosen.population * problem.piece * problem.machine.substeps
     segments = max(16, min(chosen.segments, _STEPS // cost))
     return replace(chosen, segments=segments)
 
 
 def _search(
-    folder: Any, config: Any, settings: Any, problem: Problem, seeds: Sequence[int]
+    folder: Any, config: Any, search: Any, problem: Problem, seeds: Sequence[int]
 ) -> Any:
     import jax
     import jax.numpy as jnp
 
     from easi_jax.log_data import segments_from_runs
     from easi_jax.pipeline import seed_keys
-    from easi_jax.search import Search, SearchData
+    from easi_jax.search import SearchData
     from easi_jax.segments import to_device
     from train._stages import jit_chunks, run_stage, search_check, search_rows
 
-    search = Search(problem.machine, settings)
     pieces = segments_from_runs(
-        problem.machine, problem.fit, problem.steps, max(1, problem.steps // 2)
+        problem.machine, problem.fit, problem.piece, max(1, problem.piece // 2)
     )
     noise = jnp.asarray(problem.noise, jnp.result_type(float))
     data = SearchData(segments=to_device(pieces), noise=noise)
@@ -91,15 +92,15 @@ def _search(
     states = run_stage(
         folder,
         "search",
-        settings.generations,
+        search.config.generations,
         config.search_chunk,
         lambda: jax.lax.map(lambda k: search.init(k, data), keys),
         lambda states, n: advance(states, data, n),
         search_rows(seeds, search.space.names, search.space.to_si),
         problem.notes,
-        search_check(seeds, search.space.names, settings.population),
+        search_check(seeds, search.space.names, search.config.population),
     )
-    return states, search
+    return states
 
 
 def _finish(

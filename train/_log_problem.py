@@ -5,7 +5,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-HORIZON = 0.2  # s, of pieces and of the error that is reported
+HORIZON = 0.2  # s, of the error that is reported; pieces are no longer
+_ABOVE_NOISE = 30.0  # RMS motion over a piece in units of its noise
 FINISH = 0.5  # s, of pieces in the least-squares finish
 
 
@@ -20,7 +21,8 @@ class Problem:
         held_name: which data are held out.
         noise: standard deviations of positions and velocities, ``(2 nv,)``.
         measured: velocities that were measured and can be trusted, ``(nv,)`` bool.
-        steps: control steps of a piece.
+        piece: control steps of a piece in the search.
+        steps: control steps of the open-loop error that is reported.
         horizon: the same in seconds.
         notes: what the user should know of the data.
     """
@@ -32,6 +34,7 @@ class Problem:
     held_name: str
     noise: Any
     measured: Any
+    piece: int
     steps: int
     horizon: float
     notes: list[str]
@@ -52,6 +55,7 @@ def read_problem(config: Any) -> Problem:
         split_held_out,
         to_common_step,
         trusted_velocity,
+        visible_steps,
     )
     from easi_jax.machine import Machine
 
@@ -102,6 +106,9 @@ def read_problem(config: Any) -> Problem:
         )
     steps = max(1, round(horizon / machine.dt))
     _check_lengths(fit, held, steps, machine.dt)
+    piece = steps
+    if config.horizon is None:
+        piece = visible_steps(fit, noise, steps, _ABOVE_NOISE)
     return Problem(
         name,
         machine,
@@ -110,6 +117,7 @@ def read_problem(config: Any) -> Problem:
         held_name,
         noise,
         measured,
+        piece,
         steps,
         steps * machine.dt,
         notes,

@@ -1,0 +1,204 @@
+"""Noise, splits and segments of measured runs."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from easi_jax.configuration import Configuration
+from easi_jax.errors import UserError
+from easi_jax.log_data import (
+    estimate_noise,
+    misfit_of,
+    noise_floor,
+    open_loop_error,
+    outlier_weights,
+    rows_of,
+    segments_from_runs,
+    split_held_out,
+    to_common_step,
+    trusted_velocity,
+    visible_steps,
+)
+from easi_jax.machine import Machine
+from easi_jax.parameters import ParameterSpace, declare
+from easi_jax.recording import Run
+from easi_jax.segments import to_device
+from easi_jax.windows import fitted_velocity
+
+XML = """<mujoco><option timestep="0.01"/><worldbody><body>
+  <joint name="slide" type="slide" axis="1 0 0" damping="0.5"/>
+  <geom size=".1" mass="1"/>
+</body></worldbody><actuator><motor name="push" joint="slide"/></actuator></mujoco>"""
+FLAT = Configuration(1, 1, (0,), (0,), ())
+
+
+@pytest.fixture(scope="module")
+def machine() -> Machine:
+    model = mujoco.MjModel.from_xml_string(XML)
+    return Machine(model, ParameterSpace((declare(model, "m", "joint.slide.damping"),)))
+
+
+def make_run(qpos: np.ndarray, name: str = "run", dt: float = 0.01) -> Run:
+    rows = len(qpos)
+    return Run(
+        name=name,
+        source=f"{name}.csv",
+        dt=dt,
+        time=dt * np.arange(rows),
+        qpos=qpos[:, None],
+        qvel=fitted_velocity(qpos[:, None], dt, FLAT),
+        qvel_measured=False,
+        ctrl=np.arange(rows, dtype=float)[:, None],
+        configuration=FLAT,
+    )
+
+
+def sine(rows: int = 4000, dt: float = 0.01) -> np.ndarray:
+    return 0.7 * np.sin(2 * np.pi * 0.8 * dt * np.arange(rows))
+
+
+@pytest.mark.parametrize("sigma", [1e-4, 3e-3])
+def test_noise_of_a_known_signal(sigma):
+    rng = np.random.default_rng(0)
+    run = make_run(sine() + sigma * rng.standard_normal(4000))
+    noise = estimate_noise(run)
+    assert noise[0] == pytest.approx(sigma, rel=0.1)
+    clean = fitted_velocity(sine()[:, None], 0.01, FLAT)
+    error = (run.qvel - clean)[5:-5].std()
+    assert noise[1] == pytest.approx(error, rel=0.15)
+
+
+def test_noise_survives_jumps_and_rests():
+    rng = np.random.default_rng(1)
+    qpos = np.where(np.arange(4000) % 400 < 100, 0.3, sine())  # with 20 jumps
+    run = make_run(qpos + 1e-3 * rng.standard_normal(4000))
+    assert estimate_noise(run)[0] == pytest.approx(1e-3, rel=0.15)
+
+
+def test_quantized_readings_are_as_noisy_as_their_step():
+    step = 2 * np.pi / 4096
+    for qpos in (sine(), 0.02 * np.sin(0.01 * np.arange(4000))):  # fast, nearly at rest
+        noise = estimate_noise(make_run(np.round(qpos / step) * step))
+        assert noise[0] == pytest.approx(step / np.sqrt(12), rel=0.2)
+
+
+def test_measured_velocities_have_their_own_noise():
+    rng = np.random.default_rng(2)
+    run = make_run(sine())
+    qvel = run.qvel + 0.02 * rng.standard_normal(run.qvel.shape)
+    run = dataclasses.replace(run, qvel=qvel, qvel_measured=True)
+    assert estimate_noise(run)[1] == pytest.approx(0.02, rel=0.1)
+
+
+def test_late_velocities_are_not_trusted():
+    run = make_run(sine())
+    late = dataclasses.replace(run, qvel=np.roll(run.qvel, 8, 0), qvel_measured=True)
+    np.testing.assert_array_equal(trusted_velocity(late), run.qvel)
+    close = dataclasses.replace(run, qvel=1.02 * run.qvel, qvel_measured=True)
+    np.testing.assert_array_equal(trusted_velocity(close), close.qvel)
+
+
+def test_visible_steps_grow_with_noise():
+    run = make_run(sine())
+    found = [visible_steps([run], np.array([s, 1e-9]), 50, 30) for s in (1e-6, 1e-3, 1)]
+    assert found[0] == 1
+    assert 1 < found[1] < 50
+    assert found[2] == 50
+
+
+def test_whole_runs_are_held_out():
+    runs = [make_run(np.zeros(n), f"r{i}") for i, n in enumerate((100, 90, 100, 10))]
+    fit, held, name = split_held_out(runs, 0.2)
+    assert [r.name for r in held] == ["r1"] == [name]
+    assert [r.name for r in fit] == ["r0", "r2", "r3"]
+    many = [make_run(np.zeros(50), f"r{i}") for i in range(10)]
+    fit, held, _ = split_held_out(many, 0.2)
+    assert [r.name for r in held] == ["r7", "r8", "r9"]  # 150 of 500 rows
+    assert len(fit) == 7
+
+
+def test_a_single_run_is_split_behind_a_gap():
+    run = make_run(np.arange(100.0))
+    (fit,), (held,), name = split_held_out([run], 0.2)
+    assert held.qpos[0, 0] == 70
+    assert len(held) == 30
+    assert fit.qpos[-1, 0] == 49  # 20 steps before
+    assert "30 %" in name
+    with pytest.raises(UserError, match="too few"):
+        split_held_out([make_run(np.zeros(30))], 0.3)
+
+
+def test_runs_of_two_rates_come_to_the_smaller_step():
+    fast, slow = make_run(sine(100)), make_run(sine(50, 0.02), "slow", 0.02)
+    runs, notes = to_common_step([slow, fast])
+    assert [r.dt for r in runs] == [0.01, 0.01]
+    assert len(runs[0]) == 99
+    np.testing.assert_allclose(runs[0].qpos[::2], slow.qpos)
+    middle = (slow.qpos[1:] + slow.qpos[:-1]) / 2
+    np.testing.assert_allclose(runs[0].qpos[1::2], middle)
+    np.testing.assert_array_equal(runs[0].ctrl[1::2], slow.ctrl[:-1])  # held
+    assert len(notes) == 1
+    assert "slow" in notes[0]
+
+
+def test_segments_never_cross_runs(machine):
+    runs = [make_run(np.full(21, v)) for v in (1.0, 2.0)]
+    pieces = segments_from_runs(machine, runs, 10, 5)
+    assert pieces.count == 6
+    assert pieces.horizon == 10
+    np.testing.assert_array_equal(
+        pieces.next_qpos, np.broadcast_to(pieces.qpos[:, None], (6, 10, 1))
+    )
+    with pytest.raises(UserError, match="no run is longer than 30 steps"):
+        segments_from_runs(machine, runs, 30, 5)
+    with pytest.raises(ValueError, match="control step"):
+        segments_from_runs(machine, [make_run(np.zeros(50), dt=0.02)], 10, 5)
+
+
+def test_error_of_the_true_model_is_the_noise_floor(machine):
+    """Motion by MuJoCo C, noise added: errors are what the floor says."""
+    model = machine.mj_model
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(3)
+    rows, sigma = 2000, 2e-3
+    ctrl = 5 * np.sin(0.03 * np.arange(rows))
+    qpos = np.empty(rows)
+    for t in range(rows):
+        qpos[t], data.ctrl[0] = data.qpos[0], ctrl[t]
+        mujoco.mj_step(model, data)
+    run = make_run(qpos + sigma * rng.standard_normal(rows))
+    run = dataclasses.replace(run, ctrl=ctrl[:, None])
+    pieces = to_device(segments_from_runs(machine, [run], 20, 10, fitted=True))
+    noise = jnp.asarray(estimate_noise(run), jnp.float32)
+    truth = machine.model(jnp.asarray(machine.space.nominal, jnp.float32))
+    error = open_loop_error(machine, truth, pieces)
+    floor = noise_floor(machine, truth, pieces, noise, jax.random.key(0))
+    np.testing.assert_allclose(error, floor, rtol=0.15)
+    wrong = open_loop_error(machine, machine.model(jnp.asarray([5.0])), pieces)
+    assert float(wrong[0]) > 2 * float(error[0])
+    first = rows_of(run, 0, 21)
+    one = to_device(segments_from_runs(machine, [first], 20, 20, fitted=True))
+    again = open_loop_error(machine, truth, one)
+    assert one.count == 1
+    assert float(again[0]) < 5 * float(error[0])
+
+
+def test_misfit_counts_only_what_noise_does_not_explain():
+    rng = np.random.default_rng(4)
+    white = jnp.asarray(rng.standard_normal((200, 30, 2)))
+    noise, ones = jnp.ones(2), jnp.ones(200)
+    assert float(misfit_of(white, noise, ones).max()) < 0.3
+    steady = jnp.broadcast_to(3 * white[:, :1], white.shape)  # the same in each step
+    expected = np.sqrt((9 - 1) * 30)
+    np.testing.assert_allclose(misfit_of(steady, noise, ones), expected, rtol=0.15)
+
+
+def test_outliers_weigh_less():
+    error = jnp.ones((9, 5, 2)).at[4].set(20.0)
+    weight = outlier_weights(error, jnp.ones(2), jnp.zeros(2), 2.5)
+    np.testing.assert_allclose(weight[4], 2.5 / 20, rtol=1e-5)
+    np.testing.assert_allclose(np.delete(np.asarray(weight), 4), 1.0)

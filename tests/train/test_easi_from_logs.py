@@ -1,0 +1,296 @@
+"""``train.easi --data``: what a user with a model, parameters and logs gets."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from train import _command, easi
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "lift_arm"
+
+MODEL = """<mujoco model="pendulum">
+  <option timestep="0.01" integrator="implicitfast"/>
+  <worldbody><body name="rod">
+    <joint name="hinge" type="hinge" axis="0 1 0" damping="0.05" limited="true"
+           range="-170 170"/>
+    <geom name="rod" type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="0.5"
+          contype="0" conaffinity="0"/>
+  </body></worldbody>
+  <actuator><motor name="drive" joint="hinge"/></actuator>
+</mujoco>"""
+PARAMETERS = """parameters:
+  - name: damping
+    address: joint.hinge.damping
+    initial: [0.01, 0.3]
+    bounds: [0.0001, 10.0]
+"""
+SMALL = ("--population", "8", "--generations", "2", "--set", "segments=16")
+
+
+def call(*args: object) -> None:
+    _command.main(easi.Config, easi.run, name="train.easi", args=[str(a) for a in args])
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, Path]:
+    """A model, a parameter file and a log, all good."""
+    paths = {
+        "model": tmp_path / "pendulum.xml",
+        "parameters": tmp_path / "parameters.yaml",
+        "log": tmp_path / "log.csv",
+        "out": tmp_path / "out",
+    }
+    paths["model"].write_text(MODEL)
+    paths["parameters"].write_text(PARAMETERS)
+    write_log(paths["log"])
+    return paths
+
+
+def write_log(path: Path, rows: int = 200, dt: float = 0.01, gain: float = 1.0) -> None:
+    time = dt * np.arange(rows)
+    angle = gain * 0.5 * np.sin(3 * time)
+    lines = [f"{t:.6g},{a:.6f},{np.cos(3 * t):.4f}" for t, a in zip(time, angle)]  # noqa: B905
+    path.write_text("\n".join(["time,qpos.hinge,ctrl.drive", *lines]) + "\n")
+
+
+def arguments(files: dict[str, Path], *more: object) -> list[object]:
+    head = ["--model", files["model"], "--parameters", files["parameters"]]
+    return [*head, "--data", files["log"], "--out", files["out"], *SMALL, *more]
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+# -- the example ------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The example's command, with a small search."""
+    out = tmp_path_factory.mktemp("arm") / "run"
+    call(
+        "--model",
+        EXAMPLE / "model.xml",
+        "--parameters",
+        EXAMPLE / "parameters.yaml",
+        "--data",
+        EXAMPLE / "sweep.csv",
+        EXAMPLE / "moves.csv",
+        "--out",
+        out,
+        *SMALL,
+    )
+    return out
+
+
+def truth() -> dict[str, float]:
+    lines = (EXAMPLE / "README.md").read_text().splitlines()
+    cells = [
+        [c.strip() for c in line.split("|")[1:-1]] for line in lines if "|" in line
+    ]
+    rows = [c for c in cells if len(c) == 4 and c[2][:1].isdigit()]
+    return {c[0].split(" ")[0]: float(c[2]) for c in rows}
+
+
+def test_example_finds_its_truth(arm):
+    found = json.loads((arm / "distribution.json").read_text())
+    wanted = truth()
+    result = found["seeds"]["0"]
+    names = [p["name"] for p in found["parameters"]]
+    assert sorted(names) == sorted(wanted)
+    assert result["flags"] == ["determined"] * len(names)
+    for name, mean in zip(names, result["mean"], strict=True):
+        # The model's timestep alone moves the rotor inertia by 7 % (README).
+        tolerance = 0.09 if name == "rotor_inertia" else 0.05
+        assert mean == pytest.approx(wanted[name], rel=tolerance), name
+
+
+def test_example_reports_held_out_error(arm):
+    held = json.loads((arm / "distribution.json").read_text())["held_out"]
+    assert held["what"] == "moves"
+    assert held["channels"] == ["shoulder", "elbow"]
+    for before, after, floor in zip(
+        held["before"], held["after"]["0"], held["noise_floor"], strict=True
+    ):
+        assert before > 0.03
+        assert after < 0.1 * before
+        assert floor < 1.1 * after
+    page = (arm / "report.html").read_text()
+    for said in ("rotor_inertia", "joint.*.armature", "kg m^2", "moves", "<svg"):
+        assert said in page
+    assert "http" not in page.replace("http://www.w3.org", "")
+
+
+# -- bad input --------------------------------------------------------------------
+
+
+def refuse(capsys: pytest.CaptureFixture[str], args: list[object], *said: str) -> None:
+    """One clear line, exit status 2."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stop:
+        call(*args)
+    assert stop.value.code == 2
+    line = capsys.readouterr().err.strip()
+    assert line.startswith("error: ")
+    assert "\n" not in line
+    for text in said:
+        assert text in line, line
+
+
+def unknown_address(f):
+    edit(f["parameters"], "joint.hinge.damping", "joint.hinge.dampling")
+    return 'did you mean "damping"', "parameters.yaml"
+
+
+def unknown_joint(f):
+    edit(f["parameters"], "joint.hinge.damping", "joint.hing.damping")
+    return ('did you mean "hinge"',)
+
+
+def reversed_bounds(f):
+    edit(f["parameters"], "[0.0001, 10.0]", "[10.0, 0.0001]")
+    return "damping", "bounds"
+
+
+def reversed_initial(f):
+    edit(f["parameters"], "[0.01, 0.3]", "[0.3, 0.01]")
+    return "damping", "initial"
+
+
+def missing_column(f):
+    edit(f["log"], "ctrl.drive", "ctrl.driver")
+    return "ctrl.driver", "log.csv"
+
+
+def backwards(f):
+    edit(f["log"], "\n0.05,", "\n0.03,")
+    return "time goes back", "row"
+
+
+def wrong_rate(f):
+    write_log(f["log"], dt=10.0)
+    return ("wrong rate",)
+
+
+def single_row(f):
+    write_log(f["log"], rows=1)
+    return ("a single row",)
+
+
+def all_non_finite(f):
+    lines = f["log"].read_text().splitlines()
+    rows = [line.split(",")[0] + ",nan,0" for line in lines[1:]]
+    f["log"].write_text("\n".join([lines[0], *rows]) + "\n")
+    return ("log.csv",)
+
+
+def too_short(f):
+    write_log(f["log"], rows=20)
+    return ("too few",)
+
+
+def not_xml(f):
+    edit(f["model"], "</worldbody>", "")
+    return "pendulum.xml", "cannot read"
+
+
+def no_model(f):
+    f["model"].unlink()
+    return "pendulum.xml", "no such"
+
+
+def delay(f):
+    edit(f["model"], 'joint="hinge"/>', 'joint="hinge" delay="0.02" nsample="4"/>')
+    return ("delay",)
+
+
+def foreign_folder(f):
+    f["out"].mkdir()
+    (f["out"] / "thesis.txt").write_text("mine")
+    return ("holds no run",)
+
+
+CASES = (
+    unknown_address,
+    unknown_joint,
+    reversed_bounds,
+    reversed_initial,
+    missing_column,
+    backwards,
+    wrong_rate,
+    single_row,
+    all_non_finite,
+    too_short,
+    not_xml,
+    no_model,
+    delay,
+    foreign_folder,
+)
+
+
+@pytest.mark.parametrize("spoil", CASES, ids=lambda f: f.__name__)
+def test_bad_input_is_one_line(spoil, files, capsys):
+    said = spoil(files)
+    before = sorted(files["out"].rglob("*")) if files["out"].exists() else None
+    refuse(capsys, arguments(files), *said)
+    after = sorted(files["out"].rglob("*")) if files["out"].exists() else None
+    assert after == before
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--strategy", "CMA_E"], ['did you mean "CMA_ES"']),
+        (["--preset", "papers"], ['did you mean "paper"']),
+        (["--set", "los=gan"], ['did you mean "loss"']),
+        (["--set", "source=policy"], ["without their controller"]),
+        (["--horizon", "-1"], ["--horizon"]),
+        (["--noise", "0.1"], ["2 numbers"]),
+        (["--robot", "cartpole"], ["exclude each other"]),
+        (["--held-out", "nowhere.csv"], ["nowhere.csv"]),
+    ],
+)
+def test_bad_options_are_one_line(more, said, files, capsys):
+    refuse(capsys, arguments(files, *more), *said)
+    assert not files["out"].exists()
+
+
+def test_data_alone_asks_for_a_model(files, capsys):
+    refuse(capsys, ["--data", files["log"], "--out", files["out"]], "--model")
+    args = ["--data", files["log"], "--model", files["model"], "--out", files["out"]]
+    refuse(capsys, args, "--parameters")
+
+
+def test_folder_that_cannot_be_written(files, capsys):
+    files["out"].parent.joinpath("file").write_text("x")
+    files["out"] = files["out"].parent / "file" / "out"
+    refuse(capsys, arguments(files), "--out")
+
+
+def test_non_finite_simulations_stop_the_search(files, capsys):
+    edit(files["parameters"], "joint.hinge.damping", "actuator.drive.gain")
+    edit(files["parameters"], "[0.01, 0.3]", "[1.0e+37, 3.0e+37]")
+    edit(files["parameters"], "[0.0001, 10.0]", "[0.0001, 1.0e+38]")
+    edit(files["log"], ",1.0000\n", ",900000.0\n")
+    edit(files["model"], 'joint="hinge"/>', 'joint="hinge" gear="1000"/>')
+    refuse(capsys, arguments(files), "non-finite", "damping", "generation 1")
+
+
+def test_degrees_are_noticed_and_earlier_results_kept(files, capsys):
+    """A whole small run; then a bad one into the same folder."""
+    write_log(files["log"], gain=57.3 * 2)
+    call(*arguments(files))
+    out = capsys.readouterr().out
+    assert "degrees" in out
+    assert out.strip().splitlines()[-1] == f"report: {files['out'] / 'report.html'}"
+    kept = {p: p.read_bytes() for p in files["out"].rglob("*") if p.is_file()}
+    refuse(capsys, arguments(files), "already holds a run")
+    single_row(files)
+    refuse(capsys, arguments(files, "--overwrite"), "a single row")
+    assert {p: p.read_bytes() for p in files["out"].rglob("*") if p.is_file()} == kept
