@@ -283,6 +283,17 @@ class Search:
         state, losses = jax.lax.scan(update, state, keys)
         return state, losses[-1]
 
+    def simulated_states(self, state: SearchState, data: SearchData, key: Any) -> Any:
+        """What one generation simulates and nothing else, for timing.
+
+        Uniform individuals; the last positions, ``(N, M, nq)``.
+        """
+        shape = (self.config.population, self.space.size)
+        unit = jax.random.uniform(key, shape)
+        simulate = self._replay if self.config.source == "replay" else self._roll
+        theta, center = self.space.to_si(unit), self.space.to_si(state.mean)
+        return simulate(data, theta, center, key)[2].next_qpos[..., -1, :]
+
     # -- simulation ----------------------------------------------------------
 
     def _simulate(

@@ -39,9 +39,14 @@ def run_stage(
             before the checkpoint is written.
     """
     import jax
+    from jax.sharding import NamedSharding, PartitionSpec
 
     from easi_jax.io import checkpoints
+    from easi_jax.mesh import make_mesh
 
+    # One placement whether a state is fresh, restored or came out of a chunk: every
+    # chunk runs the same compiled program, so a resumed run ends bit-equal.
+    everywhere = NamedSharding(make_mesh(), PartitionSpec())
     folder = run.checkpoints / name
     found = checkpoints.restore(
         folder, jax.eval_shape(init), config_hash=run.config_hash
@@ -53,12 +58,14 @@ def run_stage(
         if notes is not None:
             notes.extend(found.notes)
             notes.append(f"{name}: went on after step {done}")
+    state = jax.device_put(state, everywhere)
     if run.resumed:
         run.rewind(name, done)
     with progress(name, total, done) as meter:
         while done < total:
             n = min(chunk, total - done)
             state, info = advance(state, n)
+            state = jax.device_put(state, everywhere)
             info = jax.device_get(info)
             if check is not None:
                 check(done, info)

@@ -1,0 +1,216 @@
+"""Recovery of known Cartpole parameters, every seed shown.
+
+    python -m benchmarks.recovery
+
+Demonstrations of a rough controller (a linear one with exploration noise, the same for
+all methods) in the nominal robot; then the search alone (`paper`, `default`) and the
+search with the least-squares finish (`refine`). Two cases: all 11 parameters free, and
+masses and pole length weighed; with and without sensor noise; from UDR's range and from
+starts that exclude the truth. Cases run one after the other and each is written when it
+is done; those not run are absent.
+"""
+
+import dataclasses
+import time
+from typing import Any
+
+from train._command import main, say, show_table
+
+NOISE = (5e-4, 2e-3, 1e-2, 2e-2)  # m, rad, m/s, rad/s
+WEIGHED = ("pole_length", "pole_mass", "cart_mass")
+CASES: dict[str, dict[str, Any]] = {
+    "weighed_noisy": {"free": False, "noise": NOISE},
+    "free_clean": {"free": True, "noise": (0.0,) * 4},
+    "free_noisy": {"free": True, "noise": NOISE},
+    "weighed_noisy_low_start": {"free": False, "noise": NOISE, "start": (0.05, 0.5)},
+    "weighed_noisy_high_start": {"free": False, "noise": NOISE, "start": (2.0, 4.0)},
+    "weighed_clean": {"free": False, "noise": (0.0,) * 4},
+    "paper_free_clean": {"free": True, "noise": (0.0,) * 4, "preset": "paper"},
+    "paper_free_noisy": {"free": True, "noise": NOISE, "preset": "paper"},
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Recovers known Cartpole parameters from demonstrations."""
+
+    seeds: tuple[int, ...] = tuple(range(10))
+    """Seeds of demonstrations and search."""
+    cases: tuple[str, ...] = tuple(CASES)
+    """Which cases to run."""
+    trajectories: int = 200
+    """Demonstration trajectories."""
+    generations: int = 50
+    """Generations of the search."""
+
+
+def controller(obs: Any, key: Any) -> Any:
+    """A rough stabilizer with exploration noise; action in [-1, 1]."""
+    import jax
+    import jax.numpy as jnp
+
+    x, v, angle, rate = obs
+    u = 3.75 * x + 1.5 * v + 7.5 * angle + 1.375 * rate
+    return jnp.clip(u + 0.25 * jax.random.normal(key), -1.0, 1.0)[None]
+
+
+def run(config: Config) -> None:
+    """Runs the cases and writes one JSON for each."""
+    for name in config.cases:
+        from easi_jax.errors import UserError, nearest
+
+        if name not in CASES:
+            raise UserError(f'unknown case "{name}"{nearest(name, CASES)}')
+        _case(name, config, **CASES[name])
+
+
+def _case(
+    name: str,
+    config: Config,
+    free: bool,
+    noise: tuple[float, ...],
+    start: tuple[float, float] | None = None,
+    preset: str = "default",
+) -> None:
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from benchmarks._common import write_result
+    from easi_jax.heldout import relative_errors
+    from easi_jax.identify import estimate
+    from easi_jax.information import describe, identifiability
+    from easi_jax.machine import Machine
+    from easi_jax.rollout import collect, measured
+    from easi_jax.search import Search, SearchData
+    from easi_jax.search_config import preset as make_preset
+    from easi_jax.segments import windows
+    from envs import make
+
+    env = make("cartpole")
+    names = [n for n in env.space.names if free or n not in WEIGHED]
+    space = env.space.select(names)
+    if start is not None:
+        space = space.scaled(*start)
+    machine = Machine(env.mj_model, space, env.dt)
+    truth = np.asarray(space.nominal)
+    noisy = any(noise)
+    changes = {} if preset == "paper" else {"horizon": 8 if noisy else 1}
+    search = Search(
+        machine,
+        make_preset(preset, generations=config.generations, **changes),
+        env=env,
+        act=lambda _, obs, key: controller(obs, key),
+    )
+    deviation = jnp.asarray(noise)
+    nominal = env.model()
+
+    def trajectories(key: jax.Array, count: int) -> Any:
+        return collect(env, nominal, controller, key, count, env.episode_length)
+
+    @jax.jit
+    def demonstrate(key: jax.Array) -> Any:
+        k_run, k_noise = jax.random.split(key)
+        return measured(trajectories(k_run, config.trajectories), deviation, k_noise)
+
+    @jax.jit
+    def find(key: jax.Array, demos: Any) -> Any:
+        h = search.config.horizon if preset == "default" else 1
+        data = SearchData(windows(demos, h, max(1, h // 2)), deviation, ())
+        state, info = search.run(search.init(key, data), data, config.generations)
+        return state.result_mean, state.result_cov, info.non_finite.sum()
+
+    @jax.jit
+    def finish(mean: jax.Array, cov: jax.Array, demos: Any) -> Any:
+        pieces = windows(demos, 25, 26)
+        return estimate(machine, search.space, mean, cov, pieces, deviation, True)
+
+    @jax.jit
+    def errors(mean: jax.Array, key: jax.Array) -> Any:
+        fresh = trajectories(key, 20)
+        model, limit = machine.model(search.space.to_si(mean)), nominal.speed_limit
+        return tuple(
+            relative_errors(machine, model, windows(fresh, h, h), limit)
+            for h in (1, 10)
+        )
+
+    rows = []
+    for seed in config.seeds:
+        key = jax.random.key(seed)
+        demos = demonstrate(jax.random.fold_in(key, 0))
+        begin = time.monotonic()
+        mean, cov, lost = jax.block_until_ready(find(jax.random.fold_in(key, 1), demos))
+        searched = time.monotonic() - begin
+        found = {preset: mean}
+        row: dict[str, Any] = {
+            "seed": seed,
+            "search_s": searched,
+            "non_finite": int(lost),
+        }
+        if preset == "default":
+            begin = time.monotonic()
+            fit = jax.block_until_ready(finish(mean, cov, demos))
+            row["refine_s"] = time.monotonic() - begin
+            found["refine"] = fit.distribution.mean
+            ident = identifiability(search.space, np.asarray(fit.hessian))
+            row["rank"] = ident.rank
+            row["cramer_rao_std"] = ident.std.tolist()
+            row["determined"] = ident.determined.tolist()
+            row["undetermined"] = [describe(d) for d in ident.undetermined]
+        for method, unit in found.items():
+            si = np.asarray(search.space.to_si(unit))
+            one, long = errors(unit, jax.random.key(10_000 + seed))
+            row[method] = {
+                "log_ratio": np.log(np.maximum(si, 1e-30) / truth).tolist(),
+                "one_step": np.asarray(one).tolist(),
+                "open_loop_0.2s": np.asarray(long).tolist(),
+            }
+        rows.append(row)
+        short = {m: np.round(np.array(row[m]["one_step"]) * 100, 2) for m in found}
+        say(f"{name} seed {seed}: {searched:.0f} s, one-step error [%] {short}")
+    methods = [m for m in ("paper", "default", "refine") if m in rows[0]]
+    summary = {
+        m: {
+            "median_one_step": np.median([r[m]["one_step"] for r in rows], 0).tolist(),
+            "median_open_loop": np.median(
+                [r[m]["open_loop_0.2s"] for r in rows], 0
+            ).tolist(),
+            "median_abs_log_ratio": np.median(
+                np.abs([r[m]["log_ratio"] for r in rows]), 0
+            ).tolist(),
+            "worst_abs_log_ratio": np.max(
+                np.abs([r[m]["log_ratio"] for r in rows]), 0
+            ).tolist(),
+        }
+        for m in methods
+    }
+    path = write_result(
+        f"recovery_{name}",
+        f"python -m benchmarks.recovery --cases {name}",
+        config,
+        case={"free": free, "noise": noise, "start": start, "preset": preset},
+        parameters=names,
+        channels=machine.state_names,
+        summary=summary,
+        seeds=rows,
+    )
+    show_table(
+        f"{name}: |log ratio| to the truth, median (worst) over {len(rows)} seeds",
+        ("parameter", *methods),
+        [
+            (
+                n,
+                *(
+                    f"{summary[m]['median_abs_log_ratio'][i]:.4f} "
+                    f"({summary[m]['worst_abs_log_ratio'][i]:.3f})"
+                    for m in methods
+                ),
+            )
+            for i, n in enumerate(names)
+        ],
+    )
+    say(f"written: {path}")
+
+
+if __name__ == "__main__":
+    main(Config, run, name="benchmarks.recovery")

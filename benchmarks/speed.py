@@ -1,0 +1,275 @@
+"""Speed of the search, against native MuJoCo in the same run, and compile times.
+
+python -m benchmarks.speed
+"""
+
+import dataclasses
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from typing import Any
+
+from train._command import main, say, show_table
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Times physics, a generation, the whole search and compilation."""
+
+    population: int = 300
+    """Individuals."""
+    steps: int = 200
+    """Control steps of a rollout."""
+    generations: int = 50
+    """Generations of the timed search."""
+    repeats: int = 5
+    """Timings; the median is reported, all are written."""
+    stress: int = 10
+    """Fresh processes that step a large batch under a time limit."""
+    stress_batch: int = 2048
+    """Simulations in such a batch."""
+    phase: str = "all"
+    """all, or compile: print compile times of this process and stop."""
+
+
+def _search(config: Config) -> Any:
+    import jax.numpy as jnp
+
+    from benchmarks.recovery import controller
+    from easi_jax.rollout import collect
+    from easi_jax.search import Search, SearchData
+    from easi_jax.search_config import preset
+    from easi_jax.segments import windows
+    from envs import make
+
+    env = make("cartpole")
+    search = Search(
+        env.machine,
+        preset(
+            "default",
+            population=config.population,
+            segments=config.steps,
+            generations=config.generations,
+        ),
+    )
+
+    def data(key: Any) -> Any:
+        demos = collect(env, env.model(), controller, key, 50, env.episode_length)
+        return SearchData(windows(demos, 1, 1), jnp.zeros(4), ())
+
+    return env, search, data
+
+
+def _compile(config: Config) -> dict[str, float]:
+    import jax
+
+    begin = time.monotonic()
+    _, search, data = _search(config)
+    d = jax.jit(data)(jax.random.key(0))
+    state = search.init(jax.random.key(0), d)
+    ready = time.monotonic()
+    lowered = jax.jit(lambda s, d: search.run(s, d, config.generations)).lower(state, d)
+    traced = time.monotonic()
+    lowered.compile()
+    done = time.monotonic()
+    return {
+        "prepare_s": ready - begin,
+        "trace_s": traced - ready,
+        "compile_s": done - traced,
+    }
+
+
+def _native(config: Config, repeats: int) -> list[float]:
+    import mujoco
+    import numpy as np
+    from mujoco import rollout
+
+    from easi_jax import runtime
+    from envs import make
+
+    env = make("cartpole")
+    m, n = env.mj_model, config.population
+    steps = config.steps * env.machine.substeps
+    size = mujoco.mj_stateSize(m, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    start = np.zeros((n, size))
+    start[:, 2] = np.linspace(-0.1, 0.1, n)
+    ctrl = np.random.default_rng(0).uniform(-0.2, 0.2, (n, steps, 1))
+    threads = runtime.cores()
+    out = []
+    with rollout.Rollout(nthread=threads) as pool:
+        datas = [mujoco.MjData(m) for _ in range(threads)]
+        for _ in range(repeats + 1):
+            begin = time.monotonic()
+            pool.rollout([m] * n, datas, start, ctrl)
+            out.append(n * steps / (time.monotonic() - begin))
+    return out[1:]
+
+
+def _physics(config: Config) -> list[float]:
+    """Search rollouts: every individual its own model, one trajectory each."""
+    import jax
+    import jax.numpy as jnp
+
+    from easi_jax.mesh import make_mesh, sharded_map
+    from envs import make
+
+    env = make("cartpole")
+    machine, n = env.machine, config.population
+    ctrl = jax.random.uniform(
+        jax.random.key(0), (n, config.steps, 1), minval=-0.2, maxval=0.2
+    )
+    unit = jax.random.uniform(jax.random.key(1), (n, env.space.size))
+
+    def local(items: Any) -> Any:
+        def one(u: Any, c: Any) -> Any:
+            model = machine.model(env.space.to_si(u))
+            start = machine.start(jnp.array([0.0, 0.1]), jnp.zeros(2))
+
+            def step(s: Any, a: Any) -> Any:
+                s = machine.step(model, s, a)
+                return s, (s.qpos, s.qvel)
+
+            return jax.lax.scan(step, start, c)[1]
+
+        return jax.vmap(one)(*items)
+
+    run = jax.jit(lambda u, c: sharded_map(local, make_mesh(), (u, c)))
+    out = []
+    for _ in range(config.repeats + 1):
+        begin = time.monotonic()
+        jax.block_until_ready(run(unit, ctrl))
+        seconds = time.monotonic() - begin
+        out.append(n * config.steps * machine.substeps / seconds)
+    return out[1:]
+
+
+def _generations(config: Config) -> dict[str, Any]:
+    """A whole search, and the same without its discriminator and strategy."""
+    import jax
+
+    _, search, data = _search(config)
+    d = jax.jit(data)(jax.random.key(0))
+    state = search.init(jax.random.key(0), d)
+    whole = jax.jit(lambda s, d: search.run(s, d, config.generations))
+    only = jax.jit(
+        lambda s, d: jax.lax.scan(
+            lambda k, _: (
+                jax.random.fold_in(k, 1),
+                search.simulated_states(s, d, k),
+            ),
+            jax.random.key(3),
+            None,
+            length=config.generations,
+        )[1]
+    )
+    times: dict[str, list[float]] = {"search_s": [], "physics_s": []}
+    for name, fun in (("search_s", whole), ("physics_s", only)):
+        for i in range(3):
+            begin = time.monotonic()
+            jax.block_until_ready(fun(state, d))
+            if i:
+                times[name].append(time.monotonic() - begin)
+    outside = min(times["search_s"]) - min(times["physics_s"])
+    return {**times, "outside_physics_per_generation_s": outside / config.generations}
+
+
+def _stress(config: Config) -> list[dict[str, Any]]:
+    code = (
+        "import easi_jax, jax, jax.numpy as jnp; from mujoco import mjx; "
+        "from envs import make; m = make('cartpole').machine.base.mjx; "
+        "f = jax.jit(jax.vmap(lambda q: jax.lax.fori_loop(0, 20, "
+        "lambda i, d: mjx.step(m, d), mjx.make_data(m).replace(qpos=q)).qpos)); "
+        f"q = jnp.zeros(({config.stress_batch}, 2)).at[:, 1].set(0.1); "
+        "[jax.block_until_ready(f(q)) for _ in range(5)]"
+    )
+    out = []
+    for _ in range(config.stress):
+        begin = time.monotonic()
+        try:
+            done = subprocess.run(
+                [sys.executable, "-c", code], timeout=180, capture_output=True
+            )
+            ok = done.returncode == 0
+        except subprocess.TimeoutExpired:
+            ok = False
+        out.append({"finished": ok, "seconds": time.monotonic() - begin})
+    return out
+
+
+def _compile_in(cache: str) -> dict[str, float]:
+    import json
+
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.speed", "--phase", "compile"],
+        env={**os.environ, "JAX_COMPILATION_CACHE_DIR": cache},
+        timeout=600,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+def run(config: Config) -> None:
+    """Times everything in one run."""
+    if config.phase == "compile":
+        import json
+
+        say(json.dumps(_compile(config)))
+        return
+    import numpy as np
+
+    from benchmarks._common import write_result
+
+    with tempfile.TemporaryDirectory() as cache:
+        cold, cached = (_compile_in(cache) for _ in range(2))
+    native = _native(config, config.repeats)
+    physics = _physics(config)
+    again = _native(config, config.repeats)
+    native_rate = float(np.median(native + again))
+    rate = float(np.median(physics))
+    search = _generations(config)
+    stress = _stress(config)
+    path = write_result(
+        "speed",
+        "python -m benchmarks.speed",
+        config,
+        native_steps_per_s=native + again,
+        search_steps_per_s=physics,
+        ratio=rate / native_rate,
+        ratio_goal=4.0,
+        search=search,
+        search_goal_s=60.0,
+        outside_goal_s=0.25,
+        compile={"cold": cold, "cached": cached},
+        stress=stress,
+    )
+    show_table(
+        "Cartpole on this machine",
+        ("figure", "measured", "goal"),
+        [
+            ("physics steps/s, search", f"{rate:,.0f}", ""),
+            ("physics steps/s, native, all cores", f"{native_rate:,.0f}", ""),
+            ("ratio", f"{rate / native_rate:.2f}", "4"),
+            ("search [s]", f"{min(search['search_s']):.1f}", "60"),
+            (
+                "a generation outside physics [s]",
+                f"{search['outside_physics_per_generation_s']:.3f}",
+                "0.25",
+            ),
+            ("trace + compile, cold [s]", f"{sum(cold.values()):.0f}", ""),
+            ("trace + compile, cached [s]", f"{sum(cached.values()):.0f}", ""),
+            (
+                "large batches that finished",
+                f"{sum(s['finished'] for s in stress)} of {len(stress)}",
+                "all",
+            ),
+        ],
+    )
+    say(f"written: {path}")
+
+
+if __name__ == "__main__":
+    main(Config, run, name="benchmarks.speed")
