@@ -1,0 +1,160 @@
+"""Return in targets whose cart drive differs: UDR, EASI and the Oracle, equal budgets.
+
+    python -m benchmarks.transfer
+
+UDR's range stays centered on the nominal robot while the target's drive stiffness is
+multiplied; one UDR training serves all targets. Each target is written when it is done;
+those not run are absent. ``--joint`` adds a search that also trains the policy.
+"""
+
+import dataclasses
+import time
+from typing import Any
+
+from train._command import main, say, show_table
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Trains and tests UDR, EASI and Oracle policies, paired by seed."""
+
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+    """Seeds, paired over methods."""
+    factors: tuple[float, ...] = (0.25, 0.5, 2.0, 4.0)
+    """Targets: factors on the cart drive's stiffness."""
+    env_steps: int | None = None
+    """Control steps of each training; the preset where not given."""
+    joint: int = 0
+    """Policy updates per generation; 0 as in the paper."""
+
+
+def run(config: Config) -> None:
+    """Runs the targets one after the other."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from benchmarks._common import write_result
+    from easi_jax.pipeline import (
+        Pipeline,
+        PipelineConfig,
+        seed_keys,
+        stage_keys,
+        target_parameters,
+    )
+    from easi_jax.search_config import preset
+    from envs import make
+    from train._robots import sac_config
+
+    env = make("cartpole")
+    sac = dataclasses.replace(
+        sac_config("cartpole", config.env_steps), evaluate_every=0
+    )
+    pipe = Pipeline(
+        env,
+        PipelineConfig(
+            search=preset("default", policy_updates_per_generation=config.joint),
+            sac=sac,
+            refine=True,
+        ),
+    )
+    keys = stage_keys(seed_keys(list(config.seeds)))
+    count = len(config.seeds)
+    train = jax.jit(
+        lambda s, dist, target: pipe.train_chunk(s, dist, target, sac.iterations, 0)[0]
+    )
+    shorter = jax.jit(
+        lambda s, dist, target: pipe.train_chunk(
+            s, dist, target, pipe.final_iterations(), 0
+        )[0]
+    )
+    if not config.joint:
+        shorter = train
+    start = jax.jit(lambda k, dist: pipe.train_init(k, dist, 0))
+    search = jax.jit(
+        lambda k, demos, policies, training: pipe.search_chunk(
+            pipe.search_init(k, demos, policies, training),
+            demos,
+            policies,
+            pipe.config.search.generations,
+        )
+    )
+    estimate, demonstrate = jax.jit(pipe.estimate), jax.jit(pipe.demonstrate)
+    returns = jax.jit(pipe.returns)
+
+    def spread(dist: Any) -> Any:
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), dist)
+
+    nominal = jnp.asarray(env.space.nominal, jnp.float32)
+    begin = time.monotonic()
+    states = train(start(keys["udr"], spread(pipe.udr())), spread(pipe.udr()), nominal)
+    udr = pipe.policies(states)
+    jax.block_until_ready(udr)
+    say(f"UDR trained in {time.monotonic() - begin:.0f} s")
+    for factor in config.factors:
+        begin = time.monotonic()
+        theta = target_parameters(env.space, (f"cart_kp*{factor}",))
+        target = jnp.asarray(theta, jnp.float32)
+        demos = demonstrate(udr, target, keys["demonstrate"])
+        training = states if config.joint else ()
+        found, _ = search(keys["search"], demos, udr, training)
+        result = estimate(found, demos)
+        first = pipe.final_init(keys["final"], result.distribution, found)
+        easi = shorter(first, result.distribution, target)
+        truth = spread(pipe.point(target))
+        oracle = train(start(keys["oracle"], truth), truth, target)
+        methods = {
+            "UDR": udr,
+            "EASI": pipe.policies(easi),
+            "Oracle": pipe.policies(oracle),
+        }
+        scores = {
+            m: np.asarray(returns(p, target, keys["evaluate"])).mean(1)
+            for m, p in methods.items()
+        }
+        gap = scores["Oracle"] - scores["UDR"]
+        won = scores["EASI"] - scores["UDR"]
+        error = gap.std(ddof=1) / np.sqrt(count) if count > 1 else float("nan")
+        share = float(won.mean() / gap.mean())
+        draws = np.random.default_rng(0).integers(0, count, (4000, count))
+        boot = won[draws].mean(1) / gap[draws].mean(1)
+        name = f"transfer_kp_x{factor:g}" + (
+            f"_joint{config.joint}" * bool(config.joint)
+        )
+        path = write_result(
+            name,
+            f"python -m benchmarks.transfer --factors {factor:g}"
+            + (f" --joint {config.joint}" if config.joint else ""),
+            config,
+            target=dict(zip(env.space.names, theta.tolist(), strict=True)),
+            returns={
+                m: dict(zip(map(str, config.seeds), v.tolist(), strict=True))
+                for m, v in scores.items()
+            },
+            cart_kp_found=np.asarray(
+                jax.vmap(pipe.space.to_si)(result.distribution.mean)
+            )[:, env.space.names.index("cart_kp")].tolist(),
+            oracle_minus_udr={
+                "mean": float(gap.mean()),
+                "standard_error": float(error),
+            },
+            share_of_gap=share,
+            share_95=np.percentile(boot, [2.5, 97.5]).tolist(),
+            goal=0.9,
+            goal_applies=bool(gap.mean() > 2 * error),
+            seconds=time.monotonic() - begin,
+        )
+        show_table(
+            f"cart_kp x {factor:g}: return in the target; EASI closes {share:.2f} of "
+            "the gap",
+            ("method", "mean", *(f"seed {s}" for s in config.seeds)),
+            [
+                (m, f"{v.mean():.1f}", *(f"{x:.1f}" for x in v))
+                for m, v in scores.items()
+            ],
+        )
+        say(f"written: {path}")
+
+
+if __name__ == "__main__":
+    main(Config, run, name="benchmarks.transfer")

@@ -1,0 +1,167 @@
+"""train.udr, train.easi, train.evaluate and train.pipeline, end to end and small."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from train import easi, evaluate, pipeline, udr
+from train._command import main
+
+SMALL = ("--env-steps", "2400", "--eval-episodes", "4")
+SEARCH = ("--generations", "4", "--population", "16", "--trajectories", "8")
+SETTINGS = ("--set", "segments=16", "real_batch=64", "discriminator_updates=2")
+TARGET = ("--target", "cart_kp*0.5")
+
+
+def _main(module, *args: object) -> None:
+    main(module.Config, module.run, name=module.__name__, args=[str(a) for a in args])
+
+
+def _refused(capsys, module, *args: object) -> str:
+    with pytest.raises(SystemExit) as stop:
+        _main(module, *args)
+    assert stop.value.code == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: ")
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("chain")
+    _main(udr, "--out", root / "udr", *SMALL, "--chunk", 4, *TARGET)
+    _main(
+        easi,
+        *("--udr", root / "udr", "--out", root / "easi", "--chunk", 12),
+        *("--search-chunk", 2, *SEARCH, *SETTINGS, *TARGET, "--eval-episodes", 4),
+    )
+    return root
+
+
+def _restored(run: Path, stage: str):
+    import jax
+
+    from easi_jax.io import checkpoints
+    from easi_jax.pipeline import Pipeline, PipelineConfig, seed_keys
+    from envs import make
+    from train._robots import sac_config
+
+    pipe = Pipeline(make("cartpole"), PipelineConfig(sac=sac_config("cartpole", 2400)))
+    target = jax.eval_shape(lambda k: pipe.train_init(k, pipe.udr()), seed_keys([0]))
+    found = checkpoints.restore(run / "checkpoints" / stage, target)
+    assert found is not None
+    return found
+
+
+def test_folder_of_udr(chain: Path) -> None:
+    result = json.loads((chain / "udr" / "results.json").read_text())
+    assert result["methods"] == ["UDR"] and np.isfinite(result["returns"]["UDR"]["0"])
+    assert result["target"]["cart_kp"] == 10.0
+    assert _restored(chain / "udr", "train").step == 12
+
+
+def test_killed_training_goes_on_bit_equal(chain: Path, tmp_path: Path) -> None:
+    import jax
+
+    copy = tmp_path / "udr"
+    shutil.copytree(chain / "udr", copy)
+    whole = _restored(copy, "train")
+    # As a kill after the second chunk would have left it.
+    shutil.rmtree(copy / "checkpoints" / "train" / "step_000000000012")
+    (copy / "results.json").unlink()
+    _main(udr, "--out", copy, *SMALL, "--chunk", 4, *TARGET, "--resume")
+    again = _restored(copy, "train")
+    assert again.step == whole.step == 12
+    for a, b in zip(
+        jax.tree.leaves(whole.state), jax.tree.leaves(again.state), strict=True
+    ):
+        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+
+
+def test_folder_of_easi(chain: Path) -> None:
+    run = chain / "easi"
+    found = json.loads((run / "distribution.json").read_text())
+    assert [p["name"] for p in found["parameters"]][:2] == ["pole_length", "pole_mass"]
+    seed = found["seeds"]["0"]
+    cov = np.array(seed["unit_covariance"])
+    assert np.linalg.eigvalsh(cov).min() > 0
+    assert set(seed["flags"]) <= {"determined", "not determined", "at bound"}
+    assert found["truth"]["cart_kp"] == 10.0
+    result = json.loads((run / "results.json").read_text())
+    assert result["methods"] == ["UDR", "EASI"]
+    stages = {
+        json.loads(line)["stage"]
+        for line in (run / "metrics.jsonl").read_text().splitlines()
+    }
+    assert "search" in stages
+    assert (run / "figures" / "parameters.svg").read_text().startswith("<")
+
+
+def test_report_needs_no_network(chain: Path) -> None:
+    text = (chain / "easi" / "report.html").read_text()
+    assert "<svg" in text and "cart_kp" in text
+    assert not re.search(r'(src|href)="https?:', text)
+
+
+def test_refined_mean_predicts_better_than_nominal(chain: Path) -> None:
+    errors = json.loads((chain / "easi" / "results.json").read_text())["held_out"]
+    one = errors["one_step"]
+    for channel in one["EASI"]:
+        assert one["EASI"][channel] < 0.25 * one["nominal"][channel] + 0.01
+
+
+def test_evaluate_tests_any_policy_in_any_target(chain: Path, tmp_path, capsys) -> None:
+    out = tmp_path / "returns.json"
+    args = ("--run", chain / "easi", "--target", "cart_kp*2", "--episodes", 3)
+    _main(evaluate, *args, "--out", out)
+    saved = json.loads(out.read_text())
+    assert saved["method"] == "EASI" and len(saved["returns"]["0"]) == 3
+    capsys.readouterr()
+    line = _refused(capsys, evaluate, "--run", chain / "easi", "--policy", "Oracl")
+    assert "Oracl" in line
+
+
+def test_pipeline_equals_the_two_commands(chain: Path, tmp_path: Path) -> None:
+    out = tmp_path / "pipeline"
+    _main(pipeline, "--out", out, *SMALL, *SEARCH, *SETTINGS, *TARGET)
+    one = json.loads((out / "distribution.json").read_text())["seeds"]["0"]
+    two = json.loads((chain / "easi" / "distribution.json").read_text())["seeds"]["0"]
+    np.testing.assert_allclose(one["unit_mean"], two["unit_mean"], atol=2e-2)
+    result = json.loads((out / "results.json").read_text())["returns"]
+    other = json.loads((chain / "easi" / "results.json").read_text())["returns"]
+    np.testing.assert_allclose(result["UDR"]["0"], other["UDR"]["0"], rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("module", "args", "said"),
+    [
+        (udr, ("--robot", "cartpol"), 'did you mean "cartpole"?'),
+        (udr, ("--target", "cart_kpp*2"), 'did you mean "cart_kp"?'),
+        (udr, ("--target", "cart_kp*x"), "NAME*FACTOR"),
+        (udr, ("--seeds", "1", "1"), "seeds"),
+        (udr, ("--chunk", "0"), "--chunk"),
+        (easi, ("--udr", "nowhere"), "holds no run"),
+        (easi, ("--model", "robot.xml"), "--data"),
+        (evaluate, ("--run", "nowhere"), "holds no run"),
+        (pipeline, ("--preset", "papper"), 'did you mean "paper"?'),
+        (pipeline, ("--strategy", "CMA_E"), "CMA_ES"),
+        (pipeline, ("--set", "segmnts=3"), 'did you mean "segments"?'),
+        (pipeline, ("--set", "loss=hinge"), "loss"),
+        (pipeline, ("--noise", "0.1"), "noise"),
+    ],
+)
+def test_mistakes_end_with_one_line(module, args, said, tmp_path, capsys) -> None:
+    out = () if module is evaluate else ("--out", tmp_path / "run")
+    assert said in _refused(capsys, module, *args, *out)
+    assert not (tmp_path / "run").exists()
+
+
+def test_bad_settings_leave_the_earlier_run(chain: Path, capsys) -> None:
+    before = (chain / "udr" / "results.json").read_bytes()
+    line = _refused(capsys, udr, "--out", chain / "udr", "--robot", "cartpole")
+    assert "--resume" in line and "--overwrite" in line
+    assert (chain / "udr" / "results.json").read_bytes() == before
