@@ -19,26 +19,29 @@ class Distribution:
 
     Attributes:
         mean: unit coordinates, ``(n,)``.
-        chol: lower Cholesky factor of the covariance, ``(n, n)``.
+        factor: a square root A of the covariance A A', ``(n, n)``.
         low, high: uniform range, SI units, ``(n,)``.
         uniform: 1.0 for the uniform range, 0.0 for the Gaussian, ``()``.
     """
 
     mean: jax.Array
-    chol: jax.Array
+    factor: jax.Array
     low: jax.Array
     high: jax.Array
     uniform: jax.Array
 
 
 def gaussian(space: ParameterSpace, mean: Any, cov: Any) -> Distribution:
-    """A Gaussian with unit-coordinate ``mean (n,)`` and ``cov (n, n)``."""
+    """A Gaussian with unit-coordinate ``mean (n,)`` and ``cov (n, n)``.
+
+    Eigenvalues that rounding has made negative count as zero.
+    """
     mean, cov = jnp.asarray(mean), jnp.asarray(cov)
-    eye = 1e-12 * jnp.eye(space.size)
+    values, vectors = jnp.linalg.eigh(0.5 * (cov + cov.T))
     si = space.to_si(mean)
     return Distribution(
         mean=mean,
-        chol=jnp.linalg.cholesky(cov + eye),
+        factor=vectors * jnp.sqrt(jnp.maximum(values, 0.0)),
         low=si,
         high=si,
         uniform=jnp.zeros(()),
@@ -50,7 +53,7 @@ def uniform(space: ParameterSpace, low: Any, high: Any) -> Distribution:
     n = space.size
     return Distribution(
         mean=jnp.full(n, 0.5),
-        chol=jnp.zeros((n, n)),
+        factor=jnp.zeros((n, n)),
         low=jnp.asarray(low, jnp.result_type(float)),
         high=jnp.asarray(high, jnp.result_type(float)),
         uniform=jnp.ones(()),
@@ -67,7 +70,7 @@ def draw(space: ParameterSpace, dist: Distribution, key: jax.Array) -> jax.Array
     k_u, k_g = jax.random.split(key)
     flat = dist.low + (dist.high - dist.low) * jax.random.uniform(k_u, (space.size,))
     low, high = space.unit_bounds
-    z = dist.mean + dist.chol @ jax.random.normal(k_g, (space.size,))
+    z = dist.mean + dist.factor @ jax.random.normal(k_g, (space.size,))
     # Again in SI units: rounding must not make a zero negative.
     si = jnp.clip(space.to_si(jnp.clip(z, low, high)), *space.bounds)
     return jnp.where(dist.uniform > 0, flat, si)
@@ -75,4 +78,4 @@ def draw(space: ParameterSpace, dist: Distribution, key: jax.Array) -> jax.Array
 
 def covariance(dist: Distribution) -> np.ndarray:
     """Covariance in unit coordinates, ``(n, n)``."""
-    return np.asarray(dist.chol @ dist.chol.T)
+    return np.asarray(dist.factor @ dist.factor.T)

@@ -32,9 +32,9 @@ def write(
     space = search.space
     results = []
     for found in estimates:
-        chol = found.distribution.chol
+        root = np.asarray(found.distribution.factor, np.float64)
         results.append(
-            seed_result(space, found.distribution.mean, chol @ chol.T, found.hessian)
+            seed_result(space, found.distribution.mean, root @ root.T, found.hessian)
         )
     errors = _errors(problem, [found.distribution.mean for found in estimates], space)
     best = int(np.argmin([e["fit"] for e in errors["seeds"]]))

@@ -137,8 +137,8 @@ def write_pseudo_real(
     dist = estimate.distribution
     results = []
     for i in range(len(seeds)):
-        chol = dist.chol[i]
-        cov = np.asarray(chol @ chol.T)
+        root = np.asarray(dist.factor[i], np.float64)
+        cov = root @ root.T
         results.append(seed_result(space, dist.mean[i], cov, estimate.hessian[i]))
     shares = {
         kind: {
