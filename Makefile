@@ -6,13 +6,15 @@ BIN := $(VENV)/bin
 RUN_STAMP := $(VENV)/.installed
 DEV_STAMP := $(VENV)/.installed-dev
 DEMO := results/demo
+TARGET := 'cart_kp*0.25'
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .PHONY: demo test install install-dev clean
 
 demo: $(RUN_STAMP)
-	$(BIN)/python -m train.udr --out $(DEMO)/udr --overwrite
-	$(BIN)/python -m train.easi --udr $(DEMO)/udr --out $(DEMO)/easi --overwrite
+	$(BIN)/python -m train.udr --target $(TARGET) --out $(DEMO)/udr --overwrite
+	$(BIN)/python -m train.easi --udr $(DEMO)/udr --target $(TARGET) \
+	    --out $(DEMO)/easi --overwrite
 
 test: $(DEV_STAMP)
 	$(BIN)/ruff check .
