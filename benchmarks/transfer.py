@@ -9,7 +9,6 @@ those not run are absent. ``--joint`` adds a search that also trains the policy.
 
 import dataclasses
 import time
-from typing import Any
 
 from train._command import main, say, show_table
 
@@ -61,16 +60,16 @@ def run(config: Config) -> None:
     keys = stage_keys(seed_keys(list(config.seeds)))
     count = len(config.seeds)
     train = jax.jit(
-        lambda s, dist, target: pipe.train_chunk(s, dist, target, sac.iterations, 0)[0]
+        lambda s, dist, target: pipe.train_chunk(s, dist, target, sac.iterations)[0]
     )
     shorter = jax.jit(
         lambda s, dist, target: pipe.train_chunk(
-            s, dist, target, pipe.final_iterations(), 0
+            s, dist, target, pipe.final_iterations()
         )[0]
     )
     if not config.joint:
         shorter = train
-    start = jax.jit(lambda k, dist: pipe.train_init(k, dist, 0))
+    start = jax.jit(lambda k, dist: pipe.train_init(k, dist))
     search = jax.jit(
         lambda k, demos, policies, training: pipe.search_chunk(
             pipe.search_init(k, demos, policies, training),
@@ -82,12 +81,10 @@ def run(config: Config) -> None:
     estimate, demonstrate = jax.jit(pipe.estimate), jax.jit(pipe.demonstrate)
     returns = jax.jit(pipe.returns)
 
-    def spread(dist: Any) -> Any:
-        return jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), dist)
-
     nominal = jnp.asarray(env.space.nominal, jnp.float32)
     begin = time.monotonic()
-    states = train(start(keys["udr"], spread(pipe.udr())), spread(pipe.udr()), nominal)
+    wide = pipe.spread(pipe.udr(), count)
+    states = train(start(keys["udr"], wide), wide, nominal)
     udr = pipe.policies(states)
     jax.block_until_ready(udr)
     say(f"UDR trained in {time.monotonic() - begin:.0f} s")
@@ -101,7 +98,7 @@ def run(config: Config) -> None:
         result = estimate(found, demos)
         first = pipe.final_init(keys["final"], result.distribution, found)
         easi = shorter(first, result.distribution, target)
-        truth = spread(pipe.point(target))
+        truth = pipe.spread(pipe.point(target), count)
         oracle = train(start(keys["oracle"], truth), truth, target)
         methods = {
             "UDR": udr,

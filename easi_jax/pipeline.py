@@ -145,18 +145,26 @@ class Pipeline:
         """All mass at ``theta (n,)``: what the Oracle trains under."""
         return distribution.point(self.space, theta)
 
+    def spread(self, dist: Distribution, seeds: int) -> Distribution:
+        """The same distribution for each of ``seeds``."""
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds, *x.shape)), dist)
+
     # -- stages --------------------------------------------------------------
 
-    def train_init(self, keys: jax.Array, dist: Any, axis: int | None = None) -> Any:
-        """Fresh training states, ``(S, ...)``."""
-        return init_seeds(self.sac, keys, dist, axis, self.mesh)
+    def train_init(self, keys: jax.Array, dist: Distribution) -> Any:
+        """Fresh training states, ``(S, ...)``; ``dist`` has a leading axis S."""
+        return init_seeds(self.sac, keys, dist, 0, self.mesh)
 
     def train_chunk(
-        self, states: Any, dist: Any, target: jax.Array, n: int, axis: int | None = None
+        self, states: Any, dist: Distribution, target: jax.Array, n: int
     ) -> tuple[Any, dict[str, jax.Array]]:
-        """``n`` steps of training; evaluations are in the target ``theta (n,)``."""
+        """``n`` steps of training; evaluations are in the target ``theta (n,)``.
+
+        One signature for UDR, Oracle and final training, so that they share one
+        compiled program.
+        """
         return run_seeds(
-            self.sac, states, dist, n, self.point(target), axis, None, self.mesh
+            self.sac, states, dist, n, self.point(target), 0, None, self.mesh
         )
 
     def policies(self, states: Any) -> PolicyParams:
@@ -269,8 +277,9 @@ class Pipeline:
         """
         n = self.config.sac.iterations
         k = stage_keys(keys)
+        wide = self.spread(self.udr(), len(keys))
         first, udr_history = self.train_chunk(
-            self.train_init(k["udr"], self.udr()), self.udr(), target, n
+            self.train_init(k["udr"], wide), wide, target, n
         )
         udr = self.policies(first)
         demos = self.demonstrate(udr, target, k["demonstrate"])
@@ -285,7 +294,6 @@ class Pipeline:
             found.distribution,
             target,
             self.final_iterations(),
-            axis=0,
         )
         easi = self.policies(final)
         return {
@@ -303,7 +311,7 @@ class Pipeline:
         """Where final training starts: afresh, or with what the search trained."""
         if self.search.trainer:
             return search.training
-        return self.train_init(keys, dist, axis=0)
+        return self.train_init(keys, dist)
 
     def final_iterations(self) -> int:
         """Steps of final training; those made inside the search are taken off."""

@@ -104,7 +104,7 @@ def run(config: "Config") -> None:
             config.refine,
         )
         step = jit_chunks(
-            lambda s, dist, target, n: pipe.train_chunk(s, dist, target, n, 0)
+            lambda s, dist, target, n: pipe.train_chunk(s, dist, target, n)
         )
 
         def train(name: str, dist: Any, first: Any, total: int) -> Any:
@@ -127,14 +127,11 @@ def run(config: "Config") -> None:
         )
         trained = {"UDR": policies, "EASI": pipe.policies(final)}
         if config.oracle:
-            many = jax.tree.map(
-                lambda x: jnp.broadcast_to(x, (len(seeds), *x.shape)),
-                pipe.point(target),
-            )
+            many = pipe.spread(pipe.point(target), len(seeds))
             oracle = train(
                 "oracle",
                 many,
-                lambda: pipe.train_init(keys["oracle"], many, 0),
+                lambda: pipe.train_init(keys["oracle"], many),
                 pipe.config.sac.iterations,
             )
             trained["Oracle"] = pipe.policies(oracle)

@@ -121,7 +121,10 @@ def load_policies(folder: Path, method: str | None = None) -> dict[str, Any]:
     pipe = Pipeline(make(robot), PipelineConfig(sac=sac))
     keys = jax.random.split(jax.random.key(0), len(seeds))
     target = jax.eval_shape(
-        lambda k: pipe.policies(pipe.train_init(k, pipe.udr())), keys
+        lambda k: pipe.policies(
+            pipe.train_init(k, pipe.spread(pipe.udr(), len(seeds)))
+        ),
+        keys,
     )
     found = checkpoints.restore(folder / "checkpoints" / f"policy_{chosen}", target)
     if found is None:
@@ -161,7 +164,8 @@ def load_udr(folder: Path) -> dict[str, Any]:
     pipe = Pipeline(env, PipelineConfig(sac=sac))
     seeds = tuple(int(s) for s in config["seeds"])
     keys = seed_keys(list(seeds))
-    target = jax.eval_shape(lambda k: pipe.train_init(k, pipe.udr()), keys)
+    wide = pipe.spread(pipe.udr(), len(seeds))
+    target = jax.eval_shape(lambda k: pipe.train_init(k, wide), keys)
     found = checkpoints.restore(
         folder / "checkpoints" / "train", target, config_hash=config_hash(config)
     )

@@ -75,6 +75,7 @@ def run(config: Config) -> None:
         overwrite=config.overwrite,
     ) as folder:
         notes: list[str] = []
+        wide = pipe.spread(pipe.udr(), len(config.seeds))
         step = jit_chunks(
             lambda states, dist, target, n: pipe.train_chunk(states, dist, target, n)
         )
@@ -83,8 +84,8 @@ def run(config: Config) -> None:
             "train",
             sac.iterations,
             config.chunk,
-            lambda: pipe.train_init(keys["udr"], pipe.udr()),
-            lambda s, n: step(s, pipe.udr(), target, n),
+            lambda: pipe.train_init(keys["udr"], wide),
+            lambda s, n: step(s, wide, target, n),
             training_rows(config.seeds, sac.num_envs),
             notes,
         )

@@ -36,6 +36,9 @@ class SacConfig:
     learning_rate: float = 3e-4
     """Of Adam, for policy, critics and temperature."""
 
+    learning_rate_decay: float = 1.0
+    """Factor on the learning rate that is reached at `env_steps`, linearly."""
+
     discount: float = 0.99
     """Per control step."""
 
@@ -68,7 +71,7 @@ class SacConfig:
         for name in ("random_steps", "evaluate_every"):
             if getattr(self, name) < 0:
                 self._refuse(name, "needs 0 or more")
-        for name in ("learning_rate", "initial_temperature"):
+        for name in ("learning_rate", "learning_rate_decay", "initial_temperature"):
             if not getattr(self, name) > 0:
                 self._refuse(name, "needs a number above 0")
         for name in ("discount", "tau"):

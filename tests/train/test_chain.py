@@ -11,6 +11,9 @@ import pytest
 from train import easi, evaluate, pipeline, udr
 from train._command import main
 
+# The whole chain is compiled here; on a busy machine that takes its time.
+pytestmark = pytest.mark.timeout(1500)
+
 SMALL = ("--env-steps", "2400", "--eval-episodes", "4")
 SEARCH = ("--generations", "4", "--population", "16", "--trajectories", "8")
 SETTINGS = ("--set", "segments=16", "real_batch=64", "discriminator_updates=2")
@@ -33,10 +36,10 @@ def _refused(capsys, module, *args: object) -> str:
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("chain")
-    _main(udr, "--out", root / "udr", *SMALL, "--chunk", 4, *TARGET)
+    _main(udr, "--out", root / "udr", *SMALL, "--chunk", 6, *TARGET)
     _main(
         easi,
-        *("--udr", root / "udr", "--out", root / "easi", "--chunk", 12),
+        *("--udr", root / "udr", "--out", root / "easi", "--chunk", 6),
         *("--search-chunk", 2, *SEARCH, *SETTINGS, *TARGET, "--eval-episodes", 4),
     )
     return root
@@ -51,7 +54,8 @@ def _restored(run: Path, stage: str):
     from train._robots import sac_config
 
     pipe = Pipeline(make("cartpole"), PipelineConfig(sac=sac_config("cartpole", 2400)))
-    target = jax.eval_shape(lambda k: pipe.train_init(k, pipe.udr()), seed_keys([0]))
+    wide = pipe.spread(pipe.udr(), 1)
+    target = jax.eval_shape(lambda k: pipe.train_init(k, wide), seed_keys([0]))
     found = checkpoints.restore(run / "checkpoints" / stage, target)
     assert found is not None
     return found
@@ -73,7 +77,7 @@ def test_killed_training_goes_on_bit_equal(chain: Path, tmp_path: Path) -> None:
     # As a kill after the second chunk would have left it.
     shutil.rmtree(copy / "checkpoints" / "train" / "step_000000000012")
     (copy / "results.json").unlink()
-    _main(udr, "--out", copy, *SMALL, "--chunk", 4, *TARGET, "--resume")
+    _main(udr, "--out", copy, *SMALL, "--chunk", 6, *TARGET, "--resume")
     again = _restored(copy, "train")
     assert again.step == whole.step == 12
     for a, b in zip(
