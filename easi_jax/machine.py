@@ -64,7 +64,7 @@ class Machine:
 
     @cached_property
     def state_names(self) -> tuple[str, ...]:
-        """Names of the entries of `state_vector`: positions, then velocities."""
+        """Names of the ``2 nv`` entries of `difference`: positions, velocities."""
         m = self.mj_model
         pos, vel = [], []
         for j in range(m.njnt):

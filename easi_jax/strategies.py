@@ -37,7 +37,9 @@ class _MuLambda(SimpleES):
     def _tell(self, key, population, fitness, state, params):  # type: ignore[no-untyped-def]
         new = super()._tell(key, population, fitness, state, params)
         if not self.about_new_mean:
-            return new
+            # A discriminator that lags behind a moving mean feeds a spread that
+            # grows without end; twice the start is enough to get anywhere.
+            return new.replace(std=jnp.minimum(new.std, 2.0 * params.std_init))
         var = jnp.dot(fitness, (population - new.mean) ** 2)
         return new.replace(
             std=(1 - params.c_std) * state.std + params.c_std * jnp.sqrt(var)
