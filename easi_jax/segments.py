@@ -18,8 +18,6 @@ class Segments:
         next_qpos, next_qvel: measured states after each step, ``(M, H, nq)``,
             ``(M, H, nv)``.
         weight: ``(M,)``, 1 where the piece counts, 0 beyond an episode's end.
-        weight: 1 where the piece counts, 0 where its episode was already over,
-            ``(M,)``.
     """
 
     qpos: Any
