@@ -126,7 +126,6 @@ def write_pseudo_real(
     from easi_jax.io.report import (
         Diagnostic,
         ParameterRow,
-        Picture,
         Report,
         Table,
         write_report,
@@ -171,14 +170,16 @@ def write_pseudo_real(
     by_generation = history_figure(
         folder, space, seeds[0], theta, config.search.generations
     )
-    steps = returns_by_step({k: v for k, v in curves.items() if v[0]})
+    known = {k: v for k, v in curves.items() if v[0]}
+    steps = returns_by_step(known) if known else ""
     methods = returns_by_method(returns)
     for name, svg in (
         ("parameters", by_generation),
         ("returns", steps),
         ("methods", methods),
     ):
-        folder.write(f"figures/{name}.svg", svg)
+        if svg:
+            folder.write(f"figures/{name}.svg", svg)
     best = results[0]
     low, high = space.initial
     bounds = space.bounds
@@ -242,25 +243,7 @@ def write_pseudo_real(
                 ),
             ],
             pictures=[
-                Picture(
-                    "Return by method",
-                    methods,
-                    "Final return in the target of each method, a dot for each seed",
-                ),
-                Picture(
-                    "Return by training step",
-                    steps,
-                    "Return in the target against training steps for each method",
-                    "As Fig. 5 of the paper: every seed thin, the median bold.",
-                ),
-                Picture(
-                    f"Parameters by generation (seed {seeds[0]})",
-                    by_generation,
-                    "Mean and spread of each parameter over the generations, with "
-                    "the true value as a dashed line",
-                    "As Fig. 4 of the paper: the adversarial search alone, before "
-                    "any refinement; band of two standard deviations.",
-                ),
+                p for p in _pictures(methods, steps, by_generation, seeds[0]) if p.svg
             ],
             diagnostics=[
                 Diagnostic(
@@ -288,3 +271,30 @@ def write_pseudo_real(
         for r in rows
     ]
     return ("parameter", "mean", "std", "truth", "unit", "flag"), table
+
+
+def _pictures(methods: str, steps: str, by_generation: str, seed: int) -> list[Any]:
+    """The report's figures; one without content has an empty SVG."""
+    from easi_jax.io.report import Picture
+
+    return [
+        Picture(
+            "Return by method",
+            methods,
+            "Final return in the target of each method, a dot for each seed",
+        ),
+        Picture(
+            "Return by training step",
+            steps,
+            "Return in the target against training steps for each method",
+            "As Fig. 5 of the paper: every seed thin, the median bold.",
+        ),
+        Picture(
+            f"Parameters by generation (seed {seed})",
+            by_generation,
+            "Mean and spread of each parameter over the generations, with the true "
+            "value as a dashed line",
+            "As Fig. 4 of the paper: the adversarial search alone, before any "
+            "refinement; band of two standard deviations.",
+        ),
+    ]

@@ -4,18 +4,19 @@ from easi_jax.errors import UserError, nearest
 from easi_jax.rl.config import SacConfig
 
 CARTPOLE = SacConfig(
-    env_steps=200_000,
-    num_envs=200,
+    env_steps=100_000,
+    num_envs=100,
     random_steps=2_000,
     updates_per_step=10,
-    batch_size=256,
-    buffer_size=200_000,
+    batch_size=128,
+    buffer_size=100_000,
     hidden=(64, 64),
     critic_layer_norm=True,
     learning_rate=2e-3,
+    learning_rate_decay=0.05,
     tau=0.05,
-    discount=0.98,
-    evaluate_every=50,
+    discount=0.99,
+    evaluate_every=100,
 )
 
 PRESETS = {"cartpole": CARTPOLE}

@@ -36,10 +36,10 @@ def _refused(capsys, module, *args: object) -> str:
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("chain")
-    _main(udr, "--out", root / "udr", *SMALL, "--chunk", 6, *TARGET)
+    _main(udr, "--out", root / "udr", *SMALL, "--chunk", 12, *TARGET)
     _main(
         easi,
-        *("--udr", root / "udr", "--out", root / "easi", "--chunk", 6),
+        *("--udr", root / "udr", "--out", root / "easi", "--chunk", 12),
         *("--search-chunk", 2, *SEARCH, *SETTINGS, *TARGET, "--eval-episodes", 4),
     )
     return root
@@ -65,7 +65,7 @@ def test_folder_of_udr(chain: Path) -> None:
     result = json.loads((chain / "udr" / "results.json").read_text())
     assert result["methods"] == ["UDR"] and np.isfinite(result["returns"]["UDR"]["0"])
     assert result["target"]["cart_kp"] == 10.0
-    assert _restored(chain / "udr", "train").step == 12
+    assert _restored(chain / "udr", "train").step == 24
 
 
 def test_killed_training_goes_on_bit_equal(chain: Path, tmp_path: Path) -> None:
@@ -74,12 +74,12 @@ def test_killed_training_goes_on_bit_equal(chain: Path, tmp_path: Path) -> None:
     copy = tmp_path / "udr"
     shutil.copytree(chain / "udr", copy)
     whole = _restored(copy, "train")
-    # As a kill after the second chunk would have left it.
-    shutil.rmtree(copy / "checkpoints" / "train" / "step_000000000012")
+    # As a kill in the second chunk would have left it.
+    shutil.rmtree(copy / "checkpoints" / "train" / "step_000000000024")
     (copy / "results.json").unlink()
-    _main(udr, "--out", copy, *SMALL, "--chunk", 6, *TARGET, "--resume")
+    _main(udr, "--out", copy, *SMALL, "--chunk", 12, *TARGET, "--resume")
     again = _restored(copy, "train")
-    assert again.step == whole.step == 12
+    assert again.step == whole.step == 24
     for a, b in zip(
         jax.tree.leaves(whole.state), jax.tree.leaves(again.state), strict=True
     ):
