@@ -130,6 +130,7 @@ def test_evaluate_tests_any_policy_in_any_target(chain: Path, tmp_path, capsys) 
     assert "Oracl" in line
 
 
+@pytest.mark.slow
 def test_pipeline_equals_the_two_commands(chain: Path, tmp_path: Path) -> None:
     out = tmp_path / "pipeline"
     _main(pipeline, "--out", out, *SMALL, *SEARCH, *SETTINGS, *TARGET)
