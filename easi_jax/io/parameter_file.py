@@ -20,25 +20,11 @@ import yaml
 
 from easi_jax.errors import UserError, nearest
 from easi_jax.io.files import atomic_write
+from easi_jax.io.strict_yaml import read_yaml
 from easi_jax.parameters import ParameterSpace, Range, declare
 
 _KEYS = ("name", "address", "nominal", "initial", "bounds", "scale", "unit")
 _SCALES = ("log", "linear")
-
-
-class _Loader(yaml.SafeLoader):
-    """`yaml.SafeLoader` that does not drop the first of two equal keys."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        seen: set[str] = set()
-        for key, _ in node.value:
-            if key.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f'"{key.value}" is there twice', key.start_mark
-                )
-            if isinstance(key.value, str):
-                seen.add(key.value)
-        return super().construct_mapping(node, deep)
 
 
 def read_parameter_file(
@@ -51,7 +37,7 @@ def read_parameter_file(
             not fit the model; names file and entry.
     """
     path = Path(path)
-    content = _load(path)
+    content = read_yaml(path)
     if not isinstance(content, dict):
         raise UserError(f'{path}: a parameter file has the key "parameters:"')
     for key in content:
@@ -94,22 +80,6 @@ def write_parameter_file(path: str | os.PathLike[str], space: ParameterSpace) ->
         {"parameters": entries}, sort_keys=False, allow_unicode=True, width=88
     )
     atomic_write(Path(path), text)
-
-
-def _load(path: Path) -> Any:
-    try:
-        # _Loader derives from SafeLoader: plain data only
-        return yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise UserError(f"{path}: not UTF-8 text") from None
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        mark = getattr(error, "problem_mark", None)
-        problem = getattr(error, "problem", None)
-        where = f" in line {mark.line + 1}" if mark else ""
-        what = f" ({problem})" if problem else ""
-        raise UserError(f"{path}: not valid YAML{where}{what}") from None
 
 
 def _entry(path: Path, number: int, entry: Any, mj_model: mujoco.MjModel) -> Any:
