@@ -363,7 +363,7 @@ def test_cartpole_is_found_from_a_start_that_excludes_it() -> None:
 
     @jax.jit
     def run(k: jax.Array) -> Any:
-        return search.run(search.init(k, d), d, 25)
+        return search.run(search.init(k, d), d, 45)
 
     state, info = run(key)
     found = np.asarray(search.space.to_si(state.mean))
