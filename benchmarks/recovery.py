@@ -11,6 +11,7 @@ is done; those not run are absent.
 """
 
 import dataclasses
+import functools
 import time
 from typing import Any
 
@@ -82,6 +83,7 @@ def _case(
     from easi_jax.information import describe, identifiability
     from easi_jax.machine import Machine
     from easi_jax.rollout import collect, measured
+    from easi_jax.runtime import fast_loops
     from easi_jax.search import Search, SearchData
     from easi_jax.search_config import preset as make_preset
     from easi_jax.segments import windows
@@ -113,7 +115,7 @@ def _case(
         k_run, k_noise = jax.random.split(key)
         return measured(trajectories(k_run, config.trajectories), deviation, k_noise)
 
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=fast_loops())
     def find(key: jax.Array, demos: Any) -> Any:
         h = search.config.horizon if preset == "default" else 1
         data = SearchData(windows(demos, h, max(1, h // 2)), deviation, ())

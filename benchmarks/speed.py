@@ -65,12 +65,17 @@ def _search(config: Config) -> Any:
 def _compile(config: Config) -> dict[str, float]:
     import jax
 
+    from easi_jax.runtime import fast_loops
+
     begin = time.monotonic()
     _, search, data = _search(config)
     d = jax.jit(data)(jax.random.key(0))
     state = search.init(jax.random.key(0), d)
     ready = time.monotonic()
-    lowered = jax.jit(lambda s, d: search.run(s, d, config.generations)).lower(state, d)
+    lowered = jax.jit(
+        lambda s, d: search.run(s, d, config.generations),
+        compiler_options=fast_loops(),
+    ).lower(state, d)
     traced = time.monotonic()
     lowered.compile()
     done = time.monotonic()
@@ -113,6 +118,7 @@ def _physics(config: Config) -> list[float]:
     import jax.numpy as jnp
 
     from easi_jax.mesh import make_mesh, sharded_map
+    from easi_jax.runtime import fast_loops
     from envs import make
 
     env = make("cartpole")
@@ -135,7 +141,10 @@ def _physics(config: Config) -> list[float]:
 
         return jax.vmap(one)(*items)
 
-    run = jax.jit(lambda u, c: sharded_map(local, make_mesh(), (u, c)))
+    run = jax.jit(
+        lambda u, c: sharded_map(local, make_mesh(), (u, c)),
+        compiler_options=fast_loops(),
+    )
     out = []
     for _ in range(config.repeats + 1):
         begin = time.monotonic()
@@ -149,10 +158,15 @@ def _generations(config: Config) -> dict[str, Any]:
     """A whole search, and the same without its discriminator and strategy."""
     import jax
 
+    from easi_jax.runtime import fast_loops
+
     _, search, data = _search(config)
     d = jax.jit(data)(jax.random.key(0))
     state = search.init(jax.random.key(0), d)
-    whole = jax.jit(lambda s, d: search.run(s, d, config.generations))
+    options = fast_loops()
+    whole = jax.jit(
+        lambda s, d: search.run(s, d, config.generations), compiler_options=options
+    )
     only = jax.jit(
         lambda s, d: jax.lax.scan(
             lambda k, _: (
@@ -162,7 +176,8 @@ def _generations(config: Config) -> dict[str, Any]:
             jax.random.key(3),
             None,
             length=config.generations,
-        )[1]
+        )[1],
+        compiler_options=options,
     )
     times: dict[str, list[float]] = {"search_s": [], "physics_s": []}
     for name, fun in (("search_s", whole), ("physics_s", only)):

@@ -41,6 +41,7 @@ def run(config: Config) -> None:
         stage_keys,
         target_parameters,
     )
+    from easi_jax.runtime import fast_loops
     from easi_jax.search_config import preset
     from envs import make
     from train._robots import sac_config
@@ -76,7 +77,8 @@ def run(config: Config) -> None:
             demos,
             policies,
             pipe.config.search.generations,
-        )
+        ),
+        compiler_options=fast_loops(),
     )
     estimate, demonstrate = jax.jit(pipe.estimate), jax.jit(pipe.demonstrate)
     returns = jax.jit(pipe.returns)

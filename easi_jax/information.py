@@ -72,20 +72,13 @@ def normal_equations(
         weight: ``(M, H, 2 nv)`` extra weights (robust fit; ones otherwise).
     """
     n, nv2 = space.size, 2 * machine.mj_model.nv
-
-    def outputs(u: jax.Array, d: jax.Array, s: Segments) -> jax.Array:
-        one = jax.tree.map(lambda x: x[None], s)
-        moved = shift_start(machine, one, d[None])
-        err = replay.errors_from(machine, machine.model(space.to_si(u)), moved, one)
-        return -err[0]  # predicted minus measured, (H, 2 nv)
-
     directions = jnp.eye(n + nv2)
 
     def one(item: Any) -> Any:
         s, d, w = item
 
         def f(x: jax.Array) -> jax.Array:
-            return outputs(unit + x[:n], d + x[n:], s)
+            return _residual(machine, space, unit + x[:n], d + x[n:], s)
 
         zero = jnp.zeros(n + nv2)
         r, push = f(zero), lambda v: jax.jvp(f, (zero,), (v,))[1]
@@ -112,6 +105,54 @@ def normal_equations(
     out = sharded_map(local, mesh or make_mesh(), (segments, delta, weight))
     hess, grad, cost, step, gain = out
     return Normal(hess.sum(0), grad.sum(0), cost.sum(), step, gain)
+
+
+def piece_costs(
+    machine: Machine,
+    space: ParameterSpace,
+    unit: jax.Array,
+    delta: jax.Array,
+    segments: Segments,
+    noise: jax.Array,
+    weight: jax.Array,
+    mesh: Mesh | None = None,
+    chunk: int = 256,
+) -> jax.Array:
+    """The cost of `normal_equations`, piece by piece and for several points at once.
+
+    Args:
+        unit: ``(K, n)``.
+        delta: ``(K, M, 2 nv)``.
+
+    Returns:
+        ``(K, M)``; inf where the simulation is not finite.
+    """
+
+    def one(item: Any) -> jax.Array:
+        s, d, w = item
+
+        def cost(u: jax.Array, x: jax.Array) -> jax.Array:
+            r = _residual(machine, space, u, x, s)
+            square = jnp.where(w > 0, w * (r / noise) ** 2, 0.0).sum()
+            total = 0.5 * (square + jnp.sum((x / noise) ** 2))
+            return jnp.where(jnp.isfinite(total), total, jnp.inf)
+
+        return jax.vmap(cost)(unit, d)
+
+    def local(items: Any) -> jax.Array:
+        return jax.lax.map(one, items, batch_size=chunk)
+
+    items = (segments, jnp.swapaxes(delta, 0, 1), weight)
+    return sharded_map(local, mesh or make_mesh(), items).T
+
+
+def _residual(
+    machine: Machine, space: ParameterSpace, unit: jax.Array, d: jax.Array, s: Segments
+) -> jax.Array:
+    """Predicted minus measured, ``(H, 2 nv)``, of one segment; its start moved."""
+    one = jax.tree.map(lambda x: x[None], s)
+    moved = shift_start(machine, one, d[None])
+    return -replay.errors_from(machine, machine.model(space.to_si(unit)), moved, one)[0]
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from mujoco.mjx._src import sensor as mjx_sensor
 from mujoco.mjx._src.types import IntegratorType
 
 from easi_jax import solver
+from easi_jax.scalarize import scalarized
 from easi_jax.small_linalg import unroll_small
 
 
@@ -97,18 +98,20 @@ def _without_clamped(m: mjx.Model, d: mjx.Data) -> mjx.Model:
     )
 
 
-_unrolled_step = unroll_small(mjx_step)
+def substep(model: Any, state: Physics, ctrl: jax.Array) -> Physics:
+    """One physics step; the joint speed limit, which MuJoCo lacks, clips after it."""
+    d = mjx_step(model.mjx, data_at(model, state, ctrl))
+    qvel = jnp.clip(d.qvel, -model.speed_limit, model.speed_limit)
+    return Physics(d.qpos, qvel, d.act, d.qacc_warmstart)
+
+
+_batched_substep = scalarized(substep, otherwise=unroll_small(substep))
 
 
 def control_step(model: Any, state: Physics, ctrl: jax.Array, substeps: int) -> Physics:
-    """Holds ``ctrl`` ``(nu,)`` for ``substeps`` physics steps.
+    """Holds ``ctrl`` ``(nu,)`` for ``substeps`` physics steps."""
 
-    The joint speed limit, which MuJoCo lacks, clips velocities after each substep.
-    """
+    def step(s: Physics, _: None) -> tuple[Physics, None]:
+        return _batched_substep(model, s, ctrl), None
 
-    def substep(s: Physics, _: None) -> tuple[Physics, None]:
-        d = _unrolled_step(model.mjx, data_at(model, s, ctrl))
-        qvel = jnp.clip(d.qvel, -model.speed_limit, model.speed_limit)
-        return Physics(d.qpos, qvel, d.act, d.qacc_warmstart), None
-
-    return jax.lax.scan(substep, state, None, length=substeps)[0]
+    return jax.lax.scan(step, state, None, length=substeps)[0]

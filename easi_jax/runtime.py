@@ -52,8 +52,8 @@ def prepare() -> dict[str, object]:
     - ``NPROC``: jaxlib's intra-op pool must be larger than the number of cores,
       or a batched Cholesky of a few hundred matrices can wait for itself for ever.
     - one CPU device per core, so that a mesh over them uses all of them;
-    - XLA's older loop emitters: the newer ones take twice as long to compile these
-      programs and run them no faster (measured with jaxlib 0.10.2);
+    - XLA's older loop emitters, which compile faster; what simulates for long asks for
+      the newer ones by `fast_loops` (measured with jaxlib 0.10.2, benchmarks/speed.py);
     - persistent compilation cache;
     - full float32 products on GPUs that would use TF32;
     - quiet imports of mujoco.mjx where warp is missing.
@@ -87,9 +87,23 @@ def prepare() -> dict[str, object]:
 
 def _quick_compile(version: tuple[int, ...]) -> None:
     flags = os.environ.get("XLA_FLAGS", "")
-    # An unknown flag ends the process: only where it is known to exist.
-    if _EMITTERS not in flags and (0, 10) <= version < (0, 11):
+    if _EMITTERS not in flags and _has_emitters(version):
         os.environ["XLA_FLAGS"] = f"{flags} --{_EMITTERS}=false".strip()
+
+
+def fast_loops() -> dict[str, Any]:
+    """``compiler_options`` of ``jax.jit`` for programs that simulate for long.
+
+    They take longer to compile and, on CPU, simulate about twice as fast.
+    """
+    import jax
+
+    return {_EMITTERS: True} if _has_emitters(jax.__version_info__) else {}
+
+
+def _has_emitters(version: tuple[int, ...]) -> bool:
+    # An unknown flag ends the process: only where it is known to exist.
+    return (0, 10) <= version < (0, 11)
 
 
 def _ready_cache() -> None:

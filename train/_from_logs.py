@@ -87,7 +87,8 @@ def _search(
     data = SearchData(segments=to_device(pieces), noise=noise)
     keys = seed_keys(list(seeds))
     advance = jit_chunks(
-        lambda states, data, n: jax.lax.map(lambda s: search.run(s, data, n), states)
+        lambda states, data, n: jax.lax.map(lambda s: search.run(s, data, n), states),
+        fast=True,
     )
     states = run_stage(
         folder,

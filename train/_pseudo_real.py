@@ -83,7 +83,8 @@ def run(config: "Config") -> None:
         demos = jax.jit(pipe.demonstrate)(policies, target, keys["demonstrate"])
         training = states if pipe.search.trainer else ()
         advance = jit_chunks(
-            lambda s, demos, policies, n: pipe.search_chunk(s, demos, policies, n)
+            lambda s, demos, policies, n: pipe.search_chunk(s, demos, policies, n),
+            fast=True,
         )
         found = run_stage(
             folder,

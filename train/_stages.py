@@ -174,16 +174,23 @@ def search_check(
     return check
 
 
-def jit_chunks(fun: Callable[..., Any]) -> Callable[..., Any]:
-    """``fun(*arrays, n)`` compiled once for each chunk length."""
+def jit_chunks(fun: Callable[..., Any], fast: bool = False) -> Callable[..., Any]:
+    """``fun(*arrays, n)`` compiled once for each chunk length.
+
+    ``fast`` is for what simulates for long: slower to compile, faster to run.
+    """
     import jax
+
+    from easi_jax.runtime import fast_loops
+
+    options = fast_loops() if fast else None
 
     compiled: dict[int, Any] = {}
 
     def call(*args: Any) -> Any:
         *arrays, n = args
         if n not in compiled:
-            compiled[n] = jax.jit(lambda *a: fun(*a, n))
+            compiled[n] = jax.jit(lambda *a: fun(*a, n), compiler_options=options)
         return compiled[n](*arrays)
 
     return call

@@ -86,6 +86,30 @@ def test_killed_training_goes_on_bit_equal(chain: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
 
 
+def test_killed_search_goes_on_bit_equal(chain: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "easi"
+    shutil.copytree(chain / "easi", copy)
+    # As a kill in the second chunk of the search would have left it.
+    for stage in ("estimate", "final", "policy_EASI", "policy_UDR"):
+        shutil.rmtree(copy / "checkpoints" / stage)
+    shutil.rmtree(copy / "checkpoints" / "search" / "step_000000000004")
+    for name in ("results.json", "distribution.json", "report.html"):
+        (copy / name).unlink()
+    _main(
+        easi,
+        *("--udr", chain / "udr", "--out", copy, "--chunk", 12, "--resume"),
+        *("--search-chunk", 2, *SEARCH, *SETTINGS, *TARGET, "--eval-episodes", 4),
+    )
+    for name in ("distribution.json", "results.json"):
+        again, whole = (
+            json.loads((r / name).read_text()) for r in (copy, chain / "easi")
+        )
+        assert again == whole, name
+    rows = [json.loads(x) for x in (copy / "metrics.jsonl").read_text().splitlines()]
+    steps = [r["step"] for r in rows if r["stage"] == "search"]
+    assert steps == sorted(set(steps)), "a generation was logged twice"
+
+
 def test_folder_of_easi(chain: Path) -> None:
     run = chain / "easi"
     found = json.loads((run / "distribution.json").read_text())
