@@ -5,6 +5,7 @@ unknown within its noise and eliminated (Schur complement). The inverse is the
 Cramer-Rao bound.
 """
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,7 @@ from easi_jax.parameters import ParameterSpace
 from easi_jax.segments import Segments
 
 _WEAK = 0.5  # std of a log ratio beyond which a direction is called undetermined
+_ALONE = 0.998  # of a parameter's own direction unseen: it leaves no trace
 _NUMERIC = 1e-4  # relative singular value that single precision cannot resolve
 
 
@@ -214,13 +216,54 @@ def identifiability(
                 for i in np.argsort(-np.abs(v))
                 if abs(v[i]) > 0.05
             }
-            for v in _sparse_basis(null)
+            for v in _readable_basis(null, _forces(space))
         ),
         determined=determined,
         covariance=cov / np.outer(scale, scale),
         null=null,
         scale=scale,
     )
+
+
+def _forces(space: ParameterSpace) -> np.ndarray:
+    """1 where a unit holds a mass or a force: what one common factor would scale."""
+    bases = (re.findall(r"[A-Za-z]+", u.split("/")[0]) for u in space.units)
+    return np.array([float(bool({"kg", "N", "Nm"} & set(b))) for b in bases])
+
+
+def _readable_basis(null: np.ndarray, common: np.ndarray) -> list[np.ndarray]:
+    """A basis of a subspace in the order in which people think of it.
+
+    Parameters without any trace; the common scale of all masses and forces, if it is
+    there; what is left, as sparse as can be.
+    """
+    n, count = null.shape
+    singles = np.flatnonzero((null**2).sum(1) > _ALONE)[:count]
+    parts = [np.eye(n)[i] for i in singles]
+    scale = common.copy()
+    scale[singles] = 0.0
+    missed = scale - null @ (null.T @ scale)
+    found = scale.sum() >= 2 and len(parts) < count
+    found = found and np.linalg.norm(missed) < 0.05 * np.linalg.norm(scale)
+    if found:
+        parts.append(scale)
+    if not parts:
+        return _sparse_basis(null)
+    if len(parts) == count:
+        return parts
+    used = np.linalg.qr(np.stack(parts, 1))[0]
+    left = np.linalg.svd(null - used @ (used.T @ null))[0][:, : count - len(parts)]
+    others = _sparse_basis(left)
+    if found:
+        others = [_without(v, scale) for v in others]
+    return [*parts, *others]
+
+
+def _without(v: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """``v`` less the multiple of ``scale`` that leaves the smallest sum of powers."""
+    tries = [v - v[i] * scale for i in np.flatnonzero(scale)]
+    best = min(tries, key=lambda x: float(np.abs(x).sum()))
+    return best / np.max(np.abs(best))
 
 
 def _sparse_basis(null: np.ndarray) -> list[np.ndarray]:

@@ -56,6 +56,18 @@ def test_the_common_scale_is_invisible(found: Identifiability) -> None:
     assert angle_to_null(found, {**scale, "cart_kp": 0.0}) > 0.1
 
 
+def test_the_user_is_told_of_the_common_scale_by_itself(
+    found: Identifiability,
+) -> None:
+    scale, other = found.undetermined
+    assert set(scale.values()) == {1.0} and len(scale) == 9
+    assert "one common factor" in describe(scale)
+    # The other one is about the bodies alone: no drive, no friction.
+    assert set(other) == {"pole_length", "pole_mass", "pole_armature", "cart_mass"}
+    for direction in (scale, other):
+        assert angle_to_null(found, direction) < 0.03
+
+
 def test_length_mass_and_armature_trade_against_each_other(
     found: Identifiability,
 ) -> None:
