@@ -173,3 +173,16 @@ def test_settings_that_cannot_work(change, named):
     with pytest.raises(UserError, match=named) as error:
         SacConfig(**change)
     assert "\n" not in str(error.value)
+
+
+def test_the_learning_rate_falls_linearly_until_the_last_update():
+    from easi_jax.rl.learner import _learning_rate
+
+    config = SacConfig(learning_rate=1e-2, learning_rate_decay=0.1)
+    rate = _learning_rate(config)
+    assert callable(rate)
+    last = (config.iterations - config.random_iterations) * config.updates_per_step
+    np.testing.assert_allclose(rate(0), 1e-2)
+    np.testing.assert_allclose(rate(last // 2), 5.5e-3, rtol=1e-3)
+    np.testing.assert_allclose(rate(last), 1e-3, rtol=1e-6)
+    assert _learning_rate(SacConfig(learning_rate=1e-2)) == 1e-2

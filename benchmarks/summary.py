@@ -1,0 +1,237 @@
+"""All committed results against their goals, as one page of Markdown.
+
+    python -m benchmarks.summary
+
+Reads ``benchmarks/results/*.json`` and nothing else; writes ``README.md`` beside them.
+A result that was not run is named as not run.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks._common import RESULTS
+from benchmarks.recovery import CASES
+from train._command import main, say
+
+FACTORS = (0.25, 0.5, 2, 4)
+KNOWN = 0.02  # Cramer-Rao standard deviation below which a parameter must be found
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Writes the page of results."""
+
+    results: Path = RESULTS
+    """Folder of the JSON files."""
+
+
+def run(config: Config) -> None:
+    """Writes ``README.md``."""
+    from easi_jax.io.files import atomic_write
+
+    parts = ["# Results", "Made by `python -m benchmarks.summary` from the files here."]
+    for section in (_speed, _recovery, _transfer, _real):
+        parts += section(config.results)
+    path = config.results / "README.md"
+    atomic_write(path, "\n\n".join(parts) + "\n")
+    say(f"written: {path}")
+
+
+def _read(folder: Path, name: str) -> Any:
+    from easi_jax.io.files import read_json
+
+    path = folder / f"{name}.json"
+    return read_json(path) if path.is_file() else None
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    lines = [
+        "| " + " | ".join(head) + " |",
+        "| " + " | ".join("---" for _ in head) + " |",
+    ]
+    lines += ["| " + " | ".join(str(c) for c in row) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def _percent(log_ratio: float) -> str:
+    return f"{100 * (math.exp(log_ratio) - 1):.1f}"
+
+
+def _met(ok: bool) -> str:
+    return "met" if ok else "**missed**"
+
+
+def _speed(folder: Path) -> list[str]:
+    r = _read(folder, "speed")
+    if r is None:
+        return ["## Speed", "Not run: `python -m benchmarks.speed`."]
+    best, outside = (
+        min(r["search"]["search_s"]),
+        r["search"]["outside_physics_per_generation_s"],
+    )
+    done = [s["finished"] for s in r["stress"]]
+    compiled = {
+        k: f"{v['trace_s']:.0f} + {v['compile_s']:.0f}" for k, v in r["compile"].items()
+    }
+    rows = [
+        (
+            "simulated steps of native MuJoCo",
+            f"{r['ratio']:.2f} times",
+            "4",
+            _met(r["ratio"] >= 4),
+        ),
+        ("search of 50 x 300 x 200 [s]", f"{best:.1f}", "60", _met(best < 60)),
+        (
+            "a generation outside physics [s]",
+            f"{outside:.3f}",
+            "0.25",
+            _met(outside <= 0.25),
+        ),
+        ("trace + compile, cold [s]", compiled["cold"], "", ""),
+        ("trace + compile, cached [s]", compiled["cached"], "", ""),
+        (
+            "large batches finished",
+            f"{sum(done)} of {len(done)}",
+            "all",
+            _met(all(done)),
+        ),
+    ]
+    return [
+        "## Speed",
+        f"`{r['command']}`",
+        _table(("figure", "measured", "goal", ""), rows),
+    ]
+
+
+def _recovery(folder: Path) -> list[str]:
+    import numpy as np
+
+    out = ["## Recovery of known Cartpole parameters"]
+    errors, found = [], []
+    for name, case in CASES.items():
+        r = _read(folder, f"recovery_{name}")
+        if r is None:
+            out.append(f"Not run: `python -m benchmarks.recovery --cases {name}`.")
+            continue
+        count = len(r["seeds"])
+        for method, s in r["summary"].items():
+            one, long = max(s["median_one_step"]), max(s["median_open_loop"])
+            goal = case["free"] and not any(case["noise"]) and method != "paper"
+            errors.append(
+                (
+                    name,
+                    method,
+                    count,
+                    f"{100 * one:.2f} %"
+                    + (f" ({_met(one <= 0.01)}: 1 %)" if goal else ""),
+                    f"{100 * long:.2f} %"
+                    + (f" ({_met(long <= 0.03)}: 3 %)" if goal else ""),
+                )
+            )
+        stds = [row["cramer_rao_std"] for row in r["seeds"] if "cramer_rao_std" in row]
+        if case["free"] or not stds:
+            continue
+        std = np.median(np.array(stds, float), 0)
+        known = np.flatnonzero(std < KNOWN)
+        limit = 0.05 if "start" not in case else 0.10
+        for method, s in r["summary"].items():
+            middle = np.array(s["median_abs_log_ratio"])[known]
+            worst = np.array(s["worst_abs_log_ratio"])[known]
+            ok = middle.max() <= np.log1p(limit)
+            if "start" not in case:
+                ok = ok and worst.max() <= np.log1p(0.15)
+            shown = [
+                f"{r['parameters'][k]} {_percent(m)} ({_percent(w)})"
+                for k, m, w in zip(known, middle, worst, strict=True)
+            ]
+            found.append(
+                (
+                    name,
+                    method,
+                    ", ".join(shown),
+                    _met(bool(ok)),
+                )
+            )
+    if errors:
+        out.append(
+            "Worst channel of the held-out error, median over seeds, as a share of "
+            "the motion:"
+        )
+        head = ("case", "method", "seeds", "one step", "open loop 0.2 s")
+        out.append(_table(head, errors))
+    if found:
+        out.append(
+            "Parameters whose Cramer-Rao standard deviation is below 2 %: error in %, "
+            "median (worst) over seeds. Goal: 5 (15), from starts that exclude the "
+            "truth 10 in the median."
+        )
+        out.append(_table(("case", "method", "parameters", ""), found))
+    return out
+
+
+def _transfer(folder: Path) -> list[str]:
+    out, rows = ["## Transfer: return in a target with another drive"], []
+    for factor in FACTORS:
+        names = [f"transfer_kp_x{factor:g}"]
+        names += sorted(p.stem for p in folder.glob(f"{names[0]}_joint*.json"))
+        for name in names:
+            r = _read(folder, name)
+            if r is None:
+                out.append(
+                    f"Not run: `python -m benchmarks.transfer --factors {factor:g}`."
+                )
+                continue
+            mean = {m: sum(v.values()) / len(v) for m, v in r["returns"].items()}
+            gap, (low, high) = r["oracle_minus_udr"], r["share_95"]
+            verdict = _met(r["share_of_gap"] >= 0.9) if r["goal_applies"] else "no gap"
+            rows.append(
+                (
+                    name.removeprefix("transfer_"),
+                    len(next(iter(r["returns"].values()))),
+                    *(f"{mean[m]:.1f}" for m in ("UDR", "EASI", "Oracle")),
+                    f"{gap['mean']:.1f} +- {gap['standard_error']:.1f}",
+                    f"{r['share_of_gap']:.2f} [{low:.2f}, {high:.2f}]",
+                    verdict,
+                )
+            )
+    if rows:
+        head = (
+            "target",
+            "seeds",
+            "UDR",
+            "EASI",
+            "Oracle",
+            "Oracle - UDR",
+            "share closed",
+            "goal 0.9",
+        )
+        out.append(_table(head, rows))
+    return out
+
+
+def _real(folder: Path) -> list[str]:
+    r = _read(folder, "real_cartpole")
+    if r is None:
+        return ["## Real cart-pole", "Not run: `python -m benchmarks.real_cartpole`."]
+    rows = [
+        (measure, name, joint, f"{row['nominal'][joint]:.4f}", f"{x:.4f}")
+        for measure, sets in r["measures"].items()
+        for name, row in sets.items()
+        for joint, x in row["identified_median"].items()
+    ]
+    out = [
+        "## Real cart-pole",
+        f"`{r['command']}`: {r['measure']} (m, rad), median over seeds.",
+    ]
+    out.append(
+        _table(("measure", "recordings", "joint", "nominal", "identified"), rows)
+    )
+    out += [f"{measure}: {verdict}." for measure, verdict in r["verdicts"].items()]
+    return out
+
+
+if __name__ == "__main__":
+    main(Config, run, name="benchmarks.summary")
