@@ -14,6 +14,7 @@ from easi_jax.replay import motion
 from easi_jax.segments import Segments
 
 FLOOR = 1e-3  # of the motion: what a model is never trusted to be better than
+_RESOLVED = 1e-5  # smallest eigenvalue of a float32 correlation matrix worth its name
 _INITIAL_VARIANCE = 1.0 / 12.0  # of a uniform initial range, unit coordinates
 
 
@@ -99,10 +100,18 @@ def estimate(
 def _posterior(hessian: jax.Array) -> tuple[jax.Array, jax.Array]:
     """``(F + prior)^-1``, and the filter of directions that the data show.
 
-    By eigenvalues, which single precision gets right where an inverse does not: F may
-    span ten decades.
+    F spans ten decades, and single precision leaves noise where it should be zero that
+    a plain inverse would take for knowledge. So F is scaled to a unit diagonal, what is
+    below `_RESOLVED` there counts as not seen, and seen and unseen are inverted apart.
     """
-    values, vectors = jnp.linalg.eigh(0.5 * (hessian + hessian.T))
-    values = jnp.maximum(values, 0.0)
-    total = values + 1.0 / _INITIAL_VARIANCE
-    return (vectors / total) @ vectors.T, (vectors * (values / total)) @ vectors.T
+    size = jnp.sqrt(jnp.maximum(jnp.diag(hessian), 1.0 / _INITIAL_VARIANCE))
+    scaled = hessian / size[:, None] / size
+    values, vectors = jnp.linalg.eigh(0.5 * (scaled + scaled.T))
+    seen = values > _RESOLVED
+    prior = vectors.T @ (vectors / (_INITIAL_VARIANCE * size**2)[:, None])
+    total = jnp.where(seen[:, None] == seen, prior, 0.0)
+    total = total + jnp.diag(jnp.where(seen, values, 0.0))
+    root = jnp.sqrt(jnp.diag(total))
+    back = vectors / size[:, None] / root
+    cov = back @ jnp.linalg.inv(total / root[:, None] / root) @ back.T
+    return cov, jnp.eye(hessian.shape[0]) - cov / _INITIAL_VARIANCE

@@ -3,8 +3,8 @@
 Maximum likelihood under independent measurement noise: parameters and the true start
 of every segment are fitted together by Levenberg-Marquardt with forward-mode
 derivatives through the simulation. Each round tries several dampings, and jumps of
-single parameters: a speed or force limit that no simulation reaches has no slope, yet
-the data may show that it is lower. In the first half of the rounds pieces that fit far
+single parameters: a speed limit that no simulation reaches has no slope, yet the data
+may show that it is lower. In the first half of the rounds pieces that fit far
 worse than most count less. Starting at the found mean, it is the natural last
 step where commands and states were logged together; it says nothing about unpaired
 data or about distributions.
@@ -25,7 +25,7 @@ from easi_jax.parameters import ParameterSpace
 from easi_jax.segments import Segments
 
 _DAMPING = 10.0 ** np.arange(-2, 4)  # tried together, relative to the last one
-_FIRST_JUMP = 0.2  # of the initial range
+_FARTHEST = 0.8  # jump that is tried, in initial ranges
 _OUTLYING = 9.0  # times the median cost: such a piece counts half
 
 
@@ -77,9 +77,10 @@ def refine(
         return 0.5 * jnp.sum(pull * (u - anchor) ** 2, axis=-1)
 
     n, count = space.size, segments.count
+    sides = jnp.array([[1.0], [-1.0]])
 
     def step(carry: Any, item: Any) -> Any:
-        (moving, robust), (u, shift, damp, jump, pieces, _) = item, carry
+        (moving, robust), (u, shift, damp, near, far, pieces, _) = item, carry
         trust = jnp.where(robust, _trust(pieces, segments.weight > 0), 1.0)
         weighed = weight * trust[:, None, None]
         eq = normal_equations(machine, space, u, shift, segments, noise, weighed, mesh)
@@ -99,25 +100,33 @@ def refine(
             return new, shift + eq.start_step + gain
 
         newton, shifted = jax.vmap(trial)(damp * _DAMPING)
-        hops = jnp.clip(u + jnp.diag(jump), low, high)
+        # Bisection, per parameter and side, between where a change has left the cost
+        # as it was and where it has raised it: at the edge of a plateau it may fall.
+        reach = 0.5 * (near + far)
+        hops = jnp.clip(u + (reach * sides)[..., None] * jnp.eye(n), low, high)
+        hops = hops.reshape(2 * n, n)
         units = jnp.concatenate([u[None], newton, hops])
-        stay = jnp.broadcast_to(shift, (n + 1, *shift.shape))
+        stay = jnp.broadcast_to(shift, (2 * n + 1, *shift.shape))
         shifts = jnp.concatenate([stay[:1], shifted, stay[1:]])
         each = piece_costs(machine, space, units, shifts, segments, noise, weight, mesh)
         costs = (each * trust).sum(1) + prior(units)
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
         best = jnp.where(moving, jnp.argmin(costs), 0)
-        damped, hopped = costs[1 : 1 + len(_DAMPING)], costs[1 + len(_DAMPING) :]
+        damped = costs[1 : 1 + len(_DAMPING)]
         damp = damp * jnp.asarray(_DAMPING)[jnp.argmin(damped)]
         damp = jnp.where(damped.min() < costs[0], damp, 100.0 * damp)
-        # The other way next time, and less far, where it did not pay.
-        longer = jump * jnp.where(hopped < costs[0], 1.5, -0.7)
-        jump = jnp.where(moving, jnp.clip(longer, -0.5, 0.5), jump)
+        data = (each * trust).sum(1)
+        level = data[1 + len(_DAMPING) :].reshape(2, n)
+        flat, worse = level == data[0], ~(level <= data[0])
+        chosen = (jnp.arange(2 * n) == best - 1 - len(_DAMPING)).reshape(2, n)
+        near = jnp.where(moving & flat, reach, jnp.where(chosen.any(0), 0.0, near))
+        far = jnp.where(moving & (worse | chosen), reach, far)
         new = (
             units[best],
             shifts[best],
             jnp.where(moving, jnp.clip(damp, 1e-6, 1e6), carry[2]),
-            jump,
+            near,
+            far,
             each[best],
             eq.hessian,
         )
@@ -127,7 +136,8 @@ def refine(
         unit,
         jnp.zeros((count, 2 * machine.mj_model.nv)),
         jnp.asarray(1e-3),
-        jnp.full(n, _FIRST_JUMP),
+        jnp.zeros((2, n)),
+        jnp.full((2, n), _FARTHEST),
         jnp.ones(count),
         jnp.zeros((n, n)),
     )
@@ -135,7 +145,7 @@ def refine(
     at = np.arange(iterations + 2)
     moving = (at > 0) & (at <= iterations)
     rounds = (jnp.asarray(moving), jnp.asarray(moving & (at <= iterations // 2)))
-    (u, shift, _, _, _, hessian), costs = jax.lax.scan(step, init, rounds)
+    (u, shift, _, _, _, _, hessian), costs = jax.lax.scan(step, init, rounds)
     return RefineResult(u, hessian, costs[1:], shift)
 
 
