@@ -8,16 +8,21 @@ from typing import Any
 RESULTS = Path(__file__).parent / "results"
 
 
-def write_result(name: str, command: str, config: Any, **figures: Any) -> Path:
-    """Writes ``benchmarks/results/NAME.json`` with config, versions and device."""
+def write_result(
+    name: str, command: str, config: Any, folder: Path = RESULTS, **figures: Any
+) -> Path:
+    """Writes ``FOLDER/NAME.json`` with config, versions and device.
+
+    ``config`` is a dataclass, or a dict of what decides the figures.
+    """
     from easi_jax.io.files import atomic_write, to_json
     from easi_jax.io.versions import versions
 
-    RESULTS.mkdir(exist_ok=True)
-    path = RESULTS / f"{name}.json"
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}.json"
     body = {
         "command": command,
-        "config": dataclasses.asdict(config),
+        "config": config if isinstance(config, dict) else dataclasses.asdict(config),
         "versions": versions(),
         "finished": time.strftime("%Y-%m-%d"),
         **figures,

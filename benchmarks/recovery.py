@@ -57,9 +57,9 @@ def controller(obs: Any, key: Any) -> Any:
 
 def run(config: Config) -> None:
     """Runs the cases and writes one JSON for each."""
-    for name in config.cases:
-        from easi_jax.errors import UserError, nearest
+    from easi_jax.errors import UserError, nearest
 
+    for name in config.cases:
         if name not in CASES:
             raise UserError(f'unknown case "{name}"{nearest(name, CASES)}')
         _case(name, config, **CASES[name])

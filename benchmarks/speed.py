@@ -62,20 +62,27 @@ def _search(config: Config) -> Any:
     return env, search, data
 
 
-def _compile(config: Config) -> dict[str, float]:
+def _whole(search: Any, config: Config) -> Any:
+    """All generations as one program."""
     import jax
 
     from easi_jax.runtime import fast_loops
+
+    return jax.jit(
+        lambda s, d: search.run(s, d, config.generations),
+        compiler_options=fast_loops(),
+    )
+
+
+def _compile(config: Config) -> dict[str, float]:
+    import jax
 
     begin = time.monotonic()
     _, search, data = _search(config)
     d = jax.jit(data)(jax.random.key(0))
     state = search.init(jax.random.key(0), d)
     ready = time.monotonic()
-    lowered = jax.jit(
-        lambda s, d: search.run(s, d, config.generations),
-        compiler_options=fast_loops(),
-    ).lower(state, d)
+    lowered = _whole(search, config).lower(state, d)
     traced = time.monotonic()
     lowered.compile()
     done = time.monotonic()
@@ -163,10 +170,7 @@ def _generations(config: Config) -> dict[str, Any]:
     _, search, data = _search(config)
     d = jax.jit(data)(jax.random.key(0))
     state = search.init(jax.random.key(0), d)
-    options = fast_loops()
-    whole = jax.jit(
-        lambda s, d: search.run(s, d, config.generations), compiler_options=options
-    )
+    whole = _whole(search, config)
     only = jax.jit(
         lambda s, d: jax.lax.scan(
             lambda k, _: (
@@ -177,7 +181,7 @@ def _generations(config: Config) -> dict[str, Any]:
             None,
             length=config.generations,
         )[1],
-        compiler_options=options,
+        compiler_options=fast_loops(),
     )
     times: dict[str, list[float]] = {"search_s": [], "physics_s": []}
     for name, fun in (("search_s", whole), ("physics_s", only)):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from easi_jax.distribution import Distribution, gaussian
-from easi_jax.information import normal_equations
+from easi_jax.information import PairedFit
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
 from easi_jax.refine import refine, step_weights
@@ -81,7 +81,8 @@ def estimate(
     else:
         weight = step_weights(pieces, assumed, misfit)
         zero = jnp.zeros((pieces.count, len(noise)))
-        eq = normal_equations(machine, space, mean, zero, pieces, assumed, weight, mesh)
+        paired = PairedFit(machine, space, pieces, assumed, mesh)
+        eq = paired.normal(mean, zero, weight)
         center, hessian = mean, eq.hessian
         cost, delta = jnp.zeros(0), eq.start_step
     open_cov, seen = _posterior(hessian)

@@ -6,7 +6,7 @@ Cramer-Rao bound.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import flax.struct
@@ -23,6 +23,7 @@ from easi_jax.segments import Segments
 
 _WEAK = 0.5  # std of a log ratio beyond which a direction is called undetermined
 _ALONE = 0.998  # of a parameter's own direction unseen: it leaves no trace
+_CHUNK = 256  # segments simulated at once
 _NUMERIC = 1e-4  # relative singular value that single precision cannot resolve
 
 
@@ -47,114 +48,108 @@ class Normal:
 
 def shift_start(machine: Machine, seg: Segments, delta: jax.Array) -> Segments:
     """Segments with starts moved by tangent vectors ``(M, 2 nv)``."""
-    import dataclasses
-
     nv = machine.mj_model.nv
     move = jax.vmap(machine.move)
-    return dataclasses.replace(
+    return replace(
         seg, qpos=move(seg.qpos, delta[:, :nv]), qvel=seg.qvel + delta[:, nv:]
     )
 
 
-def normal_equations(
-    machine: Machine,
-    space: ParameterSpace,
-    unit: jax.Array,
-    delta: jax.Array,
-    segments: Segments,
-    noise: jax.Array,
-    weight: jax.Array,
-    mesh: Mesh | None = None,
-    chunk: int = 256,
-) -> Normal:
-    """Gauss-Newton system at parameters ``unit (n,)`` and start shifts ``delta``.
+@dataclass(frozen=True)
+class PairedFit:
+    """Predicted against measured segments, each start free within its noise.
 
-    Args:
-        noise: standard deviations ``(2 nv,)`` of measured positions, velocities.
-        weight: ``(M, H, 2 nv)`` extra weights (robust fit; ones otherwise).
-    """
-    n, nv2 = space.size, 2 * machine.mj_model.nv
-    directions = jnp.eye(n + nv2)
-
-    def one(item: Any) -> Any:
-        s, d, w = item
-
-        def f(x: jax.Array) -> jax.Array:
-            return _residual(machine, space, unit + x[:n], d + x[n:], s)
-
-        zero = jnp.zeros(n + nv2)
-        r, push = f(zero), lambda v: jax.jvp(f, (zero,), (v,))[1]
-        jac = jnp.moveaxis(jax.vmap(push)(directions), 0, -1)  # (H, 2nv, n + nv2)
-        root = jnp.sqrt(w) / noise
-        # A piece of weight zero may hold anything, not finite included.
-        on = w > 0
-        rw = jnp.where(on, r * root, 0.0).reshape(-1)
-        jw = jnp.where(on[..., None], jac * root[..., None], 0.0)
-        jw = jw.reshape(-1, n + nv2)
-        a, b = jw[:, :n], jw[:, n:]
-        # The start was measured too: its own shift costs d / noise.
-        fxx = b.T @ b + jnp.diag(1 / noise**2)
-        fxu, gx = b.T @ a, b.T @ rw + d / noise**2
-        sol = jnp.linalg.solve(fxx, jnp.concatenate([fxu, gx[:, None]], 1))
-        hess = a.T @ a - fxu.T @ sol[:, :n]
-        grad = a.T @ rw - fxu.T @ sol[:, n]
-        cost = 0.5 * (rw @ rw + jnp.sum((d / noise) ** 2))
-        return hess, grad, cost, -sol[:, n], -sol[:, :n]
-
-    def local(items: Any) -> Any:
-        return jax.lax.map(one, items, batch_size=chunk)
-
-    out = sharded_map(local, mesh or make_mesh(), (segments, delta, weight))
-    hess, grad, cost, step, gain = out
-    return Normal(hess.sum(0), grad.sum(0), cost.sum(), step, gain)
-
-
-def piece_costs(
-    machine: Machine,
-    space: ParameterSpace,
-    unit: jax.Array,
-    delta: jax.Array,
-    segments: Segments,
-    noise: jax.Array,
-    weight: jax.Array,
-    mesh: Mesh | None = None,
-    chunk: int = 256,
-) -> jax.Array:
-    """The cost of `normal_equations`, piece by piece and for several points at once.
-
-    Args:
-        unit: ``(K, n)``.
-        delta: ``(K, M, 2 nv)``.
-
-    Returns:
-        ``(K, M)``; inf where the simulation is not finite.
+    Attributes:
+        machine, space: what is simulated, and its parameters.
+        segments: M of H control steps.
+        noise: standard deviations of measured positions and velocities, ``(2 nv,)``.
+        mesh: devices that share the segments; all of them by default.
     """
 
-    def one(item: Any) -> jax.Array:
-        s, d, w = item
+    machine: Machine
+    space: ParameterSpace
+    segments: Segments
+    noise: jax.Array
+    mesh: Mesh | None = None
 
-        def cost(u: jax.Array, x: jax.Array) -> jax.Array:
-            r = _residual(machine, space, u, x, s)
-            square = jnp.where(w > 0, w * (r / noise) ** 2, 0.0).sum()
-            total = 0.5 * (square + jnp.sum((x / noise) ** 2))
-            return jnp.where(jnp.isfinite(total), total, jnp.inf)
+    def normal(self, unit: jax.Array, delta: jax.Array, weight: jax.Array) -> Normal:
+        """Gauss-Newton system at parameters ``unit (n,)`` and start shifts ``delta``.
 
-        return jax.vmap(cost)(unit, d)
+        Args:
+            delta: ``(M, 2 nv)``.
+            weight: of each measured number, ``(M, H, 2 nv)``.
+        """
+        n, nv2 = self.space.size, 2 * self.machine.mj_model.nv
+        directions = jnp.eye(n + nv2)
+        noise = self.noise
 
-    def local(items: Any) -> jax.Array:
-        return jax.lax.map(one, items, batch_size=chunk)
+        def one(item: Any) -> Any:
+            s, d, w = item
 
-    items = (segments, jnp.swapaxes(delta, 0, 1), weight)
-    return sharded_map(local, mesh or make_mesh(), items).T
+            def f(x: jax.Array) -> jax.Array:
+                return self._residual(unit + x[:n], d + x[n:], s)
 
+            zero = jnp.zeros(n + nv2)
+            r, push = f(zero), lambda v: jax.jvp(f, (zero,), (v,))[1]
+            jac = jnp.moveaxis(jax.vmap(push)(directions), 0, -1)  # (H, 2nv, n + nv2)
+            root = jnp.sqrt(w) / noise
+            # A piece of weight zero may hold anything, not finite included.
+            on = w > 0
+            rw = jnp.where(on, r * root, 0.0).reshape(-1)
+            jw = jnp.where(on[..., None], jac * root[..., None], 0.0)
+            jw = jw.reshape(-1, n + nv2)
+            a, b = jw[:, :n], jw[:, n:]
+            # The start was measured too: its own shift costs d / noise.
+            fxx = b.T @ b + jnp.diag(1 / noise**2)
+            fxu, gx = b.T @ a, b.T @ rw + d / noise**2
+            sol = jnp.linalg.solve(fxx, jnp.concatenate([fxu, gx[:, None]], 1))
+            hess = a.T @ a - fxu.T @ sol[:, :n]
+            grad = a.T @ rw - fxu.T @ sol[:, n]
+            cost = 0.5 * (rw @ rw + jnp.sum((d / noise) ** 2))
+            return hess, grad, cost, -sol[:, n], -sol[:, :n]
 
-def _residual(
-    machine: Machine, space: ParameterSpace, unit: jax.Array, d: jax.Array, s: Segments
-) -> jax.Array:
-    """Predicted minus measured, ``(H, 2 nv)``, of one segment; its start moved."""
-    one = jax.tree.map(lambda x: x[None], s)
-    moved = shift_start(machine, one, d[None])
-    return -replay.errors_from(machine, machine.model(space.to_si(unit)), moved, one)[0]
+        hess, grad, cost, step, gain = self._each(one, delta, weight)
+        return Normal(hess.sum(0), grad.sum(0), cost.sum(), step, gain)
+
+    def costs(self, unit: jax.Array, delta: jax.Array, weight: jax.Array) -> jax.Array:
+        """The cost of `normal`, piece by piece and for several points at once.
+
+        Args:
+            unit: ``(K, n)``.
+            delta: ``(K, M, 2 nv)``.
+            weight: of each measured number, ``(M, H, 2 nv)``.
+
+        Returns:
+            ``(K, M)``; inf where the simulation is not finite.
+        """
+
+        def one(item: Any) -> jax.Array:
+            s, d, w = item
+
+            def cost(u: jax.Array, x: jax.Array) -> jax.Array:
+                r = self._residual(u, x, s)
+                square = jnp.where(w > 0, w * (r / self.noise) ** 2, 0.0).sum()
+                total = 0.5 * (square + jnp.sum((x / self.noise) ** 2))
+                return jnp.where(jnp.isfinite(total), total, jnp.inf)
+
+            return jax.vmap(cost)(unit, d)
+
+        return self._each(one, jnp.swapaxes(delta, 0, 1), weight).T
+
+    def _each(self, one: Any, *items: jax.Array) -> Any:
+        """``one`` of every segment with its ``items``, shared among the devices."""
+
+        def local(block: Any) -> Any:
+            return jax.lax.map(one, block, batch_size=_CHUNK)
+
+        return sharded_map(local, self.mesh or make_mesh(), (self.segments, *items))
+
+    def _residual(self, unit: jax.Array, d: jax.Array, s: Segments) -> jax.Array:
+        """Predicted minus measured, ``(H, 2 nv)``, of one segment; its start moved."""
+        one = jax.tree.map(lambda x: x[None], s)
+        moved = shift_start(self.machine, one, d[None])
+        model = self.machine.model(self.space.to_si(unit))
+        return -replay.errors_from(self.machine, model, moved, one)[0]
 
 
 @dataclass(frozen=True)

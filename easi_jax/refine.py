@@ -18,9 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from easi_jax.information import normal_equations, piece_costs
+from easi_jax.information import PairedFit
 from easi_jax.machine import Machine
-from easi_jax.mesh import make_mesh
 from easi_jax.parameters import ParameterSpace
 from easi_jax.segments import Segments
 
@@ -67,7 +66,7 @@ def refine(
         misfit: what the model itself errs by in every step, standard deviations
             ``(2 nv,)`` on top of the noise; inf leaves a channel's steps out.
     """
-    mesh = mesh or make_mesh()
+    paired = PairedFit(machine, space, segments, noise, mesh)
     low, high = space.unit_bounds
     anchor = unit
     pull = jnp.full(space.size, 1.0 / prior_std**2)
@@ -82,8 +81,7 @@ def refine(
     def step(carry: Any, item: Any) -> Any:
         (moving, robust), (u, shift, damp, near, far, pieces, _) = item, carry
         trust = jnp.where(robust, _trust(pieces, segments.weight > 0), 1.0)
-        weighed = weight * trust[:, None, None]
-        eq = normal_equations(machine, space, u, shift, segments, noise, weighed, mesh)
+        eq = paired.normal(u, shift, weight * trust[:, None, None])
         grad = eq.gradient + pull * (u - anchor)
         # A parameter that its bound holds back takes no part in the step.
         free = ~((u <= low) & (grad > 0) | (u >= high) & (grad < 0))
@@ -108,14 +106,14 @@ def refine(
         units = jnp.concatenate([u[None], newton, hops])
         stay = jnp.broadcast_to(shift, (2 * n + 1, *shift.shape))
         shifts = jnp.concatenate([stay[:1], shifted, stay[1:]])
-        each = piece_costs(machine, space, units, shifts, segments, noise, weight, mesh)
-        costs = (each * trust).sum(1) + prior(units)
+        each = paired.costs(units, shifts, weight)
+        data = (each * trust).sum(1)
+        costs = data + prior(units)
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
         best = jnp.where(moving, jnp.argmin(costs), 0)
         damped = costs[1 : 1 + len(_DAMPING)]
         damp = damp * jnp.asarray(_DAMPING)[jnp.argmin(damped)]
         damp = jnp.where(damped.min() < costs[0], damp, 100.0 * damp)
-        data = (each * trust).sum(1)
         level = data[1 + len(_DAMPING) :].reshape(2, n)
         flat, worse = level == data[0], ~(level <= data[0])
         chosen = (jnp.arange(2 * n) == best - 1 - len(_DAMPING)).reshape(2, n)

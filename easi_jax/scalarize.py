@@ -12,7 +12,7 @@ elementwise code over the batch. Same values up to rounding.
 import operator
 from collections import OrderedDict
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from typing import Any
 
 import jax
@@ -192,9 +192,6 @@ _NUMPY: dict[str, Callable[..., Any]] = {
     "or": np.bitwise_or,
     "xor": np.bitwise_xor,
     "stop_gradient": lambda x: x,
-    "copy": lambda x: x,
-    "copy_p": lambda x: x,
-    "device_put": lambda x: x,
 }
 _ELEMENTWISE = {
     *_NUMPY,
@@ -326,25 +323,23 @@ class _Replay:
         return _map(one, *xs)
 
     def bind(self, tag: Any, prim: Any, params: dict[str, Any], e: Any) -> Any:
+        if tag[0] == "stop_gradient":
+            return self.once(tag, jax.lax.stop_gradient, e)
+        bound = prim.get_bind_params(params)
+        return self.once(tag, lambda *x: prim.bind(*x, **bound), e)
+
+    def once(self, tag: Any, fun: Callable[..., Any], e: Any) -> Any:
+        """``fun(*e)``, computed where it was not before."""
         key = (tag, *(_identity(x) for x in e))
         if key not in self.seen:
             self.alive.extend(e)
-            if tag[0] == "stop_gradient":
-                self.seen[key] = jax.lax.stop_gradient(e[0])
-            else:
-                self.seen[key] = prim.bind(*e, **prim.get_bind_params(params))
+            self.seen[key] = fun(*e)
         return self.seen[key]
 
     def _op(self, name: str, *e: Any) -> Any:
         dtype = e[0].dtype
         folded = _fold(name, {}, dtype, e)
-        if folded is not None:
-            return folded
-        key = (name, *(_identity(x) for x in e))
-        if key not in self.seen:
-            self.alive.extend(e)
-            self.seen[key] = _LAX[name](*e)
-        return self.seen[key]
+        return self.once(name, _LAX[name], e) if folded is None else folded
 
     def _sum(self, terms: Any, name: str = "add") -> Any:
         total = terms[0]
@@ -476,17 +471,16 @@ class _Replay:
             return NotImplemented
         where = np.arange(1, x.size + 1, dtype=np.int32).reshape(x.shape)
         picked = _eager(
-            jax.lax.gather_p, p | {"fill_value": 0}, where, _values(index, np.int32)
+            partial(jax.lax.gather_p.bind, **p | {"fill_value": 0}),
+            where,
+            _values(index, np.int32),
         )
-        missing = np.empty((), object)
-        dtype = next(e.dtype for e in x.flat)
+        dtype = x.flat[0].dtype
         blank = np.nan if dtype.kind == "f" else 0
-        missing[()] = np.asarray(
-            blank if p["fill_value"] is None else p["fill_value"], dtype
-        )[()]
+        missing = dtype.type(blank if p["fill_value"] is None else p["fill_value"])
         out = np.empty(picked.shape, object)
         for i in np.ndindex(out.shape):
-            out[i] = x.flat[picked[i] - 1] if picked[i] else missing[()]
+            out[i] = x.flat[picked[i] - 1] if picked[i] else missing
         return out
 
     def _dynamic_slice(self, p: dict[str, Any], x: Entries, *start: Entries) -> Any:
@@ -514,19 +508,12 @@ class _Replay:
         out = np.array(x, object, copy=True)
         flat = out.reshape(-1)
         blank = np.zeros(x.shape, np.int32)
+        dims, mode = p["dimension_numbers"], p["mode"]
+        add = partial(jax.lax.scatter_add, dimension_numbers=dims, mode=mode)
         for k, value in enumerate(new.reshape(-1)):
             mark = np.zeros(new.size, np.int32)
             mark[k] = 1
-            with jax.ensure_compile_time_eval():
-                hit = np.asarray(
-                    jax.lax.scatter_add(
-                        jnp.asarray(blank),
-                        jnp.asarray(where),
-                        jnp.asarray(mark.reshape(new.shape)),
-                        p["dimension_numbers"],
-                        mode=p["mode"],
-                    )
-                )
+            hit = _eager(add, blank, where, mark.reshape(new.shape))
             for i in np.flatnonzero(hit):
                 flat[i] = value if op is None else self._op(op, flat[i], value)
         return flat.reshape(x.shape)
@@ -609,9 +596,9 @@ def _cell(x: Any) -> Entries:
     return out
 
 
-def _eager(prim: Any, params: dict[str, Any], *arrays: np.ndarray) -> np.ndarray:
+def _eager(fun: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:
     with jax.ensure_compile_time_eval():
-        return np.asarray(prim.bind(*(jnp.asarray(a) for a in arrays), **params))
+        return np.asarray(fun(*(jnp.asarray(a) for a in arrays)))
 
 
 def _fold(name: str, p: dict[str, Any], dtype: Any, e: tuple[Any, ...]) -> Any:
@@ -625,8 +612,6 @@ def _fold(name: str, p: dict[str, Any], dtype: Any, e: tuple[Any, ...]) -> Any:
         first = cases[0]
         same = all(c is first or _equal(c, first) for c in cases[1:])
         return first if same else None
-    if name == "clamp":
-        return None
     if name == "integer_pow" and p["y"] == 1:
         return e[0]
     if len(e) != 2:

@@ -7,9 +7,9 @@ import pytest
 
 from easi_jax.information import (
     Identifiability,
+    PairedFit,
     describe,
     identifiability,
-    normal_equations,
 )
 from easi_jax.mesh import make_mesh
 from easi_jax.parameters import Parameter, ParameterSpace
@@ -28,9 +28,8 @@ def found(cartpole: Cartpole, trajectories: Segments) -> Identifiability:
     def hessian(unit: jax.Array) -> jax.Array:
         ones = jnp.broadcast_to(seg.weight[:, None, None], (*seg.ctrl.shape[:2], 4))
         zero = jnp.zeros((seg.count, 4))
-        return normal_equations(
-            machine, space, unit, zero, seg, NOISE, ones, make_mesh()
-        ).hessian
+        paired = PairedFit(machine, space, seg, NOISE, make_mesh())
+        return paired.normal(unit, zero, ones).hessian
 
     return identifiability(space, np.asarray(hessian(jnp.full(11, 0.5))), weak=1e3)
 
