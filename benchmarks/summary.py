@@ -52,7 +52,10 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
         "| " + " | ".join(head) + " |",
         "| " + " | ".join("---" for _ in head) + " |",
     ]
-    lines += ["| " + " | ".join(str(c) for c in row) + " |" for row in rows]
+    lines += [
+        "| " + " | ".join(str(c) for c in (*row, *[""] * (len(head) - len(row)))) + " |"
+        for row in rows
+    ]
     return "\n".join(lines)
 
 
@@ -217,7 +220,14 @@ def _real(folder: Path) -> list[str]:
     if r is None:
         return ["## Real cart-pole", "Not run: `python -m benchmarks.real_cartpole`."]
     rows = [
-        (measure, name, joint, f"{row['nominal'][joint]:.4f}", f"{x:.4f}")
+        (
+            measure,
+            name,
+            joint,
+            f"{row['nominal'][joint]:.4f}",
+            f"{x:.4f}",
+            *(f"{v[joint]:.4f}" for v in [row.get("fitted_to_itself")] if v),
+        )
         for measure, sets in r["measures"].items()
         for name, row in sets.items()
         for joint, x in row["identified_median"].items()
@@ -227,7 +237,21 @@ def _real(folder: Path) -> list[str]:
         f"`{r['command']}`: {r['measure']} (m, rad), median over seeds.",
     ]
     out.append(
-        _table(("measure", "recordings", "joint", "nominal", "identified"), rows)
+        _table(
+            (
+                "measure",
+                "recordings",
+                "joint",
+                "nominal",
+                "identified",
+                "fitted to itself",
+            ),
+            rows,
+        )
+    )
+    out.append(
+        "Fitted to itself: the best these parameters can do, fitted to the recordings "
+        "that they are measured on."
     )
     out += [f"{measure}: {verdict}." for measure, verdict in r["verdicts"].items()]
     return out

@@ -62,6 +62,8 @@ def estimate(
     informed: bool = True,
     mesh: Mesh | None = None,
     misfit: jax.Array | None = None,
+    rounds: int = 12,
+    robust: int | jax.Array | None = None,
 ) -> Estimate:
     """The result of a search at ``mean``, ``cov`` (unit coordinates); pure.
 
@@ -70,12 +72,23 @@ def estimate(
     initial range as prior. A direction that the data do not show keeps the initial
     spread, whatever the search has drifted to. Without ``informed`` it is the search's
     own covariance alone. ``misfit (2 nv,)`` is what the model itself errs by in every
-    step, on top of the noise (see `easi_jax.refine.refine`).
+    step, on top of the noise; it, ``rounds`` and ``robust`` go to
+    `easi_jax.refine.refine`.
     """
     assumed = effective_noise(machine, pieces, noise)
     n = space.size
     if refined:
-        fit = refine(machine, space, mean, pieces, assumed, mesh=mesh, misfit=misfit)
+        fit = refine(
+            machine,
+            space,
+            mean,
+            pieces,
+            assumed,
+            iterations=rounds,
+            mesh=mesh,
+            misfit=misfit,
+            robust=robust,
+        )
         center, hessian = fit.unit, fit.hessian
         cost, delta = fit.cost, fit.delta
     else:

@@ -25,6 +25,10 @@ _MAD = 1.4826  # median absolute deviation -> standard deviation, Gaussian
 _JITTER = 1e-6  # rounding of a written number, as a share of the largest
 _STEPS_AGREE = 1e-3
 _AGREES = 0.1
+_ODD = 20.0  # times the noise
+_ODD_ALONE = 3.0  # times the largest of the others
+_ODD_ROWS = 3  # left out at either end, at most
+_ODD_MINIMUM = 30  # rows of a run that can tell
 _SCALAR = Configuration(1, 1, (0,), (0,), ())
 
 
@@ -84,6 +88,49 @@ def _fit_gain(rows: int, dt: float) -> float:
 def pooled_noise(runs: Sequence[Run]) -> np.ndarray:
     """Median over runs of `estimate_noise`, ``(2 nv,)``."""
     return np.median([estimate_noise(run) for run in runs], axis=0)
+
+
+def without_odd_ends(
+    runs: Sequence[Run], noise: np.ndarray
+) -> tuple[list[Run], list[str]]:
+    """Runs without first or last rows that the rows beside them cannot follow.
+
+    Recorders often start with a stale or half-initialized reading. An end row is left
+    out where its third difference is far beyond the noise ``(2 nv,)`` and beyond every
+    other one of the run, at most `_ODD_ROWS` at either end.
+    """
+    out, odd = [], []
+    for run in runs:
+        first, last = 0, len(run)
+        while first < _ODD_ROWS and _odd_start(run.qpos[first:last], run, noise):
+            first += 1
+        while len(run) - last < _ODD_ROWS and _odd_start(
+            run.qpos[first:last][::-1], run, noise
+        ):
+            last -= 1
+        odd += [f"the first {first} of {run.name}"] * (first > 0)
+        odd += [f"the last {len(run) - last} of {run.name}"] * (last < len(run))
+        out.append(rows_of(run, first, last))
+    if not odd:
+        return out, []
+    return out, [
+        f"rows left out of the fit, for the rows beside them do not follow from their "
+        f"positions (a stale first reading?): {', '.join(odd)}"
+    ]
+
+
+def _odd_start(qpos: np.ndarray, run: Run, noise: np.ndarray) -> bool:
+    """Whether the first row of ``qpos (T, nq)`` stands apart from all others."""
+    scalar = run.configuration
+    x = qpos[:, list(scalar.scalar_qpos)]
+    if len(x) < _ODD_MINIMUM:
+        return False
+    jerk = np.abs(np.diff(x, 3, axis=0))
+    limit = np.maximum(
+        _ODD * math.sqrt(20.0) * noise[list(scalar.scalar_qvel)],  # binomial(6, 3)
+        _ODD_ALONE * jerk[_ODD_ROWS + 1 : -_ODD_ROWS].max(0),
+    )
+    return bool(np.any(jerk[0] > limit))
 
 
 def to_common_step(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:

@@ -4,12 +4,13 @@ Maximum likelihood under independent measurement noise: parameters and the true 
 of every segment are fitted together by Levenberg-Marquardt with forward-mode
 derivatives through the simulation. Each round tries several dampings, and jumps of
 single parameters: a speed limit that no simulation reaches has no slope, yet the data
-may show that it is lower. In the first half of the rounds pieces that fit far
-worse than most count less. Starting at the found mean, it is the natural last
+may show that it is lower. In the first rounds pieces that fit far worse than most
+count less. Starting at the found mean, it is the natural last
 step where commands and states were logged together; it says nothing about unpaired
 data or about distributions.
 """
 
+import functools
 from typing import Any
 
 import flax.struct
@@ -24,6 +25,7 @@ from easi_jax.parameters import ParameterSpace
 from easi_jax.segments import Segments
 
 _DAMPING = 10.0 ** np.arange(-2, 4)  # tried together, relative to the last one
+_TINY = 1e-12
 _FARTHEST = 0.8  # jump that is tried, in initial ranges
 _OUTLYING = 9.0  # times the median cost: such a piece counts half
 
@@ -56,6 +58,7 @@ def refine(
     prior_std: float = 3.0,
     mesh: Mesh | None = None,
     misfit: jax.Array | None = None,
+    robust: int | jax.Array | None = None,
 ) -> RefineResult:
     """Levenberg-Marquardt from ``unit (n,)``; pure, for use inside jit.
 
@@ -65,6 +68,8 @@ def refine(
             directions without any information stay where they are.
         misfit: what the model itself errs by in every step, standard deviations
             ``(2 nv,)`` on top of the noise; inf leaves a channel's steps out.
+        robust: in so many first rounds, pieces that fit far worse than most count
+            less; half of ``iterations`` by default.
     """
     paired = PairedFit(machine, space, segments, noise, mesh)
     low, high = space.unit_bounds
@@ -72,8 +77,10 @@ def refine(
     pull = jnp.full(space.size, 1.0 / prior_std**2)
     weight = step_weights(segments, noise, misfit)
 
+    away = functools.partial(_distance, space, anchor)
+
     def prior(u: jax.Array) -> jax.Array:
-        return 0.5 * jnp.sum(pull * (u - anchor) ** 2, axis=-1)
+        return 0.5 * jnp.sum(pull * away(u) ** 2, axis=-1)
 
     n, count = space.size, segments.count
     sides = jnp.array([[1.0], [-1.0]])
@@ -82,10 +89,11 @@ def refine(
         (moving, robust), (u, shift, damp, near, far, pieces, _) = item, carry
         trust = jnp.where(robust, _trust(pieces, segments.weight > 0), 1.0)
         eq = paired.normal(u, shift, weight * trust[:, None, None])
-        grad = eq.gradient + pull * (u - anchor)
+        slope = jax.jvp(away, (u,), (jnp.ones(n),))[1]
+        grad = eq.gradient + pull * slope * away(u)
         # A parameter that its bound holds back takes no part in the step.
         free = ~((u <= low) & (grad > 0) | (u >= high) & (grad < 0))
-        hess = eq.hessian + jnp.diag(pull)
+        hess = eq.hessian + jnp.diag(pull * slope**2 + _TINY)
         # By powers of ten, Fisher information spans more than single precision has.
         scale = jnp.where(free, 1.0 / jnp.sqrt(jnp.diag(hess)), 0.0)
         scaled = hess * scale[:, None] * scale + jnp.diag(jnp.where(free, 0.0, 1.0))
@@ -141,8 +149,9 @@ def refine(
     )
     # The first round only looks, and the last: cost and information at the result.
     at = np.arange(iterations + 2)
+    robust = iterations // 2 if robust is None else robust
     moving = (at > 0) & (at <= iterations)
-    rounds = (jnp.asarray(moving), jnp.asarray(moving & (at <= iterations // 2)))
+    rounds = (jnp.asarray(moving), moving & (at <= robust))
     (u, shift, _, _, _, _, hessian), costs = jax.lax.scan(step, init, rounds)
     return RefineResult(u, hessian, costs[1:], shift)
 
@@ -157,6 +166,21 @@ def _trust(pieces: jax.Array, used: jax.Array) -> jax.Array:
     typical = jnp.nan_to_num(typical)  # where there is none
     ratio = pieces / jnp.maximum(_OUTLYING * typical, 1e-30)
     return jnp.where(jnp.isfinite(ratio), 1.0 / (1.0 + ratio), 0.0)
+
+
+def _distance(space: ParameterSpace, anchor: jax.Array, unit: jax.Array) -> jax.Array:
+    """How far ``unit`` is from ``anchor`` for the prior, in initial ranges.
+
+    Below its initial range a logarithmic parameter counts by its SI value: it may be
+    as good as zero there, where the data have no slope and must not lose to the prior.
+    """
+    width = space.log_width
+
+    def scale(u: jax.Array) -> jax.Array:
+        below = jnp.expm1(width * jnp.minimum(u, 0.0)) / width
+        return jnp.where(space.log & (u < 0), below, u)
+
+    return scale(unit) - scale(anchor)
 
 
 def _moved(space: ParameterSpace, unit: jax.Array, du: jax.Array) -> jax.Array:

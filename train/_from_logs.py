@@ -8,6 +8,8 @@ from train._log_problem import FINISH, Problem, read_problem
 
 _STEPS = 500_000  # physics steps in a generation that are worth their time
 _PASSES = 3  # of the finish: the model's own error is learned from the one before
+_ROUNDS = 24  # of a pass
+_ROBUST = 12  # rounds of the first pass; later ones know which pieces fit badly
 _OUTLIER = 2.5  # times the median error: windows beyond it weigh less
 
 
@@ -123,14 +125,17 @@ def _finish(
     machine, space = problem.machine, search.space
     steps = max(problem.steps, round(FINISH / machine.dt))
     steps = min(steps, max(len(r) for r in problem.fit) - 1)
-    pieces = to_device(segments_from_runs(machine, problem.fit, steps, steps))
+    # Twice over, each counted half: where pieces begin matters less.
+    every = max(1, steps // 2)
+    pieces = to_device(segments_from_runs(machine, problem.fit, steps, every))
+    pieces = replace(pieces, weight=pieces.weight * every / steps)
     noise = jnp.asarray(problem.noise, jnp.result_type(float))
     # Velocities derived from the positions say nothing that those do not.
     seen = jnp.asarray(np.concatenate([np.ones(machine.mj_model.nv), problem.measured]))
     hidden = jnp.where(seen > 0, 0.0, jnp.inf)
 
     @jax.jit
-    def finish(mean: Any, cov: Any, pieces: Any, misfit: Any) -> Any:
+    def finish(mean: Any, cov: Any, pieces: Any, misfit: Any, robust: Any) -> Any:
         found = estimate(
             machine,
             space,
@@ -142,6 +147,8 @@ def _finish(
             search.config.informed_spread,
             search.mesh,
             misfit,
+            _ROUNDS,
+            robust,
         )
         model = machine.model(space.to_si(found.distribution.mean))
         starts = shift_start(machine, pieces, found.delta)
@@ -152,8 +159,9 @@ def _finish(
     for i in range(states.result_mean.shape[0]):
         mean, cov = states.result_mean[i], states.result_cov[i]
         misfit, weighed, center = hidden, pieces, mean
-        for _ in range(_PASSES):
-            found, error = finish(center, cov, weighed, misfit)
+        for k in range(_PASSES):
+            robust = 0 if k else _ROBUST
+            found, error = finish(center, cov, weighed, misfit, robust)
             misfit = jnp.maximum(misfit_of(error, assumed, weighed.weight), hidden)
             weight = outlier_weights(error, assumed, misfit, _OUTLIER)
             weighed = replace(pieces, weight=pieces.weight * weight)

@@ -56,6 +56,7 @@ def read_problem(config: Any) -> Problem:
         to_common_step,
         trusted_velocity,
         visible_steps,
+        without_odd_ends,
     )
     from easi_jax.machine import Machine
 
@@ -79,7 +80,8 @@ def read_problem(config: Any) -> Problem:
     every = [*log.runs, *(held_log.runs if held_log else ())]
     runs, changed = to_common_step(every)
     notes += changed
-    fit = runs[: len(log.runs)]
+    fit, odd = without_odd_ends(runs[: len(log.runs)], noise)
+    notes += odd
     if held_log is None:
         fit, held, held_name = split_held_out(fit, horizon)
     else:

@@ -22,6 +22,7 @@ from easi_jax.log_data import (
     to_common_step,
     trusted_velocity,
     visible_steps,
+    without_odd_ends,
 )
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace, declare
@@ -202,3 +203,24 @@ def test_outliers_weigh_less():
     weight = outlier_weights(error, jnp.ones(2), jnp.zeros(2), 2.5)
     np.testing.assert_allclose(weight[4], 2.5 / 20, rtol=1e-5)
     np.testing.assert_allclose(np.delete(np.asarray(weight), 4), 1.0)
+
+
+def test_an_end_row_that_the_others_do_not_follow_from_is_left_out() -> None:
+    noise = np.array([1e-5, 1e-3])
+    x = sine(400) + 1e-5 * np.random.default_rng(0).standard_normal(400)
+    clean, notes = without_odd_ends([make_run(x)], noise)
+    assert len(clean[0]) == 400 and not notes
+    x[0] += 0.02
+    x[-2:] -= 0.03
+    cut, notes = without_odd_ends([make_run(x, "stale")], noise)
+    np.testing.assert_array_equal(cut[0].qpos[:, 0], x[1:-2])
+    assert "first 1 of stale" in notes[0] and "last 2 of stale" in notes[0]
+
+
+def test_motion_that_starts_with_a_jerk_is_kept() -> None:
+    noise = np.array([1e-5, 1e-3])
+    t = 0.01 * np.arange(400)
+    bump = np.abs(np.sin(6 * t))  # bounces: its velocity jumps again and again
+    fall = np.maximum(0.0, 5 * (t - 0.005)) ** 2
+    for x in (bump, fall):
+        assert len(without_odd_ends([make_run(x)], noise)[0][0]) == 400

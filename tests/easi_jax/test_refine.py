@@ -66,3 +66,20 @@ def test_is_as_good_as_the_cramer_rao_bound(
     assert np.sqrt(np.mean(z**2)) > 0.2
     assert not (np.diff(np.asarray(out.cost)) > 0).any()
     assert np.abs(out.delta).max() < 6 * float(NOISE.max())
+
+
+def test_what_is_as_good_as_zero_comes_back_though_little_is_known(
+    cartpole: Cartpole, fit: Any, space: ParameterSpace, trajectories: Segments
+) -> None:
+    """Errors of the model drown most information; the prior must not hold it back."""
+    pieces = windows(trajectories, 25, 25)
+    machine = Machine(cartpole.mj_model, space, cartpole.dt)
+    i = space.index("cart_kv")
+    low = space.nominal.copy()
+    low[i] *= 1e-3
+    misfit = 30 * NOISE
+    run = jax.jit(
+        lambda u: refine(machine, space, u, pieces, NOISE, misfit=misfit, robust=0)
+    )
+    out = run(space.to_unit(jnp.asarray(low)))
+    assert float(space.to_si(out.unit)[i]) == pytest.approx(space.nominal[i], rel=0.1)
