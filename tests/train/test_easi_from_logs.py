@@ -2,6 +2,10 @@
 
 import json
 import re
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -51,9 +55,9 @@ def files(tmp_path: Path) -> dict[str, Path]:
 
 
 def write_log(path: Path, rows: int = 200, dt: float = 0.01, gain: float = 1.0) -> None:
-    time = dt * np.arange(rows)
-    angle = gain * 0.5 * np.sin(3 * time)
-    lines = [f"{t:.6g},{a:.6f},{np.cos(3 * t):.4f}" for t, a in zip(time, angle)]  # noqa: B905
+    at = dt * np.arange(rows)
+    angle = gain * 0.5 * np.sin(3 * at)
+    lines = [f"{t:.6g},{a:.6f},{np.cos(3 * t):.4f}" for t, a in zip(at, angle)]  # noqa: B905
     path.write_text("\n".join(["time,qpos.hinge,ctrl.drive", *lines]) + "\n")
 
 
@@ -295,3 +299,34 @@ def test_degrees_are_noticed_and_earlier_results_kept(files, capsys):
     single_row(files)
     refuse(capsys, arguments(files, "--overwrite"), "a single row")
     assert {p: p.read_bytes() for p in files["out"].rglob("*") if p.is_file()} == kept
+
+
+@pytest.mark.parametrize(
+    "blow", [signal.SIGKILL, signal.SIGINT], ids=["kill", "ctrl-c"]
+)
+def test_a_stopped_run_goes_on_bit_equal(blow, files, tmp_path):
+    """Stopped at a moment of no one's choosing, then resumed with the same command."""
+    many = ("--generations", "40", "--search-chunk", "1")
+    args = [str(a) for a in arguments(files, *many)]
+    child = subprocess.Popen(
+        [sys.executable, "-m", "train.easi", *args],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 400
+    while not any(files["out"].glob("checkpoints/search/step_*")):
+        assert child.poll() is None, child.communicate()[1]
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    child.send_signal(blow)
+    said = child.communicate(timeout=100)[1]
+    assert not (files["out"] / "distribution.json").exists()
+    if blow == signal.SIGINT:
+        assert child.returncode == 130
+        assert "--resume" in said and "Traceback" not in said
+    call(*args, "--resume")
+    resumed = (files["out"] / "distribution.json").read_bytes()
+    call(*args, "--overwrite")
+    assert (files["out"] / "distribution.json").read_bytes() == resumed
