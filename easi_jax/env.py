@@ -4,6 +4,7 @@ from typing import Any, Protocol
 
 import flax.struct
 import jax
+import jax.numpy as jnp
 
 Model = Any
 
@@ -20,6 +21,7 @@ class EnvState:
         terminated: 1.0 where the task ended in this state, ``()`` float.
         truncated: 1.0 where the time limit was reached without ending, ``()``.
         count: control steps since reset, ``()`` int32.
+        memory: what else the environment carries (a pytree of arrays).
     """
 
     physics: Any
@@ -28,6 +30,7 @@ class EnvState:
     terminated: jax.Array
     truncated: jax.Array
     count: jax.Array
+    memory: Any = ()
 
 
 class Env(Protocol):
@@ -49,3 +52,29 @@ class Env(Protocol):
         one, and its ``obs`` the terminal observation.
         """
         ...
+
+    def control(self, state: EnvState, action: jax.Array) -> jax.Array:
+        """What ``step`` would send to the actuators, ``(nu,)``."""
+        ...
+
+
+def start(physics: Any, obs: jax.Array, memory: Any = ()) -> EnvState:
+    """The first state of an episode."""
+    zero = jnp.zeros(())
+    return EnvState(physics, obs, zero, zero, zero, jnp.zeros((), jnp.int32), memory)
+
+
+def advance(
+    state: EnvState,
+    physics: Any,
+    obs: jax.Array,
+    reward: jax.Array,
+    failed: jax.Array,
+    limit: int,
+    memory: Any = (),
+) -> EnvState:
+    """The state after a step; ``failed`` ends the task, ``limit`` steps the episode."""
+    terminated = failed.astype(jnp.float32)
+    count = state.count + 1
+    truncated = (count >= limit) * (1.0 - terminated)
+    return EnvState(physics, obs, reward, terminated, truncated, count, memory)

@@ -62,8 +62,7 @@ def estimate(
     informed: bool = True,
     mesh: Mesh | None = None,
     misfit: jax.Array | None = None,
-    rounds: int = 12,
-    robust: int | jax.Array | None = None,
+    robust: int | jax.Array = 6,
 ) -> Estimate:
     """The result of a search at ``mean``, ``cov`` (unit coordinates); pure.
 
@@ -72,8 +71,7 @@ def estimate(
     initial range as prior. A direction that the data do not show keeps the initial
     spread, whatever the search has drifted to. Without ``informed`` it is the search's
     own covariance alone. ``misfit (2 nv,)`` is what the model itself errs by in every
-    step, on top of the noise; it, ``rounds`` and ``robust`` go to
-    `easi_jax.refine.refine`.
+    step, on top of the noise; it and ``robust`` go to `easi_jax.refine.refine`.
     """
     assumed = effective_noise(machine, pieces, noise)
     n = space.size
@@ -84,7 +82,6 @@ def estimate(
             mean,
             pieces,
             assumed,
-            iterations=rounds,
             mesh=mesh,
             misfit=misfit,
             robust=robust,

@@ -9,7 +9,7 @@ import numpy as np
 from mujoco.mjx._src import math
 
 from easi_jax.errors import UserError
-from easi_jax.model import Model, put_model, with_parameters
+from easi_jax.model import Model, Sense, put_model, with_parameters
 from easi_jax.parameters import ParameterSpace
 from easi_jax.physics import Physics, at_rest, control_step
 from easi_jax.recording import physics_steps
@@ -32,7 +32,12 @@ class Machine:
     """
 
     def __init__(
-        self, mj_model: mujoco.MjModel, space: ParameterSpace, dt: float | None = None
+        self,
+        mj_model: mujoco.MjModel,
+        space: ParameterSpace,
+        dt: float | None = None,
+        sense: Sense | None = None,
+        sense_size: int = 0,
     ) -> None:
         step = float(mj_model.opt.timestep)
         self.dt = float(dt) if dt is not None else step
@@ -41,7 +46,7 @@ class Machine:
         self.substeps = physics_steps(self.dt, step)
         self.mj_model = mj_model
         self.space = space
-        self.base = self._put()
+        self.base = self._put().replace(sense=sense, sense_size=sense_size)
 
     def _put(self) -> Model:
         # Eagerly, also where a machine is made while something is traced.

@@ -1,6 +1,6 @@
 """An MJX model whose physical parameters are an argument."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 import flax.struct
@@ -15,6 +15,8 @@ from easi_jax.constants import set_const
 from easi_jax.errors import UserError
 from easi_jax.quantities import length_of, long_axis, unit_inertia
 
+Sense = Callable[[mjx.Model, mjx.Data], jax.Array]
+
 
 @flax.struct.dataclass
 class Model:
@@ -25,12 +27,17 @@ class Model:
         speed_limit: largest joint speed, ``(nv,)`` [m/s, rad/s]; inf where none.
         writers: which numbers follow which parameter (static).
         long_axes: the axis of each geom that its length is measured along (static).
+        sense: ``sense(mjx_model, data) -> (sense_size,)``, read in every physics step
+            (static); None for nothing.
+        sense_size: how many numbers it reads (static).
     """
 
     mjx: mjx.Model
     speed_limit: jax.Array
     writers: tuple[Writer, ...] = flax.struct.field(pytree_node=False, default=())
     long_axes: tuple[int, ...] = flax.struct.field(pytree_node=False, default=())
+    sense: Sense | None = flax.struct.field(pytree_node=False, default=None)
+    sense_size: int = flax.struct.field(pytree_node=False, default=0)
 
     if TYPE_CHECKING:  # made by flax
 

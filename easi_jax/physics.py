@@ -11,8 +11,11 @@ from mujoco.mjx._src import sensor as mjx_sensor
 from mujoco.mjx._src.types import IntegratorType
 
 from easi_jax import solver
+from easi_jax.equality import with_velocity_products
 from easi_jax.scalarize import scalarized
 from easi_jax.small_linalg import unroll_small
+
+_UNROLLED = 8  # degrees of freedom up to which small matrices are written out
 
 
 @flax.struct.dataclass
@@ -24,18 +27,22 @@ class Physics:
         qvel: joint velocities, ``(nv,)`` [m/s, rad/s].
         act: actuator activations, ``(na,)``.
         warmstart: last acceleration, where the solver starts, ``(nv,)``.
+        sensed: what ``model.sense`` read in the last physics step; zeros before.
     """
 
     qpos: jax.Array
     qvel: jax.Array
     act: jax.Array
     warmstart: jax.Array
+    sensed: Any = ()
 
 
 def at_rest(model: Any, qpos: jax.Array, qvel: jax.Array) -> Physics:
     """A state with nothing known of what came before it."""
     m = model.mjx
-    return Physics(qpos=qpos, qvel=qvel, act=jnp.zeros(m.na), warmstart=jnp.zeros(m.nv))
+    act, warm = jnp.zeros(m.na), jnp.zeros(m.nv)
+    sensed = jnp.zeros(model.sense_size) if model.sense else ()
+    return Physics(qpos, qvel, act, warm, sensed)
 
 
 def data_at(model: Any, state: Physics, ctrl: jax.Array) -> mjx.Data:
@@ -55,7 +62,7 @@ def forward(m: mjx.Model, d: mjx.Data) -> mjx.Data:
         return mjx.forward(m, d)
     d = mjx_forward.fwd_position(m, d)
     d = mjx_sensor.sensor_pos(m, d)
-    d = mjx_forward.fwd_velocity(m, d)
+    d = with_velocity_products(m, mjx_forward.fwd_velocity(m, d))
     d = mjx_sensor.sensor_vel(m, d)
     d = mjx_forward.fwd_actuation(m, d)
     d = mjx_forward.fwd_acceleration(m, d)
@@ -102,10 +109,18 @@ def substep(model: Any, state: Physics, ctrl: jax.Array) -> Physics:
     """One physics step; the joint speed limit, which MuJoCo lacks, clips after it."""
     d = mjx_step(model.mjx, data_at(model, state, ctrl))
     qvel = jnp.clip(d.qvel, -model.speed_limit, model.speed_limit)
-    return Physics(d.qpos, qvel, d.act, d.qacc_warmstart)
+    sensed = model.sense(model.mjx, d) if model.sense else ()
+    return Physics(d.qpos, qvel, d.act, d.qacc_warmstart, sensed)
 
 
-_batched_substep = scalarized(substep, otherwise=unroll_small(substep))
+def _otherwise(model: Any, state: Physics, ctrl: jax.Array) -> Physics:
+    """Beyond what is written out entry by entry (benchmarks/physics.py)."""
+    small = model.mjx.nv <= _UNROLLED
+    return (_unrolled if small else substep)(model, state, ctrl)
+
+
+_unrolled = unroll_small(substep)
+_batched_substep = scalarized(substep, otherwise=_otherwise)
 
 
 def control_step(model: Any, state: Physics, ctrl: jax.Array, substeps: int) -> Physics:

@@ -26,6 +26,9 @@ from easi_jax.segments import Segments
 
 _DAMPING = 10.0 ** np.arange(-2, 4)  # tried together, relative to the last one
 _TINY = 1e-12
+_PATIENCE = 6  # rounds without progress that end the fit
+_TOLD_APART = 0.05  # of the cost, which is minus a logarithm of likelihood
+_MOVING, _LOOKING, _FINISHED = range(3)
 _FARTHEST = 0.8  # jump that is tried, in initial ranges
 _OUTLYING = 9.0  # times the median cost: such a piece counts half
 
@@ -38,7 +41,7 @@ class RefineResult:
         unit: parameters, unit coordinates, ``(n,)``.
         hessian: information at them, without the prior, ``(n, n)``.
         cost: half the weighted squared error, at the start and after each iteration,
-            ``(I + 1,)``.
+            ``(I + 1,)``; the last value from where the fit had settled.
         delta: corrections of the starts, ``(M, 2 nv)``.
     """
 
@@ -54,22 +57,23 @@ def refine(
     unit: jax.Array,
     segments: Segments,
     noise: jax.Array,
-    iterations: int = 12,
+    iterations: int = 40,
     prior_std: float = 3.0,
     mesh: Mesh | None = None,
     misfit: jax.Array | None = None,
-    robust: int | jax.Array | None = None,
+    robust: int | jax.Array = 6,
 ) -> RefineResult:
     """Levenberg-Marquardt from ``unit (n,)``; pure, for use inside jit.
 
     Args:
+        iterations: rounds at most; fewer where the cost has settled.
         noise: standard deviations of the measurement, ``(2 nv,)``, above zero.
         prior_std: weak pull towards the start, in initial ranges, so that
             directions without any information stay where they are.
         misfit: what the model itself errs by in every step, standard deviations
             ``(2 nv,)`` on top of the noise; inf leaves a channel's steps out.
         robust: in so many first rounds, pieces that fit far worse than most count
-            less; half of ``iterations`` by default.
+            less.
     """
     paired = PairedFit(machine, space, segments, noise, mesh)
     low, high = space.unit_bounds
@@ -85,9 +89,9 @@ def refine(
     n, count = space.size, segments.count
     sides = jnp.array([[1.0], [-1.0]])
 
-    def step(carry: Any, item: Any) -> Any:
-        (moving, robust), (u, shift, damp, near, far, pieces, _) = item, carry
-        trust = jnp.where(robust, _trust(pieces, segments.weight > 0), 1.0)
+    def step(carry: Any, moving: jax.Array, trusting: jax.Array) -> Any:
+        u, shift, damp, near, far, pieces, _ = carry
+        trust = jnp.where(trusting, 1.0, _trust(pieces, segments.weight > 0))
         eq = paired.normal(u, shift, weight * trust[:, None, None])
         slope = jax.jvp(away, (u,), (jnp.ones(n),))[1]
         grad = eq.gradient + pull * slope * away(u)
@@ -147,12 +151,28 @@ def refine(
         jnp.ones(count),
         jnp.zeros((n, n)),
     )
-    # The first round only looks, and the last: cost and information at the result.
-    at = np.arange(iterations + 2)
-    robust = iterations // 2 if robust is None else robust
-    moving = (at > 0) & (at <= iterations)
-    rounds = (jnp.asarray(moving), moving & (at <= robust))
-    (u, shift, _, _, _, _, hessian), costs = jax.lax.scan(step, init, rounds)
+
+    def going(state: Any) -> jax.Array:
+        return state[0] < _FINISHED
+
+    def round_(state: Any) -> Any:
+        phase, k, costs, carry = state
+        # The first round only looks, and the last: cost and information at the result.
+        moving = (phase == _MOVING) & (k > 0)
+        carry, cost = step(carry, moving, ~moving | (k > robust))
+        costs = jnp.where(jnp.arange(iterations + 2) >= k, cost, costs)
+        # By less than this the data cannot tell two results apart.
+        settled = costs[jnp.maximum(k - _PATIENCE, 0)] - cost < _TOLD_APART
+        settled &= k > robust + _PATIENCE
+        over = settled | (k >= iterations)
+        phase = jnp.where(
+            moving | (k == 0), jnp.where(over, _LOOKING, _MOVING), _FINISHED
+        )
+        return phase, k + 1, costs, carry
+
+    start = (jnp.asarray(_MOVING), jnp.asarray(0), jnp.zeros(iterations + 2), init)
+    _, _, costs, carry = jax.lax.while_loop(going, round_, start)
+    u, shift, *_, hessian = carry
     return RefineResult(u, hessian, costs[1:], shift)
 
 

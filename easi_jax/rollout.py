@@ -44,7 +44,7 @@ def policy_rollout(
         seg = Segments(
             qpos=state.physics.qpos,
             qvel=state.physics.qvel,
-            ctrl=env.control(action)[None],
+            ctrl=env.control(state, action)[None],
             next_qpos=after.physics.qpos[None],
             next_qvel=after.physics.qvel[None],
             weight=alive,

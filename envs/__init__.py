@@ -4,9 +4,17 @@ from collections.abc import Callable
 from typing import Any
 
 from easi_jax.errors import UserError, nearest
+from envs.ant import Ant
+from envs.ballbalance import Ballbalance
 from envs.cartpole import Cartpole
+from envs.go2 import Go2
 
-REGISTRY: dict[str, Callable[..., Any]] = {"cartpole": Cartpole}
+REGISTRY: dict[str, Callable[..., Any]] = {
+    "cartpole": Cartpole,
+    "ant": Ant,
+    "ballbalance": Ballbalance,
+    "go2": Go2,
+}
 
 
 def make(name: str, **options: Any) -> Any:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from easi_jax.env import EnvState
+from easi_jax.env import EnvState, advance, start
 from easi_jax.machine import Machine
 from easi_jax.model import Model
 from easi_jax.parameters import Parameter, ParameterSpace
@@ -90,18 +90,11 @@ class Cartpole:
         scale = jnp.array([0.1, 0.1, 0.2, 0.2])
         s = jax.random.uniform(key, (4,), minval=-scale, maxval=scale)
         physics = self.machine.start(s[:2], s[2:])
-        zero = jnp.zeros(())
-        return EnvState(
-            physics=physics,
-            obs=self.observe(physics),
-            reward=zero,
-            terminated=zero,
-            truncated=zero,
-            count=jnp.zeros((), jnp.int32),
-        )
+        return start(physics, self.observe(physics))
 
-    def control(self, action: jax.Array) -> jax.Array:
+    def control(self, state: EnvState, action: jax.Array) -> jax.Array:
         """The actuator's ctrl ``(1,)`` [m] for an action in [-1, 1]."""
+        del state
         return TARGET_RANGE * jnp.clip(action, -1.0, 1.0)
 
     def observe(self, physics: Physics) -> jax.Array:
@@ -111,19 +104,11 @@ class Cartpole:
 
     def step(self, model: Model, state: EnvState, action: jax.Array) -> EnvState:
         """One control step of 20 ms; never resets."""
-        physics = self.machine.step(model, state.physics, self.control(action))
+        physics = self.machine.step(model, state.physics, self.control(state, action))
         obs = self.observe(physics)
         x, v, angle, rate = obs
         failed = (jnp.abs(x) > FAIL_X) | (jnp.abs(angle) > FAIL_ANGLE)
         failed |= ~jnp.isfinite(obs).all()
         upright = 1 - angle**2 - 0.01 * jnp.abs(v) - 0.005 * jnp.abs(rate)
-        terminated = failed.astype(jnp.float32)
-        count = state.count + 1
-        return EnvState(
-            physics=physics,
-            obs=obs,
-            reward=jnp.where(failed, -2.0, upright),
-            terminated=terminated,
-            truncated=(count >= self.episode_length) * (1.0 - terminated),
-            count=count,
-        )
+        reward = jnp.where(failed, -2.0, upright)
+        return advance(state, physics, obs, reward, failed, self.episode_length)

@@ -8,7 +8,6 @@ from train._log_problem import FINISH, Problem, read_problem
 
 _STEPS = 500_000  # physics steps in a generation that are worth their time
 _PASSES = 3  # of the finish: the model's own error is learned from the one before
-_ROUNDS = 24  # of a pass
 _ROBUST = 12  # rounds of the first pass; later ones know which pieces fit badly
 _OUTLIER = 2.5  # times the median error: windows beyond it weigh less
 
@@ -147,7 +146,6 @@ def _finish(
             search.config.informed_spread,
             search.mesh,
             misfit,
-            _ROUNDS,
             robust,
         )
         model = machine.model(space.to_si(found.distribution.mean))

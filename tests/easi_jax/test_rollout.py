@@ -26,7 +26,7 @@ class Walker:
         done = (x[0] > 1.0).astype(jnp.float32)
         return EnvState(physics, x, zero, done, zero, count)
 
-    def control(self, action: jax.Array) -> jax.Array:
+    def control(self, state: Any, action: jax.Array) -> jax.Array:
         return 2 * action
 
     def step(self, model: Any, state: EnvState, action: jax.Array) -> EnvState:

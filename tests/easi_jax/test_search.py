@@ -66,7 +66,7 @@ class ServoEnv:
     def __init__(self, machine: Machine) -> None:
         self.machine = machine
 
-    def control(self, action: jax.Array) -> jax.Array:
+    def control(self, state: Any, action: jax.Array) -> jax.Array:
         return jnp.clip(action, -1, 1)
 
     def reset(self, model: Any, key: jax.Array) -> EnvState:
@@ -75,7 +75,7 @@ class ServoEnv:
         return EnvState(physics, s, zero, zero, zero, jnp.zeros((), jnp.int32))
 
     def step(self, model: Any, state: EnvState, action: jax.Array) -> EnvState:
-        p = self.machine.step(model, state.physics, self.control(action))
+        p = self.machine.step(model, state.physics, self.control(state, action))
         obs = jnp.concatenate([p.qpos, p.qvel])
         done = (jnp.abs(p.qpos[0]) > 0.22).astype(float)
         zero = jnp.zeros(())

@@ -74,7 +74,7 @@ def test_observation_is_position_speed_angle_rate(env: Cartpole) -> None:
 
 
 def test_action_is_a_cart_target_and_saturates(env: Cartpole, step: Any) -> None:
-    got = [float(env.control(jnp.array([a]))[0]) for a in (0.5, 1.0, 3.0, -3.0)]
+    got = [float(env.control(None, jnp.array([a]))[0]) for a in (0.5, 1.0, 3.0, -3.0)]
     np.testing.assert_allclose(got, [0.1, 0.2, 0.2, -0.2], rtol=1e-6)
     s = step(np.zeros((3, 4)), [[1.0], [5.0], [-1.0]])
     np.testing.assert_array_equal(s.obs[0], s.obs[1])

@@ -1,0 +1,260 @@
+"""Go2: a quadruped follows a velocity command on flat ground at 50 Hz.
+
+Parameters: EASI (NeurIPS 2024), section 4 and appendix A, which has no public Go2 code;
+robot figures are the maker's. Reward terms are the usual ones of legged locomotion
+(legged_gym, MuJoCo Playground), per step and not multiplied by its length.
+"""
+
+import itertools
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from easi_jax.env import EnvState, advance, start
+from easi_jax.errors import UserError, nearest
+from easi_jax.model import Model
+from easi_jax.physics import Physics
+from envs.frames import from_yaw, matrix
+from envs.robot import Robot, not_finite
+
+LEGS = ("FL", "FR", "RL", "RR")
+JOINTS = ("hip", "thigh", "calf")
+ACTION_SCALE = 0.5  # rad of joint target at action 1
+_FX = np.array([1.0, 1.0, -1.0, -1.0])
+_SY = np.array([1.0, -1.0, 1.0, -1.0])
+_UPPER = 0.213  # m, thigh and calf alike
+_FOOT = 0.022  # m, radius
+_SWING = 0.08  # m, height of a swinging foot
+_TOUCH = 0.004  # m above the floor within which a foot counts as touching
+
+_CLASSES = {
+    f"{joint}_{gain}": f"actuator.*_{joint}.{gain}"
+    for gain, joint in itertools.product(("kp", "kv"), JOINTS)
+}
+_EACH = {
+    f"{leg}_{joint}_{gain}": f"actuator.{leg}_{joint}.{gain}"
+    for gain, leg, joint in itertools.product(("kp", "kv"), LEGS, JOINTS)
+}
+_BASE = {"base_mass": "body.base.mass"}
+PARAMETERS = {
+    "default": {**_CLASSES, **_BASE, "ground_friction": "geom.floor.friction"},
+    "real": {**_CLASSES, **_BASE},
+    "full": {**_EACH, **_BASE},
+}
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Ranges that commands are drawn from, one for each episode."""
+
+    forward: tuple[float, float] = (-0.5, 1.0)
+    """Speed along x [m/s]."""
+    sideways: tuple[float, float] = (-0.3, 0.3)
+    """Speed along y [m/s]."""
+    turn: tuple[float, float] = (-0.7, 0.7)
+    """Rate about z [rad/s]."""
+    still: float = 0.1
+    """Share of episodes without any command to move."""
+
+
+class Memory(NamedTuple):
+    """What a Go2 episode carries.
+
+    Attributes:
+        command: forward, sideways [m/s], turn [rad/s], ``(3,)``.
+        last: the action before, ``(12,)``.
+        feet: positions of the feet in the world, ``(4, 3)`` [m].
+        air: time that each foot has been in the air, ``(4,)`` [s].
+    """
+
+    command: jax.Array
+    last: jax.Array
+    feet: jax.Array
+    air: jax.Array
+
+
+class Go2(Robot):
+    """Follow a command for 200 steps of 20 ms.
+
+    Observation ``(48,)``: linear [m/s] and angular [rad/s] velocity and gravity's
+    direction in the base's frame; 12 joint angles from the standing pose [rad] and
+    speeds [rad/s]; the 12 last actions; the command (m/s, m/s, rad/s). Action
+    ``(12,)``: joint targets about the standing pose, in units of 0.5 rad, legs FL, FR,
+    RL, RR.
+    The episode ends, with reward -1, where the base tips beyond 60 degrees or sinks
+    below 0.15 m.
+    """
+
+    name = "go2"
+    obs_size = 48
+    action_size = 12
+    dt = 0.02
+    k = 2.0
+
+    def __init__(
+        self,
+        parameters: str = "default",
+        commands: Commands | None = None,
+        episode_length: int = 200,
+    ) -> None:
+        """Builds the robot.
+
+        Args:
+            parameters: "default": 8, gains by kind of joint, base mass and friction;
+                "real": the same without friction; "full": 25, the gains of every
+                joint and base mass.
+            commands: what it is asked to do.
+            episode_length: control steps.
+
+        Raises:
+            UserError: unknown set of parameters.
+        """
+        if parameters not in PARAMETERS:
+            raise UserError(
+                f'unknown parameters "{parameters}" (known: {", ".join(PARAMETERS)})'
+                f"{nearest(parameters, PARAMETERS)}"
+            )
+        super().__init__(PARAMETERS[parameters])
+        self.commands = commands or Commands()
+        self.episode_length = episode_length
+        m = self.mj_model
+        self._stand = m.key_qpos[0].copy()
+        self._pose = self._stand[7:]
+        self._low, self._high = m.actuator_ctrlrange.T
+        self._limit = m.actuator_forcerange[:, 1]
+
+    def reset(self, model: Model, key: jax.Array) -> EnvState:
+        """Standing, turned anywhere, joints and speeds a little off."""
+        del model
+        k_yaw, k_joint, k_speed, k_command = jax.random.split(key, 4)
+        yaw = jax.random.uniform(k_yaw, minval=-jnp.pi, maxval=jnp.pi)
+        joints = self._pose + jax.random.uniform(
+            k_joint, (12,), minval=-0.1, maxval=0.1
+        )
+        qpos = jnp.concatenate([self._stand[:3], from_yaw(yaw), joints])
+        qvel = jax.random.uniform(k_speed, (18,), minval=-0.2, maxval=0.2)
+        physics = self.machine.start(qpos, qvel)
+        memory = Memory(
+            command=self.draw_command(k_command),
+            last=jnp.zeros(12),
+            feet=feet_in_world(qpos),
+            air=jnp.zeros(4),
+        )
+        return start(physics, self.observe(physics, memory), memory)
+
+    def draw_command(self, key: jax.Array) -> jax.Array:
+        """A command ``(3,)``."""
+        c = self.commands
+        k_move, k_still = jax.random.split(key)
+        low, high = jnp.array([c.forward, c.sideways, c.turn]).T
+        command = jax.random.uniform(k_move, (3,), minval=low, maxval=high)
+        return command * (jax.random.uniform(k_still) >= c.still)
+
+    def control(self, state: EnvState, action: jax.Array) -> jax.Array:
+        """Joint targets ``(12,)`` [rad] for an action in [-1, 1]."""
+        del state
+        return self._targets(jnp.clip(action, -1.0, 1.0))
+
+    def _targets(self, action: jax.Array) -> jax.Array:
+        return jnp.clip(self._pose + ACTION_SCALE * action, self._low, self._high)
+
+    def observe(self, physics: Physics, memory: Memory) -> jax.Array:
+        """Observation ``(48,)`` of a physics state."""
+        q, v = physics.qpos, physics.qvel
+        rotation = matrix(q[3:7])
+        return jnp.concatenate(
+            [
+                rotation.T @ v[:3],
+                v[3:6],
+                -rotation[2],
+                q[7:] - self._pose,
+                v[6:],
+                memory.last,
+                memory.command,
+            ]
+        )
+
+    def step(self, model: Model, state: EnvState, action: jax.Array) -> EnvState:
+        """One control step of 20 ms; never resets."""
+        action = jnp.clip(action, -1.0, 1.0)
+        physics = self.advance_physics(model, state, action)
+        before: Memory = state.memory
+        feet = feet_in_world(physics.qpos)
+        touching = feet[:, 2] < _FOOT + _TOUCH
+        memory = Memory(
+            command=before.command,
+            last=action,
+            feet=feet,
+            air=jnp.where(touching, 0.0, before.air + self.dt),
+        )
+        obs = self.observe(physics, memory)
+        tipped = matrix(physics.qpos[3:7])[2, 2] < 0.5
+        failed = tipped | (physics.qpos[2] < 0.15)
+        failed |= not_finite(physics.qpos, physics.qvel)
+        reward = self.reward(model, physics, memory, before, touching)
+        reward = jnp.where(failed, -1.0, reward)
+        return advance(state, physics, obs, reward, failed, self.episode_length, memory)
+
+    def reward(
+        self,
+        model: Model,
+        physics: Physics,
+        memory: Memory,
+        before: Memory,
+        touching: jax.Array,
+    ) -> jax.Array:
+        """At most 1: tracking of the command, less what spoils a gait; not below 0."""
+        q, v = physics.qpos, physics.qvel
+        rotation = matrix(q[3:7])
+        speed, rate = rotation.T @ v[:3], v[3:6]
+        command = memory.command
+        moving = jnp.linalg.norm(command) > 0.1
+        track = jnp.exp(-jnp.sum((command[:2] - speed[:2]) ** 2) / 0.25)
+        turn = jnp.exp(-((command[2] - rate[2]) ** 2) / 0.25)
+        gain = model.mjx.actuator_gainprm[:, 0], model.mjx.actuator_biasprm[:, 2]
+        target = self._targets(memory.last)
+        torque = gain[0] * (target - q[7:]) + gain[1] * v[6:]
+        torque = jnp.clip(torque, -self._limit, self._limit)
+        shift = jnp.linalg.norm(memory.feet[:, :2] - before.feet[:, :2], axis=1)
+        foot_speed = shift / self.dt
+        landed = touching & (before.air > 0)
+        swing = jnp.abs(memory.feet[:, 2] - _FOOT - _SWING) * jnp.sqrt(foot_speed)
+        airtime = jnp.sum((before.air - 0.1) * landed) * moving
+        cost = (
+            0.5 * speed[2] ** 2
+            + 0.05 * jnp.sum(rate[:2] ** 2)
+            + 5.0 * jnp.sum(rotation[2, :2] ** 2)
+            + 2e-4 * jnp.sum(torque**2)
+            + 0.01 * jnp.sum((memory.last - before.last) ** 2)
+            + 1e-3 * jnp.sum(jnp.abs(torque * v[6:]))
+            + 0.1 * jnp.sum(foot_speed**2 * touching)
+            + 0.5 * jnp.sum(swing * ~touching)
+            + jnp.where(moving, 0.0, 0.5) * jnp.sum(jnp.abs(q[7:] - self._pose))
+        )
+        return jnp.maximum(0.0, (track + 0.5 * turn + airtime - cost) / 1.5)
+
+
+def feet_in_base(joints: jax.Array) -> jax.Array:
+    """Centers of the feet in the base's frame ``(4, 3)`` [m], from 12 joint angles."""
+    hip, thigh, calf = joints.reshape(4, 3).T
+    knee = thigh + calf
+    foot = jnp.array([-0.002, -_UPPER])  # x, z in the calf's frame
+    x = -_UPPER * jnp.sin(thigh) + foot[0] * jnp.cos(knee) + foot[1] * jnp.sin(knee)
+    z = -_UPPER * jnp.cos(thigh) - foot[0] * jnp.sin(knee) + foot[1] * jnp.cos(knee)
+    y = 0.0955 * _SY
+    return jnp.stack(
+        [
+            0.1934 * _FX + x,
+            0.0465 * _SY + y * jnp.cos(hip) - z * jnp.sin(hip),
+            y * jnp.sin(hip) + z * jnp.cos(hip),
+        ],
+        axis=1,
+    )
+
+
+def feet_in_world(qpos: jax.Array) -> jax.Array:
+    """Centers of the feet in the world ``(4, 3)`` [m]."""
+    return qpos[:3] + feet_in_base(qpos[7:]) @ matrix(qpos[3:7]).T

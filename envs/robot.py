@@ -1,0 +1,79 @@
+"""What the built-in robots share: model file, parameters, machine."""
+
+from importlib import resources
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from easi_jax.env import EnvState
+from easi_jax.machine import Machine
+from easi_jax.model import Model
+from easi_jax.parameters import ParameterSpace, declare
+from easi_jax.physics import Physics
+
+_FACTOR = 1e3  # of the nominal value, that bounds allow either way
+
+
+class Robot:
+    """A built-in robot; subclasses say what it observes and what it is asked to do.
+
+    Attributes:
+        mj_model: the robot in MuJoCo.
+        space: its parameters; a search starts in [nominal / k, k nominal].
+        machine: how it is simulated.
+    """
+
+    name: str
+    obs_size: int
+    action_size: int
+    episode_length: int
+    dt: float
+    k: float = 3.0
+
+    def __init__(self, addresses: dict[str, str]) -> None:
+        path = resources.files("envs") / "assets" / f"{self.name}.xml"
+        self.mj_model = mujoco.MjModel.from_xml_string(path.read_text())
+        self.space = parameter_space(self.mj_model, addresses, self.k)
+        self.machine = Machine(self.mj_model, self.space, self.dt)
+
+    def model(self, theta: jax.Array | None = None) -> Model:
+        """The model at ``theta (n,)`` in SI units; nominal without it."""
+        return self.machine.model(
+            jnp.asarray(self.space.nominal) if theta is None else theta
+        )
+
+    def control(self, state: EnvState, action: jax.Array) -> jax.Array:
+        """What ``step`` sends to the actuators, ``(nu,)``."""
+        raise NotImplementedError
+
+    def advance_physics(
+        self, model: Model, state: EnvState, action: jax.Array
+    ) -> Physics:
+        """The physics after a control step."""
+        return self.machine.step(model, state.physics, self.control(state, action))
+
+
+def parameter_space(
+    mj_model: mujoco.MjModel, addresses: dict[str, str], k: float
+) -> ParameterSpace:
+    """Parameters by name and address, nominal values from the model."""
+
+    def one(name: str, address: str) -> Any:
+        p = declare(mj_model, name, address)
+        low = 0.0 if "friction" in name else p.nominal / _FACTOR
+        return declare(
+            mj_model,
+            name,
+            address,
+            initial=(p.nominal / k, p.nominal * k),
+            bounds=(low, _FACTOR * p.nominal),
+        )
+
+    return ParameterSpace(tuple(one(n, a) for n, a in addresses.items()))
+
+
+def not_finite(*arrays: jax.Array) -> jax.Array:
+    """Whether any number is not finite, ``()`` bool."""
+    return ~jnp.stack([jnp.isfinite(a).all() for a in arrays]).all()
