@@ -44,17 +44,17 @@ def run(config: Config) -> None:
     from easi_jax.runtime import fast_loops
     from easi_jax.search_config import preset
     from envs import make
-    from train._robots import sac_config
+    from train._robots import training_config
 
     env = make("cartpole")
     sac = dataclasses.replace(
-        sac_config("cartpole", config.env_steps), evaluate_every=0
+        training_config("cartpole", config.env_steps), evaluate_every=0
     )
     pipe = Pipeline(
         env,
         PipelineConfig(
             search=preset("default", policy_updates_per_generation=config.joint),
-            sac=sac,
+            training=sac,
             refine=True,
         ),
     )

@@ -23,8 +23,8 @@ from easi_jax.parameters import ParameterSpace
 from easi_jax.rl.config import SacConfig
 from easi_jax.rl.evaluate import evaluate
 from easi_jax.rl.networks import PolicyParams, act
-from easi_jax.rl.sac import Sac
 from easi_jax.rl.seeds import init_seeds, run_seeds
+from easi_jax.rl.trainer import TrainingConfig, make_trainer
 from easi_jax.rollout import collect, measured
 from easi_jax.search import Search, SearchData, SearchInfo, SearchState
 from easi_jax.search_config import SearchConfig
@@ -37,7 +37,7 @@ class PipelineConfig:
 
     search: SearchConfig = field(default_factory=SearchConfig)
     """The search."""
-    sac: SacConfig = field(default_factory=SacConfig)
+    training: TrainingConfig = field(default_factory=SacConfig)
     """Policy training, the same budget for UDR, final policy and Oracle."""
     trajectories: int = 200
     """Demonstration trajectories recorded in the target."""
@@ -119,13 +119,13 @@ class Pipeline:
         self.env, self.config, self.mesh = env, config, mesh or make_mesh()
         space = env.space if start is None else env.space.scaled(*start)
         self.machine = Machine(env.mj_model, space, env.dt)
-        self.sac = Sac(env, config.sac, env.model, self._draw)
+        self.trainer = make_trainer(env, config.training, env.model, self._draw)
         self.search = Search(
             self.machine,
             config.search,
             env=env,
             act=lambda policy, obs, key: act(policy, obs, key),
-            trainer=self.sac.step,
+            trainer=self.trainer.step,
             mesh=self.mesh,
         )
         self.space = self.search.space
@@ -153,7 +153,7 @@ class Pipeline:
 
     def train_init(self, keys: jax.Array, dist: Distribution) -> Any:
         """Fresh training states, ``(S, ...)``; ``dist`` has a leading axis S."""
-        return init_seeds(self.sac, keys, dist, 0, self.mesh)
+        return init_seeds(self.trainer, keys, dist, 0, self.mesh)
 
     def train_chunk(
         self, states: Any, dist: Distribution, target: jax.Array, n: int
@@ -164,12 +164,12 @@ class Pipeline:
         compiled program.
         """
         return run_seeds(
-            self.sac, states, dist, n, self.point(target), 0, None, self.mesh
+            self.trainer, states, dist, n, self.point(target), 0, None, self.mesh
         )
 
     def policies(self, states: Any) -> PolicyParams:
         """Policies of training states, ``(S, ...)``."""
-        return jax.vmap(self.sac.policy)(states)
+        return jax.vmap(self.trainer.policy)(states)
 
     def demonstrate(
         self, policies: PolicyParams, target: jax.Array, keys: jax.Array
@@ -275,7 +275,7 @@ class Pipeline:
             ``(S, episodes)`` in the target; ``udr_history``, ``easi_history``;
             ``search``: SearchInfo; ``estimate``: Estimate.
         """
-        n = self.config.sac.iterations
+        n = self.config.training.iterations
         k = stage_keys(keys)
         wide = self.spread(self.udr(), len(keys))
         first, udr_history = self.train_chunk(
@@ -317,9 +317,9 @@ class Pipeline:
         """Steps of final training; those made inside the search are taken off."""
         c = self.config.search
         if not self.search.trainer:
-            return self.config.sac.iterations
+            return self.config.training.iterations
         done = c.policy_updates_per_generation * c.generations
-        return max(1, self.config.sac.iterations - done)
+        return max(1, self.config.training.iterations - done)
 
 
 STAGES = ("udr", "demonstrate", "search", "final", "evaluate", "oracle")

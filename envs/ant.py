@@ -65,6 +65,7 @@ class Ant(Robot):
     action_size = 8
     episode_length = 200
     dt = 1 / 60
+    default_target = ("torso_mass*0.5",)
 
     def __init__(self) -> None:
         super().__init__(ADDRESSES)

@@ -47,6 +47,7 @@ class Ballbalance(Robot):
     action_size = 3
     episode_length = 500
     dt = 0.1
+    default_target = ("ball_mass*0.5",)
 
     def __init__(self, episode_length: int = 500) -> None:
         super().__init__(ADDRESSES)

@@ -70,12 +70,12 @@ class Cartpole:
     action_size = 1
     episode_length = 200
     dt = 0.02
-    randomization = 3.0
+    default_target = ("cart_kp*0.5",)
 
     def __init__(self) -> None:
         path = resources.files("envs") / "assets" / "cartpole.xml"
         self.mj_model = mujoco.MjModel.from_xml_string(path.read_text())
-        self.space = space(self.randomization)
+        self.space = space()
         self.machine = Machine(self.mj_model, self.space, self.dt)
 
     def model(self, theta: jax.Array | None = None) -> Model:

@@ -93,6 +93,7 @@ class Go2(Robot):
     action_size = 12
     dt = 0.02
     k = 2.0
+    default_target = ("thigh_kp*0.5",)
 
     def __init__(
         self,

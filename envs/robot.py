@@ -23,6 +23,7 @@ class Robot:
         mj_model: the robot in MuJoCo.
         space: its parameters; a search starts in [nominal / k, k nominal].
         machine: how it is simulated.
+        default_target: how the pseudo-real robot differs where nothing else is said.
     """
 
     name: str
@@ -31,6 +32,7 @@ class Robot:
     episode_length: int
     dt: float
     k: float = 3.0
+    default_target: tuple[str, ...] = ()
 
     def __init__(self, addresses: dict[str, str]) -> None:
         path = resources.files("envs") / "assets" / f"{self.name}.xml"

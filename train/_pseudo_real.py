@@ -44,7 +44,8 @@ def run(config: "Config") -> None:
             f"{list(udr['seeds'])}"
         )
     env = make(udr["robot"])
-    theta = target_parameters(env.space, config.target)
+    changes = env.default_target if config.target is None else config.target
+    theta = target_parameters(env.space, changes)
     noisy = any(x > 0 for x in config.noise)
     horizon = steps_of(config.horizon, env.dt, noisy)
     search = search_config(
@@ -59,7 +60,7 @@ def run(config: "Config") -> None:
         env,
         PipelineConfig(
             search=search,
-            sac=udr["sac"],
+            training=udr["training"],
             trajectories=config.trajectories,
             noise=config.noise,
             refine=config.refine,
@@ -116,7 +117,7 @@ def run(config: "Config") -> None:
                 config.chunk,
                 first,
                 lambda s, n: step(s, dist, target, n),
-                training_rows(seeds, pipe.sac.config.num_envs),
+                training_rows(seeds, pipe.trainer.config.steps_per_iteration),
                 notes,
             )
 
@@ -133,7 +134,7 @@ def run(config: "Config") -> None:
                 "oracle",
                 many,
                 lambda: pipe.train_init(keys["oracle"], many),
-                pipe.config.sac.iterations,
+                pipe.config.training.iterations,
             )
             trained["Oracle"] = pipe.policies(oracle)
         for name, policy in trained.items():
@@ -146,7 +147,7 @@ def run(config: "Config") -> None:
         errors = held_out_errors(pipe, estimate, theta, policies, keys["evaluate"])
         curves = {"EASI": training_curve(folder.path, "final", seeds)}
         udr_steps = training_curve(config.udr, "train", seeds)
-        if udr["config"]["target"] == list(config.target):
+        if udr["config"]["target"] == list(changes):
             curves = {"UDR": udr_steps, **curves}
         if config.oracle:
             curves["Oracle"] = training_curve(folder.path, "oracle", seeds)
@@ -155,7 +156,7 @@ def run(config: "Config") -> None:
         rows = write_pseudo_real(
             folder, pipe, estimate, theta, seeds, returns, errors, curves, notes
         )
-    names = ", ".join(config.target) or "nominal"
+    names = ", ".join(changes) or "nominal"
     show_table(
         f"Return in the target ({names})",
         ("method", "median", *(f"seed {s}" for s in seeds)),

@@ -131,6 +131,7 @@ def write_pseudo_real(
         write_report,
     )
     from easi_jax.io.versions import versions
+    from easi_jax.rl.presets import algorithm_of
 
     space, config = pipe.space, pipe.config
     dist = estimate.distribution
@@ -161,7 +162,8 @@ def write_pseudo_real(
         {
             "robot": pipe.env.name,
             "seeds": list(seeds),
-            "env_steps": config.sac.env_steps,
+            "env_steps": config.training.env_steps,
+            "algorithm": algorithm_of(config.training),
             "methods": list(returns),
             "returns": {k: per_seed_json(seeds, v) for k, v in returns.items()},
             "held_out": shares,

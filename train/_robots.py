@@ -5,13 +5,15 @@ from pathlib import Path
 from typing import Any
 
 
-def sac_config(robot: str, env_steps: int | None = None) -> Any:
-    """SAC settings of a robot, with another budget where given."""
+def training_config(
+    robot: str, env_steps: int | None = None, algorithm: str | None = None
+) -> Any:
+    """Training settings of a robot, with another budget or algorithm where given."""
     from dataclasses import replace
 
-    from easi_jax.rl.presets import sac_preset
+    from easi_jax.rl.presets import training_preset
 
-    config = sac_preset(robot)
+    config = training_preset(robot, algorithm)
     return config if env_steps is None else replace(config, env_steps=env_steps)
 
 
@@ -87,7 +89,7 @@ def load_policies(folder: Path, method: str | None = None) -> dict[str, Any]:
         method: UDR, EASI or Oracle; the run's own where not given.
 
     Returns:
-        ``robot``, ``seeds``, ``sac``, ``method`` and ``policies`` ``(S, ...)``.
+        ``robot``, ``seeds``, ``training``, ``method`` and ``policies`` ``(S, ...)``.
 
     Raises:
         UserError: no finished run, or none of that method.
@@ -117,8 +119,10 @@ def load_policies(folder: Path, method: str | None = None) -> dict[str, Any]:
             f"{', '.join(result['methods'])}){nearest(chosen, result['methods'])}"
         )
     robot, seeds = result["robot"], tuple(result["seeds"])
-    sac = sac_config(robot, result["env_steps"])
-    pipe = Pipeline(make(robot), PipelineConfig(sac=sac))
+    training = training_config(
+        robot, result["env_steps"], result.get("algorithm", "sac")
+    )
+    pipe = Pipeline(make(robot), PipelineConfig(training=training))
     keys = jax.random.split(jax.random.key(0), len(seeds))
     target = jax.eval_shape(
         lambda k: pipe.policies(
@@ -132,7 +136,7 @@ def load_policies(folder: Path, method: str | None = None) -> dict[str, Any]:
     return {
         "robot": robot,
         "seeds": seeds,
-        "sac": sac,
+        "training": training,
         "method": chosen,
         "policies": found.state,
     }
@@ -160,8 +164,10 @@ def load_udr(folder: Path) -> dict[str, Any]:
             f"{folder} holds an unfinished run of train.udr: finish it with --resume"
         )
     env = make(config["robot"])
-    sac = sac_config(config["robot"], config["env_steps"])
-    pipe = Pipeline(env, PipelineConfig(sac=sac))
+    training = training_config(
+        config["robot"], config["env_steps"], config.get("algorithm")
+    )
+    pipe = Pipeline(env, PipelineConfig(training=training))
     seeds = tuple(int(s) for s in config["seeds"])
     keys = seed_keys(list(seeds))
     wide = pipe.spread(pipe.udr(), len(seeds))
@@ -174,7 +180,7 @@ def load_udr(folder: Path) -> dict[str, Any]:
     return {
         "robot": config["robot"],
         "seeds": seeds,
-        "sac": sac,
+        "training": training,
         "states": found.state,
         "config": config,
     }

@@ -46,7 +46,7 @@ def run(config: Config) -> None:
     env = make(saved["robot"])
     theta = target_parameters(env.space, config.target)
     pipe = Pipeline(
-        env, PipelineConfig(sac=saved["sac"], eval_episodes=config.episodes)
+        env, PipelineConfig(training=saved["training"], eval_episodes=config.episodes)
     )
     key = jax.random.key(config.seed)
     keys = jax.random.split(key, len(saved["seeds"]))

@@ -26,10 +26,13 @@ class Config:
     NAME*FACTOR or NAME=VALUE."""
     env_steps: int | None = None
     """Control steps of training; the robot's preset where not given."""
+    algorithm: str | None = None
+    """sac or ppo; the robot's own where not given."""
     eval_episodes: int = 100
     """Episodes of the final evaluation."""
     chunk: int = 500
-    """Steps of all environments between checkpoints."""
+    """Iterations between checkpoints: steps of all environments (sac) or unrolls
+    (ppo)."""
     resume: bool = False
     """Go on with the run in the folder."""
     overwrite: bool = False
@@ -39,7 +42,7 @@ class Config:
 def run(config: Config) -> None:
     """Trains, evaluates and writes the run folder."""
     from train._results import per_seed_json
-    from train._robots import check_chunk, check_seeds, sac_config, save_policies
+    from train._robots import check_chunk, check_seeds, save_policies, training_config
 
     check_seeds(config.seeds)
     check_chunk(config.chunk)
@@ -58,13 +61,16 @@ def run(config: Config) -> None:
         stage_keys,
         target_parameters,
     )
+    from easi_jax.rl.presets import algorithm_of
     from envs import make
     from train._stages import jit_chunks, run_stage, training_curve, training_rows
 
     env = make(config.robot)
-    sac = sac_config(config.robot, config.env_steps)
+    training = training_config(config.robot, config.env_steps, config.algorithm)
     theta = target_parameters(env.space, config.target)
-    pipe = Pipeline(env, PipelineConfig(sac=sac, eval_episodes=config.eval_episodes))
+    pipe = Pipeline(
+        env, PipelineConfig(training=training, eval_episodes=config.eval_episodes)
+    )
     target = jnp.asarray(theta, jnp.float32)
     keys = stage_keys(seed_keys(list(config.seeds)))
     with RunFolder.open(
@@ -82,11 +88,11 @@ def run(config: Config) -> None:
         states = run_stage(
             folder,
             "train",
-            sac.iterations,
+            training.iterations,
             config.chunk,
             lambda: pipe.train_init(keys["udr"], wide),
             lambda s, n: step(s, wide, target, n),
-            training_rows(config.seeds, sac.num_envs),
+            training_rows(config.seeds, training.steps_per_iteration),
             notes,
         )
         policies = pipe.policies(states)
@@ -96,7 +102,8 @@ def run(config: Config) -> None:
         results = {
             "robot": config.robot,
             "seeds": list(config.seeds),
-            "env_steps": sac.env_steps,
+            "env_steps": training.env_steps,
+            "algorithm": algorithm_of(training),
             "methods": ["UDR"],
             "target": dict(zip(env.space.names, theta.tolist(), strict=True)),
             "returns": {"UDR": per_seed_json(config.seeds, per_seed)},

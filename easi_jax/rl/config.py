@@ -1,6 +1,7 @@
-"""Settings of SAC; the defaults are those of EASI's reference on Cartpole."""
+"""Settings of SAC (defaults: EASI's reference on Cartpole) and of PPO."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from easi_jax.errors import UserError
 
@@ -65,30 +66,27 @@ class SacConfig:
 
     def __post_init__(self) -> None:
         whole = ("env_steps", "num_envs", "updates_per_step", "batch_size", "eval_envs")
-        for name in (*whole, "buffer_size"):
-            if getattr(self, name) < 1:
-                self._refuse(name, "needs at least 1")
-        for name in ("random_steps", "evaluate_every"):
-            if getattr(self, name) < 0:
-                self._refuse(name, "needs 0 or more")
-        for name in ("learning_rate", "learning_rate_decay", "initial_temperature"):
-            if not getattr(self, name) > 0:
-                self._refuse(name, "needs a number above 0")
-        for name in ("discount", "tau"):
-            if not 0 <= getattr(self, name) <= 1:
-                self._refuse(name, "needs a number from 0 to 1")
-        if not self.hidden or min(self.hidden) < 1:
-            self._refuse("hidden", "needs at least one layer of at least one unit")
+        _check(
+            self,
+            "SAC",
+            counts=(*whole, "buffer_size"),
+            none_or_more=("random_steps", "evaluate_every"),
+            positive=("learning_rate", "learning_rate_decay", "initial_temperature"),
+            shares=("discount", "tau"),
+        )
         if self.random_steps >= self.env_steps:
-            self._refuse("random_steps", f"needs less than env_steps={self.env_steps}")
-
-    def _refuse(self, name: str, need: str) -> None:
-        raise UserError(f"SAC setting {name}={getattr(self, name)}: it {need}")
+            need = f"needs less than env_steps={self.env_steps}"
+            _refuse(self, "SAC", "random_steps", need)
 
     @property
     def iterations(self) -> int:
         """Steps of all environments that ``env_steps`` takes, rounded up."""
         return -(-self.env_steps // self.num_envs)
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Environment steps of one of them."""
+        return self.num_envs
 
     @property
     def random_iterations(self) -> int:
@@ -100,3 +98,114 @@ class SacConfig:
         """Transitions that the buffer holds; never more than are collected."""
         wanted = min(self.buffer_size, self.iterations * self.num_envs)
         return -(-wanted // self.num_envs) * self.num_envs
+
+
+@dataclass(frozen=True)
+class PpoConfig:
+    """Proximal policy optimization. Raises UserError for values that cannot work."""
+
+    env_steps: int = 1_000_000
+    """Environment steps in all."""
+
+    num_envs: int = 256
+    """Environments that step together."""
+
+    unroll: int = 20
+    """Control steps between updates."""
+
+    minibatches: int = 4
+    """Parts that the environments are split into; each makes a gradient update."""
+
+    epochs: int = 4
+    """Times that each unroll is gone through."""
+
+    hidden: tuple[int, ...] = (64, 64)
+    """Hidden layer sizes of policy and value."""
+
+    learning_rate: float = 1e-3
+    """Of Adam."""
+
+    learning_rate_decay: float = 1.0
+    """Factor on the learning rate that is reached at `env_steps`, linearly."""
+
+    max_gradient: float = 1.0
+    """Norm that gradients are cut to."""
+
+    discount: float = 0.99
+    """Per control step."""
+
+    gae_lambda: float = 0.95
+    """Of the generalized advantages."""
+
+    clipping: float = 0.2
+    """Change of an action's probability beyond which there is nothing to gain."""
+
+    entropy_cost: float = 1e-3
+    """Weight of the entropy."""
+
+    reward_scaling: float = 1.0
+    """Factor on rewards inside the losses; reported returns are unscaled."""
+
+    normalize_observations: bool = True
+    """Standardize observations by running statistics."""
+
+    evaluate_every: int = 0
+    """Evaluate the policy after every so many unrolls; 0: never."""
+
+    eval_envs: int = 32
+    """Episodes of an evaluation."""
+
+    def __post_init__(self) -> None:
+        _check(
+            self,
+            "PPO",
+            counts=(
+                *("env_steps", "num_envs", "unroll", "minibatches"),
+                *("epochs", "eval_envs"),
+            ),
+            none_or_more=("evaluate_every", "entropy_cost"),
+            positive=("learning_rate", "learning_rate_decay", "max_gradient"),
+            shares=("discount", "gae_lambda", "clipping"),
+        )
+        if self.num_envs % self.minibatches:
+            need = f"needs a divisor of num_envs={self.num_envs}"
+            _refuse(self, "PPO", "minibatches", need)
+
+    @property
+    def iterations(self) -> int:
+        """Unrolls of all environments that ``env_steps`` takes, rounded up."""
+        return -(-self.env_steps // self.steps_per_iteration)
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Environment steps of one of them."""
+        return self.num_envs * self.unroll
+
+
+def _check(
+    config: Any,
+    kind: str,
+    counts: tuple[str, ...],
+    none_or_more: tuple[str, ...],
+    positive: tuple[str, ...],
+    shares: tuple[str, ...],
+) -> None:
+    rules = (
+        (counts, lambda x: x >= 1, "needs at least 1"),
+        (none_or_more, lambda x: x >= 0, "needs 0 or more"),
+        (positive, lambda x: x > 0, "needs a number above 0"),
+        (shares, lambda x: 0 <= x <= 1, "needs a number from 0 to 1"),
+        (
+            ("hidden",),
+            lambda x: bool(x) and min(x) >= 1,
+            "needs at least one layer of at least one unit",
+        ),
+    )
+    for names, holds, need in rules:
+        for name in names:
+            if not holds(getattr(config, name)):
+                _refuse(config, kind, name, need)
+
+
+def _refuse(config: Any, kind: str, name: str, need: str) -> None:
+    raise UserError(f"{kind} setting {name}={getattr(config, name)}: it {need}")

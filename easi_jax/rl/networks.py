@@ -25,7 +25,8 @@ class PolicyParams:
     network: Any
 
 
-def _standardize(observation: Any, preprocessor_params: Any) -> Any:
+def standardize(observation: Any, preprocessor_params: Any) -> Any:
+    """Observations less their mean, over their standard deviation."""
     return running_statistics.normalize(observation, preprocessor_params)
 
 
@@ -39,7 +40,7 @@ def make_networks(
     return sac_networks.make_sac_networks(
         obs_size,
         action_size,
-        preprocess_observations_fn=_standardize,
+        preprocess_observations_fn=standardize,
         hidden_layer_sizes=hidden,
         q_network_layer_norm=critic_layer_norm,
         # brax hands its keyword dict over as the first argument.
@@ -56,7 +57,7 @@ def act(
     """Action in (-1, 1), ``(..., action_size)``, for ``obs`` ``(..., obs_size)``.
 
     Args:
-        policy: from ``Sac.policy`` or a checkpoint.
+        policy: from a trainer's ``policy`` or a checkpoint.
         obs: observations.
         key: for the sample; not needed where ``deterministic``.
         deterministic: the mode instead of a sample.
@@ -71,7 +72,7 @@ def act(
     network = networks.make_policy_network(
         param_size,
         policy.mean.shape[-1],
-        preprocess_observations_fn=_standardize,
+        preprocess_observations_fn=standardize,
         hidden_layer_sizes=hidden,
     )
     statistics = running_statistics.NestedMeanStd(policy.mean, policy.std)

@@ -1,9 +1,15 @@
-"""Training settings of the built-in robots, chosen by measurement on two cores."""
+"""Training settings of the built-in robots, chosen for two CPU cores.
+
+The first algorithm of a robot is its default.
+"""
+
+from dataclasses import replace
 
 from easi_jax.errors import UserError, nearest
-from easi_jax.rl.config import SacConfig
+from easi_jax.rl.config import PpoConfig, SacConfig
+from easi_jax.rl.trainer import TrainingConfig
 
-CARTPOLE = SacConfig(
+_SAC = SacConfig(
     env_steps=100_000,
     num_envs=100,
     random_steps=2_000,
@@ -18,19 +24,57 @@ CARTPOLE = SacConfig(
     discount=0.99,
     evaluate_every=100,
 )
+_PPO = PpoConfig(
+    env_steps=2_000_000,
+    num_envs=256,
+    unroll=20,
+    minibatches=4,
+    epochs=4,
+    hidden=(64, 64),
+    learning_rate=1e-3,
+    learning_rate_decay=0.1,
+    evaluate_every=20,
+)
 
-PRESETS = {"cartpole": CARTPOLE}
+PRESETS: dict[str, dict[str, TrainingConfig]] = {
+    "cartpole": {"sac": _SAC, "ppo": _PPO},
+    "ant": {
+        "ppo": replace(_PPO, hidden=(128, 64), env_steps=4_000_000),
+        "sac": replace(_SAC, hidden=(128, 128), env_steps=400_000),
+    },
+    "ballbalance": {
+        "sac": replace(_SAC, hidden=(128, 128), env_steps=300_000),
+        "ppo": replace(_PPO, env_steps=1_000_000),
+    },
+    "go2": {
+        "ppo": replace(_PPO, hidden=(128, 64), env_steps=6_000_000, entropy_cost=5e-3),
+        "sac": replace(_SAC, hidden=(128, 128), env_steps=500_000),
+    },
+}
 
 
-def sac_preset(robot: str) -> SacConfig:
-    """Settings of a built-in robot.
+def training_preset(robot: str, algorithm: str | None = None) -> TrainingConfig:
+    """Settings of a built-in robot, for its own or another algorithm.
 
     Raises:
-        UserError: no robot of that name.
+        UserError: no robot or no algorithm of that name.
     """
     if robot not in PRESETS:
         known = ", ".join(sorted(PRESETS))
         raise UserError(
             f'unknown robot "{robot}" (known: {known}){nearest(robot, PRESETS)}'
         )
-    return PRESETS[robot]
+    mine = PRESETS[robot]
+    if algorithm is None:
+        return next(iter(mine.values()))
+    if algorithm not in mine:
+        raise UserError(
+            f'unknown algorithm "{algorithm}" (known: {", ".join(mine)})'
+            f"{nearest(algorithm, mine)}"
+        )
+    return mine[algorithm]
+
+
+def algorithm_of(config: TrainingConfig) -> str:
+    """The name under which presets know an algorithm."""
+    return "ppo" if isinstance(config, PpoConfig) else "sac"

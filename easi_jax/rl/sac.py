@@ -24,7 +24,7 @@ from brax.training.acme import running_statistics
 from easi_jax.env import Env, EnvState, Model
 from easi_jax.rl.buffer import RingQueue
 from easi_jax.rl.config import SacConfig
-from easi_jax.rl.evaluate import evaluate
+from easi_jax.rl.episodes import Episodes, finite, mean_where, raw_key
 from easi_jax.rl.learner import Info, Learner, LearnerState
 from easi_jax.rl.networks import PolicyParams, act
 
@@ -74,7 +74,7 @@ class Sac:
                 is any pytree of arrays.
         """
         self.env, self.config = env, config
-        self._bind, self._draw = bind, draw
+        self._episodes = Episodes(env, bind, draw, config.num_envs, config.eval_envs)
         self._learner = Learner(config, env.obs_size, env.action_size)
         obs, zero = jnp.zeros(env.obs_size), jnp.zeros(())
         self._buffer = RingQueue(
@@ -86,26 +86,16 @@ class Sac:
     def init(self, key: jax.Array, dist: Any) -> SacState:
         """The state before the first step; ``key`` is a typed or raw PRNG key."""
         n = self.config.num_envs
-        if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
-            key = jax.random.key_data(key)
+        key = raw_key(key)
         key, k_learner, k_buffer = jax.random.split(key, 3)
         normalizer = running_statistics.init_state(jnp.zeros(self.env.obs_size))
 
-        def episode(key: jax.Array) -> tuple[Any, EnvState]:
-            theta = self._draw(dist, key)
-            return theta, self.env.reset(self._bind(theta), key)
-
-        # Every environment starts as finished, so that the first step resets it:
-        # a program holds one reset only, and compiles faster.
-        theta, envs = jax.tree.map(
-            lambda x: jnp.zeros((n, *x.shape), x.dtype),
-            jax.eval_shape(episode, k_buffer),
-        )
+        envs, theta = self._episodes.unborn(dist, k_buffer)
         return SacState(
             learner=self._learner.init(k_learner),
             normalizer=replace(normalizer, std_eps=jnp.zeros(())),
             buffer=self._buffer.init(k_buffer),
-            envs=replace(envs, terminated=jnp.ones_like(envs.terminated)),
+            envs=envs,
             theta=theta,
             returns=jnp.zeros(n),
             key=key,
@@ -152,7 +142,10 @@ class Sac:
         key, k_reset, k_move, k_learn, k_eval = jax.random.split(
             jax.random.wrap_key_data(state.key), 5
         )
-        state = self._reset_finished(state, dist, k_reset)
+        envs, theta, returns = self._episodes.reset_finished(
+            state.envs, state.theta, state.returns, dist, k_reset
+        )
+        state = replace(state, envs=envs, theta=theta, returns=returns)
         learning = state.iteration >= config.random_iterations
         state, info = self._move(state, k_move, learning)
 
@@ -181,8 +174,21 @@ class Sac:
         if config.evaluate_every:
             due = state.iteration % config.evaluate_every == 0
             target = dist if eval_dist is None else eval_dist
-            info |= self._evaluate(self.policy(state), target, k_eval, due)
+            info |= self._episodes.evaluate(self.policy(state), target, k_eval, due)
         return state, info
+
+    @staticmethod
+    def clock(state: SacState) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Counters that are the same for all seeds (see `easi_jax.rl.seeds`)."""
+        buffer = state.buffer
+        return state.iteration, buffer.insert_position, buffer.sample_position
+
+    @staticmethod
+    def with_clock(state: SacState, clock: tuple[jax.Array, ...]) -> SacState:
+        """The state with other counters."""
+        iteration, insert, sample = clock
+        buffer = replace(state.buffer, insert_position=insert, sample_position=sample)
+        return replace(state, iteration=iteration, buffer=buffer)
 
     def run_chunk(
         self, state: SacState, dist: Any, n: int, eval_dist: Any = None
@@ -197,26 +203,10 @@ class Sac:
         state = self.init(key, dist)
         return self.run_chunk(state, dist, self.config.iterations, eval_dist)
 
-    def _reset_finished(self, state: SacState, dist: Any, key: jax.Array) -> SacState:
-        envs = state.envs
-        done = ~_finite(envs) | (envs.terminated + envs.truncated > 0)
-        k_draw, k_reset = jax.random.split(key)
-        drawn = jax.vmap(self._draw, (None, 0))(dist, self._each(k_draw))
-        theta = _where(done, drawn, state.theta)
-        fresh = jax.vmap(self.env.reset)(
-            jax.vmap(self._bind)(theta), self._each(k_reset)
-        )
-        return replace(
-            state,
-            theta=theta,
-            envs=_where(done, fresh, envs),
-            returns=jnp.where(done, 0.0, state.returns),
-        )
-
     def _move(
         self, state: SacState, key: jax.Array, learning: jax.Array
     ) -> tuple[SacState, Info]:
-        envs, usable = state.envs, _finite(state.envs)
+        envs, usable = state.envs, finite(state.envs)
         obs = jnp.where(usable[:, None], envs.obs, 0.0)
         if self.config.normalize_observations:
             weights = usable.astype(obs.dtype)
@@ -230,54 +220,25 @@ class Sac:
         action = act(self.policy(state), obs, k_policy)
         uniform = jax.random.uniform(k_random, action.shape, action.dtype, -1.0)
         action = jnp.where(learning, action, uniform)
-        models = jax.vmap(self._bind)(state.theta)
-        new = jax.vmap(self.env.step)(models, envs, action)
-        finite = usable & _finite(new)
+        new = self._episodes.step(envs, state.theta, action)
+        ok = usable & finite(new)
         rows = _transition(
             observation=obs,
             action=action,
-            reward=jnp.where(finite, new.reward, 0.0),
+            reward=jnp.where(ok, new.reward, 0.0),
             discount=1.0 - new.terminated,
-            next_observation=jnp.where(finite[:, None], new.obs, obs),
-            masked=1.0 - finite.astype(obs.dtype),
+            next_observation=jnp.where(ok[:, None], new.obs, obs),
+            masked=1.0 - ok.astype(obs.dtype),
         )
         returns = state.returns + new.reward
-        ended = finite & (new.terminated + new.truncated > 0)
+        ended = ok & (new.terminated + new.truncated > 0)
         info = {
             "episodes": ended.sum(),
-            "return": _mean_where(ended, returns),
-            "nonfinite": (~finite).sum(),
+            "return": mean_where(ended, returns),
+            "nonfinite": (~ok).sum(),
         }
         buffer = self._buffer.insert_internal(state.buffer, rows)
         return replace(state, envs=new, buffer=buffer, returns=returns), info
-
-    def _evaluate(
-        self, policy: PolicyParams, dist: Any, key: jax.Array, due: jax.Array
-    ) -> Info:
-        n = self.config.eval_envs
-
-        def run() -> Info:
-            k_draw, k_run = jax.random.split(key)
-            theta = jax.vmap(self._draw, (None, 0))(dist, jax.random.split(k_draw, n))
-            models = jax.vmap(self._bind)(theta)
-            returns = evaluate(self.env, models, policy, act, k_run, n, batched=True)
-            finite = jnp.isfinite(returns)
-            return {
-                "eval_return": _mean_where(finite, returns),
-                "eval_nonfinite": (~finite).sum(),
-            }
-
-        def skip() -> Info:
-            shapes = jax.eval_shape(run)
-            return {
-                "eval_return": jnp.full((), jnp.nan, shapes["eval_return"].dtype),
-                "eval_nonfinite": jnp.zeros((), shapes["eval_nonfinite"].dtype),
-            }
-
-        return jax.lax.cond(due, run, skip)
-
-    def _each(self, key: jax.Array) -> jax.Array:
-        return jax.random.split(key, self.config.num_envs)
 
 
 def _transition(
@@ -291,22 +252,4 @@ def _transition(
     extras: Any = {"state_extras": {"truncation": masked}, "policy_extras": {}}
     return types.Transition(
         observation, action, reward, discount, next_observation, extras
-    )
-
-
-def _finite(envs: EnvState) -> jax.Array:
-    """Which environments are still finite, ``(n,)`` bool."""
-    return jnp.isfinite(envs.obs).all(-1) & jnp.isfinite(envs.reward)
-
-
-def _mean_where(mask: jax.Array, values: jax.Array) -> jax.Array:
-    """Mean of ``values`` where ``mask``; NaN where none is."""
-    total, count = jnp.where(mask, values, 0.0).sum(), mask.sum()
-    return jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan)
-
-
-def _where(done: jax.Array, new: Any, old: Any) -> Any:
-    """``new`` where ``done`` ``(n,)``, else ``old``; leaves ``(n, ...)``."""
-    return jax.tree.map(
-        lambda a, b: jnp.where(done.reshape(-1, *([1] * (a.ndim - 1))), a, b), new, old
     )

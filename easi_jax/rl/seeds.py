@@ -6,7 +6,6 @@ devices where None. Call these inside ``jax.jit``.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -15,32 +14,32 @@ from jax.sharding import Mesh
 
 from easi_jax.mesh import make_mesh, sharded_map
 from easi_jax.rl.learner import Info
-from easi_jax.rl.sac import Sac, SacState
+from easi_jax.rl.trainer import Trainer
 
 
 def init_seeds(
-    sac: Sac,
+    trainer: Trainer,
     keys: jax.Array,
     dist: Any,
     dist_axis: int | None = None,
     mesh: Mesh | None = None,
-) -> SacState:
-    """``sac.init`` for each of ``keys`` ``(seeds,)``; leaves ``(seeds, ...)``."""
+) -> Any:
+    """``trainer.init`` for each of ``keys`` ``(seeds,)``; leaves ``(seeds, ...)``."""
     inputs = (keys, _per_seed(dist, dist_axis, len(keys)))
-    return _over_seeds(sac.init, inputs, mesh)
+    return _over_seeds(trainer.init, inputs, mesh)
 
 
 def run_seeds(
-    sac: Sac,
-    states: SacState,
+    trainer: Trainer,
+    states: Any,
     dist: Any,
     n: int,
     eval_dist: Any = None,
     dist_axis: int | None = None,
     eval_axis: int | None = None,
     mesh: Mesh | None = None,
-) -> tuple[SacState, Info]:
-    """``sac.run_chunk`` for each seed; history ``(seeds, n)``.
+) -> tuple[Any, Info]:
+    """``trainer.run_chunk`` for each seed; history ``(seeds, n)``.
 
     All seeds must have done the same number of steps.
     """
@@ -48,13 +47,15 @@ def run_seeds(
 
     def local(inputs: Any) -> Any:
         states, dist, eval_dist = inputs
-        clock = jax.tree.map(lambda x: x[0], _clock(states))
+        clock = jax.tree.map(lambda x: x[0], trainer.clock(states))
 
         def run(args: Any) -> Any:
             state, dist, eval_dist = args
             # Counters are the same for all seeds; as such they keep conditionals
             # real and writes to the memory contiguous under vmap.
-            return sac.run_chunk(_with_clock(state, clock), dist, n, eval_dist)
+            return trainer.run_chunk(
+                trainer.with_clock(state, clock), dist, n, eval_dist
+            )
 
         return _map(run, (states, dist, eval_dist))
 
@@ -67,22 +68,22 @@ def run_seeds(
 
 
 def train_seeds(
-    sac: Sac,
+    trainer: Trainer,
     keys: jax.Array,
     dist: Any,
     eval_dist: Any = None,
     dist_axis: int | None = None,
     eval_axis: int | None = None,
     mesh: Mesh | None = None,
-) -> tuple[SacState, Info]:
-    """``sac.train`` for each of ``keys`` ``(seeds,)``; history ``(seeds, n)``."""
+) -> tuple[Any, Info]:
+    """``trainer.train`` for each of ``keys`` ``(seeds,)``; history ``(seeds, n)``."""
     seeds = len(keys)
     inputs = (
         keys,
         _per_seed(dist, dist_axis, seeds),
         _per_seed(eval_dist, eval_axis, seeds),
     )
-    return _over_seeds(sac.train, inputs, mesh)
+    return _over_seeds(trainer.train, inputs, mesh)
 
 
 def _over_seeds(fun: Callable[..., Any], inputs: Any, mesh: Mesh | None) -> Any:
@@ -103,14 +104,3 @@ def _per_seed(dist: Any, axis: int | None, seeds: int) -> Any:
     if axis is not None:
         return dist
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (seeds, *jnp.shape(x))), dist)
-
-
-def _clock(state: SacState) -> tuple[jax.Array, jax.Array, jax.Array]:
-    buffer = state.buffer
-    return state.iteration, buffer.insert_position, buffer.sample_position
-
-
-def _with_clock(state: SacState, clock: tuple[jax.Array, ...]) -> SacState:
-    iteration, insert, sample = clock
-    buffer = replace(state.buffer, insert_position=insert, sample_position=sample)
-    return replace(state, iteration=iteration, buffer=buffer)

@@ -51,9 +51,11 @@ def _restored(run: Path, stage: str):
     from easi_jax.io import checkpoints
     from easi_jax.pipeline import Pipeline, PipelineConfig, seed_keys
     from envs import make
-    from train._robots import sac_config
+    from train._robots import training_config
 
-    pipe = Pipeline(make("cartpole"), PipelineConfig(sac=sac_config("cartpole", 2400)))
+    pipe = Pipeline(
+        make("cartpole"), PipelineConfig(training=training_config("cartpole", 2400))
+    )
     wide = pipe.spread(pipe.udr(), 1)
     target = jax.eval_shape(lambda k: pipe.train_init(k, wide), seed_keys([0]))
     found = checkpoints.restore(run / "checkpoints" / stage, target)

@@ -1,0 +1,122 @@
+"""Episodes of many environments at once, each with its own drawn parameters."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from easi_jax.env import Env, EnvState, Model
+from easi_jax.rl.evaluate import evaluate
+from easi_jax.rl.networks import PolicyParams, act
+
+Info = dict[str, jax.Array]
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """What SAC and PPO share: resets with redrawn parameters, and evaluations.
+
+    Attributes:
+        env: the environment.
+        bind: the model for parameters ``theta``; pure.
+        draw: ``draw(dist, key) -> theta``, one sample of a distribution.
+        num_envs: environments that step together.
+        eval_envs: episodes of an evaluation.
+    """
+
+    env: Env
+    bind: Callable[[Any], Model]
+    draw: Callable[[Any, jax.Array], Any]
+    num_envs: int
+    eval_envs: int
+
+    def unborn(self, dist: Any, key: jax.Array) -> tuple[EnvState, Any]:
+        """Environments that count as finished, so that the first step resets them.
+
+        A program then holds one reset only, and compiles faster.
+
+        Returns:
+            States and parameters, leading axis ``num_envs``.
+        """
+
+        def episode(key: jax.Array) -> tuple[EnvState, Any]:
+            theta = self.draw(dist, key)
+            return self.env.reset(self.bind(theta), key), theta
+
+        envs, theta = jax.tree.map(
+            lambda x: jnp.zeros((self.num_envs, *x.shape), x.dtype),
+            jax.eval_shape(episode, key),
+        )
+        return replace(envs, terminated=jnp.ones_like(envs.terminated)), theta
+
+    def reset_finished(
+        self, envs: EnvState, theta: Any, returns: jax.Array, dist: Any, key: jax.Array
+    ) -> tuple[EnvState, Any, jax.Array]:
+        """New episodes, with new parameters, where the old ones are over."""
+        done = ~finite(envs) | (envs.terminated + envs.truncated > 0)
+        k_draw, k_reset = jax.random.split(key)
+        drawn = jax.vmap(self.draw, (None, 0))(dist, self.each(k_draw))
+        theta = _where(done, drawn, theta)
+        fresh = jax.vmap(self.env.reset)(jax.vmap(self.bind)(theta), self.each(k_reset))
+        return _where(done, fresh, envs), theta, jnp.where(done, 0.0, returns)
+
+    def step(self, envs: EnvState, theta: Any, action: jax.Array) -> EnvState:
+        """One control step of all, ``action (num_envs, action_size)``."""
+        return jax.vmap(self.env.step)(jax.vmap(self.bind)(theta), envs, action)
+
+    def evaluate(
+        self, policy: PolicyParams, dist: Any, key: jax.Array, due: jax.Array
+    ) -> Info:
+        """``eval_return`` and ``eval_nonfinite`` where ``due``, NaN and 0 elsewhere."""
+        n = self.eval_envs
+
+        def run() -> Info:
+            k_draw, k_run = jax.random.split(key)
+            theta = jax.vmap(self.draw, (None, 0))(dist, jax.random.split(k_draw, n))
+            models = jax.vmap(self.bind)(theta)
+            returns = evaluate(self.env, models, policy, act, k_run, n, batched=True)
+            ok = jnp.isfinite(returns)
+            return {
+                "eval_return": mean_where(ok, returns),
+                "eval_nonfinite": (~ok).sum(),
+            }
+
+        def skip() -> Info:
+            shapes = jax.eval_shape(run)
+            return {
+                "eval_return": jnp.full((), jnp.nan, shapes["eval_return"].dtype),
+                "eval_nonfinite": jnp.zeros((), shapes["eval_nonfinite"].dtype),
+            }
+
+        return jax.lax.cond(due, run, skip)
+
+    def each(self, key: jax.Array) -> jax.Array:
+        """A key for each environment."""
+        return jax.random.split(key, self.num_envs)
+
+
+def raw_key(key: jax.Array) -> jax.Array:
+    """A key as ordinary numbers, whatever kind it was."""
+    if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        return jax.random.key_data(key)
+    return key
+
+
+def finite(envs: EnvState) -> jax.Array:
+    """Which environments are still finite, ``(n,)`` bool."""
+    return jnp.isfinite(envs.obs).all(-1) & jnp.isfinite(envs.reward)
+
+
+def mean_where(mask: jax.Array, values: jax.Array) -> jax.Array:
+    """Mean of ``values`` where ``mask``; NaN where none is."""
+    total, count = jnp.where(mask, values, 0.0).sum(), mask.sum()
+    return jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan)
+
+
+def _where(done: jax.Array, new: Any, old: Any) -> Any:
+    """``new`` where ``done`` ``(n,)``, else ``old``; leaves ``(n, ...)``."""
+    return jax.tree.map(
+        lambda a, b: jnp.where(done.reshape(-1, *([1] * (a.ndim - 1))), a, b), new, old
+    )

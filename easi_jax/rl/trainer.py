@@ -1,0 +1,54 @@
+"""What a training algorithm offers: the same door for SAC and PPO."""
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import jax
+
+from easi_jax.env import Env, Model
+from easi_jax.rl.config import PpoConfig, SacConfig
+from easi_jax.rl.networks import PolicyParams
+from easi_jax.rl.ppo import Ppo
+from easi_jax.rl.sac import Sac
+
+Info = dict[str, jax.Array]
+TrainingConfig = SacConfig | PpoConfig
+
+
+class Trainer(Protocol):
+    """A training as pure functions of its state; see `Sac` for what they do."""
+
+    @property
+    def config(self) -> Any: ...
+
+    def init(self, key: jax.Array, dist: Any) -> Any: ...
+
+    def step(
+        self, state: Any, dist: Any, eval_dist: Any = None
+    ) -> tuple[Any, Info]: ...
+
+    def run_chunk(
+        self, state: Any, dist: Any, n: int, eval_dist: Any = None
+    ) -> tuple[Any, Info]: ...
+
+    def train(
+        self, key: jax.Array, dist: Any, eval_dist: Any = None
+    ) -> tuple[Any, Info]: ...
+
+    def policy(self, state: Any) -> PolicyParams: ...
+
+    def clock(self, state: Any) -> tuple[jax.Array, ...]: ...
+
+    def with_clock(self, state: Any, clock: tuple[jax.Array, ...]) -> Any: ...
+
+
+def make_trainer(
+    env: Env,
+    config: TrainingConfig,
+    bind: Callable[[Any], Model],
+    draw: Callable[[Any, jax.Array], Any],
+) -> Trainer:
+    """The algorithm that ``config`` is of."""
+    if isinstance(config, PpoConfig):
+        return Ppo(env, config, bind, draw)
+    return Sac(env, config, bind, draw)

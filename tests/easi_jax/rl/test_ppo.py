@@ -1,0 +1,156 @@
+"""PPO on probes whose values are known, and the state that it carries."""
+
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from easi_jax.errors import UserError
+from easi_jax.mesh import make_mesh
+from easi_jax.rl import Ppo, PpoConfig, act, init_seeds, run_seeds
+from easi_jax.rl.probes import Probe, probe_models
+
+OBS = jnp.array([[-1.0], [1.0]])
+GAMMA = 0.8
+HALF = 60
+
+
+class Trained(NamedTuple):
+    """Probes after training, all by one program."""
+
+    ppo: Ppo
+    names: list[str]
+    keys: jax.Array
+    dist: Any
+    final: Any
+    history: dict[str, jax.Array]
+
+
+@pytest.fixture(scope="module")
+def ppo() -> Ppo:
+    config = PpoConfig(
+        env_steps=2 * HALF * 64 * 8,
+        num_envs=64,
+        unroll=8,
+        minibatches=4,
+        epochs=4,
+        hidden=(32, 32),
+        learning_rate=3e-3,
+        learning_rate_decay=0.1,
+        discount=GAMMA,
+        entropy_cost=0.0,
+        normalize_observations=False,
+        evaluate_every=HALF,
+        eval_envs=4,
+    )
+    return Ppo(Probe(), config, bind=lambda theta: theta, draw=lambda dist, key: dist)
+
+
+@pytest.fixture(scope="module")
+def trained(ppo: Ppo) -> Trained:
+    probes = probe_models()
+    probes["broken"] = probes["constant"].replace(constant=jnp.float32(jnp.nan))
+    dist = jax.tree.map(lambda *x: jnp.stack(x), *probes.values())
+    keys = jax.random.split(jax.random.key(0), len(probes))
+    start = jax.jit(lambda k, d: init_seeds(ppo, k, d, dist_axis=0))(keys, dist)
+    run = jax.jit(lambda s, d: run_seeds(ppo, s, d, HALF, dist_axis=0))
+    half, first = run(start, dist)
+    final, second = run(half, dist)
+    history = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), first, second)
+    return Trained(ppo, list(probes), keys, dist, final, history)
+
+
+def state_of(trained: Trained, name: str) -> Any:
+    i = trained.names.index(name)
+    return jax.tree.map(lambda x: x[i], trained.final)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("constant", (1.0, 1.0)),
+        ("observation", (-1.0, 1.0)),
+        ("discount", (GAMMA, 1.0)),
+    ],
+)
+def test_values(trained: Trained, name: str, expected: tuple[float, float]) -> None:
+    got = trained.ppo.values(state_of(trained, name), OBS)
+    np.testing.assert_allclose(got, expected, atol=0.04)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("action", (0.5, 0.5)), ("both", (-0.5, 0.5))]
+)
+def test_actions(trained: Trained, name: str, expected: tuple[float, float]) -> None:
+    policy = trained.ppo.policy(state_of(trained, name))
+    best = act(policy, OBS, deterministic=True)[:, 0]
+    np.testing.assert_allclose(best, expected, atol=0.07)
+
+
+def test_time_limit_bootstraps_from_the_terminal_observation(trained: Trained) -> None:
+    """Ended instead: (0.8, 1). From the next reset: (2.2, 2.8)."""
+    got = trained.ppo.values(state_of(trained, "time_limit"), OBS)
+    expected = np.array([GAMMA, 1.0]) / (1 - GAMMA)
+    np.testing.assert_allclose(got, expected, rtol=0.05)
+
+
+def test_finished_episodes_are_reported(trained: Trained) -> None:
+    i = trained.names.index("constant")
+    assert (trained.history["episodes"][i] == 64 * 8).all()
+    np.testing.assert_array_equal(trained.history["return"][i], 1.0)
+    j = trained.names.index("discount")
+    assert (trained.history["episodes"][j] == 64 * 4).all()
+
+
+def test_nonfinite_simulations_are_counted_and_kept_from_the_losses(
+    trained: Trained,
+) -> None:
+    i = trained.names.index("broken")
+    assert (trained.history["nonfinite"][i] == 64 * 8).all()
+    assert (np.delete(trained.history["nonfinite"], i, 0) == 0).all()
+    chex.assert_tree_all_finite(state_of(trained, "broken").params)
+
+
+def test_evaluations_come_when_due(trained: Trained) -> None:
+    told = np.asarray(trained.history["eval_return"])[trained.names.index("constant")]
+    due = np.flatnonzero(np.isfinite(told))
+    np.testing.assert_array_equal(due, [HALF - 1, 2 * HALF - 1])
+
+
+def test_chunks_and_devices_do_not_matter(ppo: Ppo, trained: Trained) -> None:
+    mesh = make_mesh(1)
+    dist, keys = trained.dist, trained.keys
+
+    @jax.jit
+    def alone(keys: jax.Array, dist: Any) -> Any:
+        start = init_seeds(ppo, keys, dist, 0, mesh)
+        return run_seeds(ppo, start, dist, 2, dist_axis=0, mesh=mesh)
+
+    @jax.jit
+    def parts(keys: jax.Array, dist: Any) -> Any:
+        state = init_seeds(ppo, keys, dist, 0)
+        state, _ = run_seeds(ppo, state, dist, 1, dist_axis=0)
+        return run_seeds(ppo, state, dist, 1, dist_axis=0)
+
+    a, b = alone(keys, dist)[0], parts(keys, dist)[0]
+    chex.assert_trees_all_close(a.params, b.params, atol=1e-4)
+    np.testing.assert_array_equal(a.iteration, b.iteration)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"unroll": 0}, "unroll=0"),
+        ({"minibatches": 3}, "minibatches=3"),
+        ({"clipping": 2.0}, "clipping=2.0"),
+        ({"hidden": ()}, "hidden=()"),
+        ({"learning_rate": 0.0}, "learning_rate=0.0"),
+    ],
+)
+def test_settings_that_cannot_work(change: dict[str, Any], named: str) -> None:
+    with pytest.raises(UserError, match="PPO setting") as error:
+        PpoConfig(**change)
+    assert named in str(error.value)

@@ -1,0 +1,85 @@
+"""``train.parameters``: a first parameter file, read back and used."""
+
+from importlib import resources
+from pathlib import Path
+
+import mujoco
+import pytest
+
+from easi_jax.io.parameter_file import read_parameter_file
+from easi_jax.proposal import propose
+from train import parameters
+from train._command import main
+from train._log_problem import load_model
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "lift_arm"
+BARE = """<mujoco><worldbody><body name="rod">
+  <joint name="swing" axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".001" mass=".5"/>
+</body></worldbody></mujoco>"""
+
+
+def call(*args: object) -> None:
+    main(
+        parameters.Config,
+        parameters.run,
+        name="train.parameters",
+        args=[str(a) for a in args],
+    )
+
+
+@pytest.mark.parametrize(
+    ("robot", "some"),
+    [
+        ("cartpole", {"cart_kp": 20.0, "pole_mass": 0.1, "cart_force_limit": 5.0}),
+        ("ant", {"hip_damping": 0.3, "ankle_frictionloss": 0.1, "leg_mass": 0.1}),
+        ("ballbalance", {"knee_kp": 100.0, "ball_mass": 3.0}),
+        ("go2", {"hip_kp": 40.0, "calf_kv": 1.0, "base_mass": 6.923}),
+    ],
+)
+def test_built_in_robots(robot: str, some: dict[str, float], tmp_path: Path) -> None:
+    asset = resources.files("envs") / "assets" / f"{robot}.xml"
+    path = tmp_path / "robot.xml"
+    path.write_text(asset.read_text())
+    out = tmp_path / "new" / "p.yaml"
+    call("--model", path, "--out", out)
+    space = read_parameter_file(out, load_model(path))
+    values = dict(zip(space.names, space.nominal, strict=True))
+    for name, value in some.items():
+        assert values[name] == pytest.approx(value), (name, values)
+
+
+def test_what_the_model_lacks_gets_a_range_from_the_machine() -> None:
+    m = mujoco.MjModel.from_xml_string(BARE)
+    found = {p.parameter.name: p for p in propose(m)}
+    friction = found["swing_frictionloss"]
+    assert friction.note == "the model has none"
+    low, high = friction.parameter.initial
+    weight = 0.5 * 9.81 * 0.2  # N m, of the rod at its middle
+    assert 0 < low < 0.01 * weight < high < weight
+    low, high = found["swing_armature"].parameter.initial
+    assert 0 < low < 0.1 * 0.5 * 0.4**2 / 3 < high
+
+
+def test_logs_say_what_they_determine(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "p.yaml"
+    args = ("--model", EXAMPLE / "model.xml", "--data", EXAMPLE / "sweep.csv")
+    call(*args, "--out", out)
+    told = capsys.readouterr().out
+    assert "these logs" in told and "known to" in told
+    # All masses and forces at once: no log of motions alone can show it.
+    assert "one common factor change nothing" in told
+    assert "known to" in out.read_text()
+
+
+def test_a_file_is_not_replaced_unasked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "p.yaml"
+    out.write_text("mine")
+    with pytest.raises(SystemExit) as stop:
+        call("--model", EXAMPLE / "model.xml", "--out", out)
+    assert stop.value.code == 2 and "--overwrite" in capsys.readouterr().err
+    assert out.read_text() == "mine"

@@ -1,0 +1,124 @@
+"""``python -m train.parameters``: a first parameter file for a model."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from train._command import main, say, show_table
+
+_HORIZON = 0.2  # s, of the pieces that say what logs determine
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Proposes what may vary in a model: a parameter file for train.easi to start from.
+
+    Damping, friction and inertia of joints, gains and limits of drives, masses, ground
+    friction. Places that look alike are tied to one parameter. With --data it also says
+    what these logs can determine. Read the file, take out what you have measured, and
+    correct the ranges you know better.
+    """
+
+    model: Path
+    """MuJoCo model (MJCF) of the machine."""
+    out: Path = Path("parameters.yaml")
+    """Parameter file to write."""
+    data: tuple[Path, ...] = ()
+    """Measured logs (CSV, NPZ or Parquet)."""
+    mapping: Path | None = None
+    """Mapping file (YAML) for logs with foreign column names."""
+    overwrite: bool = False
+    """Replace the file if it is there."""
+
+
+def run(config: Config) -> None:
+    """Writes the file and shows what is in it."""
+    from easi_jax.errors import UserError
+    from easi_jax.io.files import atomic_write
+    from easi_jax.io.parameter_file import read_parameter_file
+    from easi_jax.proposal import as_text, propose
+    from train._log_problem import load_model
+
+    if config.out.exists() and not config.overwrite:
+        raise UserError(
+            f"{config.out} is there already: name another file with --out, or replace "
+            "it with --overwrite"
+        )
+    m = load_model(config.model)
+    proposals = propose(m)
+    found = _information(config, m, proposals) if config.data else None
+    verdicts: dict[str, str] = {}
+    head = [f"Proposed by python -m train.parameters for {config.model.name}."]
+    if found is not None:
+        for name, sure, std in zip(
+            found.names, found.determined, found.std, strict=True
+        ):
+            verdicts[name] = f"known to {100 * std:.2g} %" if sure else "not determined"
+        names = ", ".join(p.name for p in config.data)
+        head.append(f"What {names} can determine at best is said beside each name.")
+    config.out.parent.mkdir(parents=True, exist_ok=True)
+    atomic_write(config.out, as_text(proposals, head, verdicts))
+    read_parameter_file(config.out, m)
+    rows = [
+        (
+            p.parameter.name,
+            p.parameter.addresses[0],
+            f"{p.parameter.nominal:.4g}",
+            f"{p.parameter.initial[0]:.3g} .. {p.parameter.initial[1]:.3g}",
+            p.parameter.unit,
+            *([verdicts[p.parameter.name]] if found is not None else []),
+        )
+        for p in proposals
+    ]
+    columns = ["name", "address", "nominal", "start", "unit"]
+    if found is not None:
+        columns.append("these logs")
+    show_table(f"What may vary in {config.model.name}", columns, rows)
+    if found is not None:
+        from easi_jax.information import describe
+
+        for direction in found.undetermined:
+            say(f"note: {describe(direction)}")
+    say(f"written: {config.out}")
+
+
+def _information(config: Config, m: Any, proposals: list[Any]) -> Any:
+    """What the logs can determine, near the middle of the proposed ranges."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from easi_jax.identify import effective_noise
+    from easi_jax.information import PairedFit, identifiability
+    from easi_jax.io.logs import read_logs
+    from easi_jax.log_data import pooled_noise, segments_from_runs, to_common_step
+    from easi_jax.machine import Machine
+    from easi_jax.proposal import space_of
+    from easi_jax.refine import step_weights
+    from easi_jax.segments import to_device
+
+    log = read_logs(list(config.data), m, config.mapping)
+    noise = pooled_noise(log.runs)
+    runs, notes = to_common_step(log.runs)
+    for note in (*log.notes, *notes):
+        say(f"note: {note}")
+    space = space_of(proposals)
+    machine = Machine(m, space, runs[0].dt)
+    steps = max(1, round(_HORIZON / machine.dt))
+    pieces = to_device(segments_from_runs(machine, runs, steps, steps))
+    noise = effective_noise(machine, pieces, jnp.asarray(noise, jnp.float32))
+    unit = space.to_unit(jnp.asarray(space.nominal))
+    unit = jnp.where(jnp.isfinite(unit), unit, 0.5)
+    say("Fisher information of the logs ...")
+
+    @jax.jit
+    def information(unit: Any) -> Any:
+        paired = PairedFit(machine, space, pieces, noise)
+        zero = jnp.zeros((pieces.count, 2 * m.nv))
+        return paired.normal(unit, zero, step_weights(pieces, noise)).hessian
+
+    return identifiability(space, np.asarray(information(unit)))
+
+
+if __name__ == "__main__":
+    main(Config, run, name="train.parameters")
