@@ -93,74 +93,6 @@ def _compile(config: Config) -> dict[str, float]:
     }
 
 
-def _native(config: Config, repeats: int) -> list[float]:
-    import mujoco
-    import numpy as np
-    from mujoco import rollout
-
-    from easi_jax import runtime
-    from envs import make
-
-    env = make("cartpole")
-    m, n = env.mj_model, config.population
-    steps = config.steps * env.machine.substeps
-    size = mujoco.mj_stateSize(m, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-    start = np.zeros((n, size))
-    start[:, 2] = np.linspace(-0.1, 0.1, n)
-    ctrl = np.random.default_rng(0).uniform(-0.2, 0.2, (n, steps, 1))
-    threads = runtime.cores()
-    out = []
-    with rollout.Rollout(nthread=threads) as pool:
-        datas = [mujoco.MjData(m) for _ in range(threads)]
-        for _ in range(repeats + 1):
-            begin = time.monotonic()
-            pool.rollout([m] * n, datas, start, ctrl)
-            out.append(n * steps / (time.monotonic() - begin))
-    return out[1:]
-
-
-def _physics(config: Config) -> list[float]:
-    """Search rollouts: every individual its own model, one trajectory each."""
-    import jax
-    import jax.numpy as jnp
-
-    from easi_jax.mesh import make_mesh, sharded_map
-    from easi_jax.runtime import fast_loops
-    from envs import make
-
-    env = make("cartpole")
-    machine, n = env.machine, config.population
-    ctrl = jax.random.uniform(
-        jax.random.key(0), (n, config.steps, 1), minval=-0.2, maxval=0.2
-    )
-    unit = jax.random.uniform(jax.random.key(1), (n, env.space.size))
-
-    def local(items: Any) -> Any:
-        def one(u: Any, c: Any) -> Any:
-            model = machine.model(env.space.to_si(u))
-            start = machine.start(jnp.array([0.0, 0.1]), jnp.zeros(2))
-
-            def step(s: Any, a: Any) -> Any:
-                s = machine.step(model, s, a)
-                return s, (s.qpos, s.qvel)
-
-            return jax.lax.scan(step, start, c)[1]
-
-        return jax.vmap(one)(*items)
-
-    run = jax.jit(
-        lambda u, c: sharded_map(local, make_mesh(), (u, c)),
-        compiler_options=fast_loops(),
-    )
-    out = []
-    for _ in range(config.repeats + 1):
-        begin = time.monotonic()
-        jax.block_until_ready(run(unit, ctrl))
-        seconds = time.monotonic() - begin
-        out.append(n * config.steps * machine.substeps / seconds)
-    return out[1:]
-
-
 def _generations(config: Config) -> dict[str, Any]:
     """A whole search, and the same without its discriminator and strategy."""
     import jax
@@ -241,12 +173,15 @@ def run(config: Config) -> None:
     import numpy as np
 
     from benchmarks._common import write_result
+    from benchmarks.physics import native_rates, search_rates
+    from envs import make
 
     with tempfile.TemporaryDirectory() as cache:
         cold, cached = (_compile_in(cache) for _ in range(2))
-    native = _native(config, config.repeats)
-    physics = _physics(config)
-    again = _native(config, config.repeats)
+    env, size = make("cartpole"), (config.population, config.steps, config.repeats)
+    native = native_rates(env, *size)
+    physics, _ = search_rates(env, *size)
+    again = native_rates(env, *size)
     native_rate = float(np.median(native + again))
     rate = float(np.median(physics))
     search = _generations(config)

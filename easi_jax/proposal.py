@@ -105,7 +105,7 @@ def _pattern(name: str, values: dict[str, tuple[float, str]], every: list[str]) 
     best, size = name, 1
     tries = [re.sub(head, "*_", name) for head in (r"^[^_]+_", r"^.*_")]
     tries += [re.sub(tail, "", name) + "*" for tail in (r"[^_]+$", r"\d+$")]
-    for pattern in tries:
+    for pattern in (t for t in tries if t != "*"):
         members = fnmatch.filter(every, pattern)
         alike = all(m in values and values[m] == values[name] for m in members)
         if alike and len(members) > size:

@@ -28,6 +28,7 @@ _DAMPING = 10.0 ** np.arange(-2, 4)  # tried together, relative to the last one
 _TINY = 1e-12
 _PATIENCE = 6  # rounds without progress that end the fit
 _TOLD_APART = 0.05  # of the cost, which is minus a logarithm of likelihood
+_ROUNDING = 3e-6  # of the cost, which the best of many trials takes for progress
 _MOVING, _LOOKING, _FINISHED = range(3)
 _FARTHEST = 0.8  # jump that is tried, in initial ranges
 _OUTLYING = 9.0  # times the median cost: such a piece counts half
@@ -162,7 +163,8 @@ def refine(
         carry, cost = step(carry, moving, ~moving | (k > robust))
         costs = jnp.where(jnp.arange(iterations + 2) >= k, cost, costs)
         # By less than this the data cannot tell two results apart.
-        settled = costs[jnp.maximum(k - _PATIENCE, 0)] - cost < _TOLD_APART
+        told_apart = _TOLD_APART + _ROUNDING * cost
+        settled = costs[jnp.maximum(k - _PATIENCE, 0)] - cost < told_apart
         settled &= k > robust + _PATIENCE
         over = settled | (k >= iterations)
         phase = jnp.where(
