@@ -2,8 +2,11 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 from train._command import main, say, show_table
+
+_FPS = 25  # frames per second of a video, about
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,6 +29,8 @@ class Config:
     """Seed of resets."""
     out: Path | None = None
     """JSON file to write; nothing is written where not given."""
+    render: Path | None = None
+    """Video of one episode of the first seed to write, .gif or .mp4 (with ffmpeg)."""
 
 
 def run(config: Config) -> None:
@@ -42,6 +47,8 @@ def run(config: Config) -> None:
 
     if config.episodes < 1:
         raise UserError(f"--episodes is {config.episodes}: give at least 1")
+    if config.render is not None and config.render.suffix not in (".gif", ".mp4"):
+        raise UserError(f"--render {config.render}: a video ends in .gif or .mp4")
     saved = load_policies(config.run, config.policy)
     env = make(saved["robot"])
     theta = target_parameters(env.space, config.target)
@@ -75,6 +82,21 @@ def run(config: Config) -> None:
         config.out.parent.mkdir(parents=True, exist_ok=True)
         atomic_write(config.out, to_json(result))
         say(f"written: {config.out}")
+    if config.render is not None:
+        from easi_jax.io.video import render, write_video
+        from easi_jax.rl.evaluate import record
+        from easi_jax.rl.networks import act
+
+        @jax.jit
+        def episode(policies: Any, theta: Any, key: Any) -> Any:
+            first = jax.tree.map(lambda x: x[0], policies)
+            return record(env, env.model(theta), first, act, key)
+
+        qpos = episode(saved["policies"], jnp.asarray(theta, jnp.float32), keys[0])
+        every = max(1, round(1 / (_FPS * env.dt)))
+        frames = render(env.mj_model, np.asarray(qpos)[::every])
+        write_video(config.render, frames, 1 / (every * env.dt))
+        say(f"written: {config.render}")
 
 
 if __name__ == "__main__":

@@ -59,3 +59,20 @@ def evaluate(
 
     keys = jax.random.split(key, num_envs)
     return jax.vmap(episode, in_axes=(0 if batched else None, 0))(models, keys)
+
+
+def record(
+    env: Env, model: Model, policy: PolicyParams, act: Act, key: jax.Array
+) -> jax.Array:
+    """Positions ``(T + 1, nq)`` of one episode, deterministic; it stands at its end."""
+
+    def step(state: Any, k: jax.Array) -> tuple[Any, jax.Array]:
+        done = (state.terminated + state.truncated) > 0
+        new = env.step(model, state, act(policy, state.obs, k, True))
+        state = jax.tree.map(lambda a, b: jnp.where(done, a, b), state, new)
+        return state, state.physics.qpos
+
+    k_reset, k_act = jax.random.split(key)
+    first = env.reset(model, k_reset)
+    _, qpos = jax.lax.scan(step, first, jax.random.split(k_act, env.episode_length))
+    return jnp.concatenate([first.physics.qpos[None], qpos])

@@ -1,0 +1,117 @@
+"""Motion as pictures: frames by MuJoCo's renderer, GIF, MP4, a strip for reports."""
+
+import base64
+import io
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from PIL import Image
+
+from easi_jax.errors import UserError
+
+_LIMIT = 300  # s
+_WAYS = ("egl", "osmesa", "glfw")
+
+
+def render(
+    m: mujoco.MjModel, qpos: np.ndarray, width: int = 480, height: int = 320
+) -> np.ndarray:
+    """Frames ``(T, height, width, 3)`` uint8 of positions ``qpos (T, nq)``.
+
+    Through the model's first camera, or from outside where it has none. The way to
+    OpenGL is ``MUJOCO_GL``'s, or the first of EGL, OSMesa and GLFW that works.
+
+    Raises:
+        UserError: none works here.
+    """
+    ways = [os.environ["MUJOCO_GL"]] if os.environ.get("MUJOCO_GL") else _WAYS
+    eye = m.camera(0).name if m.ncam else "-1"
+    worker = Path(__file__).with_name("render_worker.py")
+    reasons = []
+    with tempfile.TemporaryDirectory() as folder:
+        names = ("m.mjb", "q.npy", "frames.npy")
+        files, size = [str(Path(folder) / n) for n in names], (str(width), str(height))
+        mujoco.mj_saveModel(m, files[0])
+        np.save(files[1], np.asarray(qpos, float))
+        for way in ways:
+            try:
+                done = subprocess.run(
+                    [sys.executable, "-I", str(worker), *files, *size, eye],
+                    env={**os.environ, "MUJOCO_GL": way},
+                    capture_output=True,
+                    text=True,
+                    timeout=_LIMIT,
+                )
+            except subprocess.TimeoutExpired:
+                reasons.append(f"{way}: no picture within {_LIMIT} s")
+                continue
+            if done.returncode == 0:
+                return np.load(files[2])
+            last = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+            reasons.append(f"{way}: {last}")
+    raise UserError(
+        "nothing can be drawn here, for MuJoCo's renderer needs EGL or OSMesa (on "
+        f"Debian: libegl1 or libosmesa6): {'; '.join(reasons)}"
+    )
+
+
+def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
+    """Writes ``frames (T, H, W, 3)`` as ``.gif``, or as ``.mp4`` with ffmpeg.
+
+    Raises:
+        UserError: another ending, or no ffmpeg for an MP4.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.part{path.suffix}")
+    if path.suffix == ".gif":
+        images = [Image.fromarray(f) for f in frames]
+        images[0].save(
+            part,
+            save_all=True,
+            append_images=images[1:],
+            duration=max(20, round(1000 / fps)),
+            loop=0,
+        )
+    elif path.suffix == ".mp4":
+        tool = shutil.which("ffmpeg")
+        if tool is None:
+            raise UserError(
+                f"{path}: an MP4 needs ffmpeg, which is not here; give .gif"
+            )
+        height, width = frames.shape[1:3]
+        wanted = ("-pix_fmt", "yuv420p")
+        kind = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
+        done = subprocess.run(
+            [tool, "-y", *kind, "-r", f"{fps:g}", "-i", "-", *wanted, str(part)],
+            input=np.ascontiguousarray(frames).tobytes(),
+            capture_output=True,
+            timeout=_LIMIT,
+        )
+        if done.returncode:
+            part.unlink(missing_ok=True)
+            last = done.stderr.decode(errors="replace").strip().splitlines()[-1]
+            raise UserError(f"{path}: ffmpeg failed: {last}")
+    else:
+        raise UserError(f"{path}: a video ends in .gif or .mp4")
+    part.replace(path)
+
+
+def strip(frames: np.ndarray, count: int = 6) -> str:
+    """``count`` frames side by side as SVG that holds its picture within itself."""
+    chosen = frames[np.linspace(0, len(frames) - 1, count).round().astype(int)]
+    wide = np.concatenate(list(chosen), axis=1)
+    buffer = io.BytesIO()
+    Image.fromarray(wide).save(buffer, "JPEG", quality=80)
+    data = base64.b64encode(buffer.getvalue()).decode()
+    height, width = wide.shape[:2]
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}">'
+        f'<image width="{width}" height="{height}" '
+        f'href="data:image/jpeg;base64,{data}"/></svg>'
+    )
