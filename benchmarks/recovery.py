@@ -28,6 +28,7 @@ CASES: dict[str, dict[str, Any]] = {
     "weighed_clean": {"free": False, "noise": (0.0,) * 4},
     "paper_free_clean": {"free": True, "noise": (0.0,) * 4, "preset": "paper"},
     "paper_free_noisy": {"free": True, "noise": NOISE, "preset": "paper"},
+    "paper_weighed_noisy": {"free": False, "noise": NOISE, "preset": "paper"},
 }
 
 

@@ -30,7 +30,7 @@ _PATIENCE = 6  # rounds without progress that end the fit
 _TOLD_APART = 0.05  # of the cost, which is minus a logarithm of likelihood
 _ROUNDING = 3e-6  # of the cost, which the best of many trials takes for progress
 _MOVING, _LOOKING, _FINISHED = range(3)
-_FARTHEST = 0.8  # jump that is tried, in initial ranges
+_FARTHEST = 0.8, 2.5  # jump that is tried, in initial ranges, in log ratios
 _OUTLYING = 9.0  # times the median cost: such a piece counts half
 
 
@@ -88,6 +88,9 @@ def refine(
         return 0.5 * jnp.sum(pull * away(u) ** 2, axis=-1)
 
     n, count = space.size, segments.count
+    # A start range may be narrow, and wrong.
+    wide = np.maximum(_FARTHEST[0], _FARTHEST[1] / space.log_width)
+    farthest = np.where(space.log, wide, _FARTHEST[0])
     sides = jnp.array([[1.0], [-1.0]])
 
     def step(carry: Any, moving: jax.Array, trusting: jax.Array) -> Any:
@@ -148,7 +151,7 @@ def refine(
         jnp.zeros((count, 2 * machine.mj_model.nv)),
         jnp.asarray(1e-3),
         jnp.zeros((2, n)),
-        jnp.full((2, n), _FARTHEST),
+        jnp.broadcast_to(jnp.asarray(farthest), (2, n)),
         jnp.ones(count),
         jnp.zeros((n, n)),
     )

@@ -83,3 +83,20 @@ def test_what_is_as_good_as_zero_comes_back_though_little_is_known(
     )
     out = run(space.to_unit(jnp.asarray(low)))
     assert float(space.to_si(out.unit)[i]) == pytest.approx(space.nominal[i], rel=0.1)
+
+
+def test_a_limit_that_nothing_meets_is_found_from_a_narrow_start(
+    cartpole: Cartpole, space: ParameterSpace, trajectories: Segments
+) -> None:
+    """The cart's speed limit, three times too high: no simulation reaches it."""
+    far = space.scaled(2.0, 4.0)
+    machine = Machine(cartpole.mj_model, far, cartpole.dt)
+    pieces = windows(trajectories, 25, 25)
+    speed = np.abs(np.asarray(trajectories.next_qvel)[..., 0])
+    assert 0.55 < speed.max() <= 0.6 + 1e-6
+    i = far.index("cart_speed_limit")
+    wrong = far.nominal.copy()
+    wrong[i] *= 3.0
+    run = jax.jit(lambda u: refine(machine, far, u, pieces, NOISE))
+    out = run(far.to_unit(jnp.asarray(wrong)))
+    assert float(far.to_si(out.unit)[i]) == pytest.approx(far.nominal[i], rel=0.02)
