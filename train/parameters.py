@@ -46,14 +46,11 @@ def run(config: Config) -> None:
         )
     m = load_model(config.model)
     proposals = propose(m)
-    found = _information(config, m, proposals) if config.data else None
     verdicts: dict[str, str] = {}
+    notes: list[str] = []
     head = [f"Proposed by python -m train.parameters for {config.model.name}."]
-    if found is not None:
-        for name, sure, std in zip(
-            found.names, found.determined, found.std, strict=True
-        ):
-            verdicts[name] = f"known to {100 * std:.2g} %" if sure else "not determined"
+    if config.data:
+        verdicts, notes = _verdicts(proposals, _information(config, m, proposals))
         names = ", ".join(p.name for p in config.data)
         head.append(f"What {names} can determine at best is said beside each name.")
     config.out.parent.mkdir(parents=True, exist_ok=True)
@@ -66,30 +63,67 @@ def run(config: Config) -> None:
             f"{p.parameter.nominal:.4g}",
             f"{p.parameter.initial[0]:.3g} .. {p.parameter.initial[1]:.3g}",
             p.parameter.unit,
-            *([verdicts[p.parameter.name]] if found is not None else []),
+            *([verdicts[p.parameter.name]] if verdicts else []),
         )
         for p in proposals
     ]
     columns = ["name", "address", "nominal", "start", "unit"]
-    if found is not None:
+    if verdicts:
         columns.append("these logs")
     show_table(f"What may vary in {config.model.name}", columns, rows)
-    if found is not None:
-        from easi_jax.information import describe
-
-        for direction in found.undetermined:
-            say(f"note: {describe(direction)}")
+    for note in notes:
+        say(f"note: {note}")
     say(f"written: {config.out}")
 
 
+def _verdicts(
+    proposals: list[Any], information: Any
+) -> tuple[dict[str, str], list[str]]:
+    """What the logs can determine of each parameter, and what people should know.
+
+    Motion alone never shows the common scale of masses and forces. So the heaviest
+    mass counts as weighed, and the verdict is on the others.
+    """
+    import numpy as np
+
+    from easi_jax.information import describe, identifiability
+    from easi_jax.proposal import space_of
+
+    space = space_of(proposals)
+    notes, keep = [], list(range(space.size))
+    masses = [i for i in keep if space.addresses[i][0].endswith(".mass")]
+    scale_open = any(
+        len(d) > 1 and max(abs(v - 1) for v in d.values()) < 0.05
+        for d in identifiability(space, information).undetermined
+    )
+    verdicts = {}
+    if scale_open and masses:
+        heaviest = max(masses, key=lambda i: space.nominal[i])
+        name = space.names[heaviest]
+        keep.remove(heaviest)
+        verdicts[name] = "weigh it"
+        notes.append(
+            "all masses and forces times one common factor change nothing in motion: "
+            f"weigh {name} and take it out of the file; the rest is judged as if it "
+            "were known"
+        )
+    found = identifiability(
+        space.select([space.names[i] for i in keep]), information[np.ix_(keep, keep)]
+    )
+    for name, sure, std in zip(found.names, found.determined, found.std, strict=True):
+        verdicts[name] = f"known to {100 * std:.2g} %" if sure else "not determined"
+    notes += [describe(d) for d in found.undetermined]
+    return verdicts, notes
+
+
 def _information(config: Config, m: Any, proposals: list[Any]) -> Any:
-    """What the logs can determine, near the middle of the proposed ranges."""
+    """Fisher information of the logs, near the middle of the proposed ranges."""
     import jax
     import jax.numpy as jnp
     import numpy as np
 
     from easi_jax.identify import effective_noise
-    from easi_jax.information import PairedFit, identifiability
+    from easi_jax.information import PairedFit
     from easi_jax.io.logs import read_logs
     from easi_jax.log_data import pooled_noise, segments_from_runs, to_common_step
     from easi_jax.machine import Machine
@@ -117,7 +151,7 @@ def _information(config: Config, m: Any, proposals: list[Any]) -> Any:
         zero = jnp.zeros((pieces.count, 2 * m.nv))
         return paired.normal(unit, zero, step_weights(pieces, noise)).hessian
 
-    return identifiability(space, np.asarray(information(unit)))
+    return np.asarray(information(unit))
 
 
 if __name__ == "__main__":

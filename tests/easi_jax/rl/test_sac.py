@@ -11,6 +11,7 @@ import pytest
 from easi_jax.env import EnvState
 from easi_jax.errors import UserError
 from easi_jax.rl import Sac, SacConfig, act
+from easi_jax.rl.episodes import Episodes
 from easi_jax.rl.probes import Probe, probe_models
 
 OBS = jnp.array([[-1.0], [1.0]])
@@ -133,30 +134,27 @@ class Counter:
 
 def test_parameters_are_redrawn_for_each_episode():
     """Every fresh episode takes its model from the distribution of that moment."""
-    config = SacConfig(env_steps=64, num_envs=8, random_steps=32, hidden=(8,))
     two_steps = probe_models()["discount"]
-    sac = Sac(
+    episodes = Episodes(
         Probe(),
-        config,
         bind=lambda theta: dataclasses.replace(two_steps, constant=theta),
         draw=lambda dist, key: dist + jax.random.uniform(key),
+        num_envs=8,
+        eval_envs=1,
     )
-    reset = jax.jit(sac._reset_finished)
+    reset = jax.jit(episodes.reset_finished)
     k1, k2, k3 = jax.random.split(jax.random.key(3), 3)
-    state = sac.init(k1, jnp.float32(0.0))
-    first = reset(state, jnp.float32(0.0), k2)
-    assert len(np.unique(first.theta)) == 8
-    assert (first.envs.terminated == 0).all()
-    running = dataclasses.replace(
-        first,
-        envs=dataclasses.replace(first.envs, truncated=jnp.arange(8) % 2 * 1.0),
-        returns=jnp.ones(8),
-    )
-    second = reset(running, jnp.float32(5.0), k3)
-    np.testing.assert_array_equal(second.theta[::2], first.theta[::2])
-    assert (second.theta[1::2] >= 5.0).all()
-    np.testing.assert_array_equal(second.returns, 1.0 - np.arange(8) % 2)
-    assert (second.envs.truncated == 0).all()
+    low, high = jnp.float32(0.0), jnp.float32(5.0)
+    envs, theta = episodes.unborn(low, k1)
+    envs, first, _ = reset(envs, theta, jnp.zeros(8), low, k2)
+    assert len(np.unique(first)) == 8
+    assert (envs.terminated == 0).all()
+    half = dataclasses.replace(envs, truncated=jnp.arange(8) % 2 * 1.0)
+    envs, second, returns = reset(half, first, jnp.ones(8), high, k3)
+    np.testing.assert_array_equal(second[::2], first[::2])
+    assert (second[1::2] >= 5.0).all()
+    np.testing.assert_array_equal(returns, 1.0 - np.arange(8) % 2)
+    assert (envs.truncated == 0).all()
 
 
 @pytest.mark.parametrize(
