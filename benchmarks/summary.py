@@ -212,6 +212,11 @@ def _transfer(folder: Path) -> list[str]:
             "goal 0.9",
         )
         out.append(_table(head, rows))
+    if any("_joint" in str(row[0]) for row in rows):
+        out.append(
+            "`_jointN`: the policy goes on training inside the search, N steps of all "
+            "environments a generation, which are taken off the final training."
+        )
     return out
 
 
