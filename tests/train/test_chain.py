@@ -7,7 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from easi_jax.errors import UserError
+from easi_jax.io.video import render
+from envs import make
 from train import easi, evaluate, pipeline, udr
 from train._command import main
 
@@ -154,6 +158,19 @@ def test_evaluate_tests_any_policy_in_any_target(chain: Path, tmp_path, capsys) 
     capsys.readouterr()
     line = _refused(capsys, evaluate, "--run", chain / "easi", "--policy", "Oracl")
     assert "Oracl" in line
+    line = _refused(capsys, evaluate, *args, "--render", tmp_path / "run.avi")
+    assert ".gif" in line
+
+
+def test_evaluate_draws_an_episode(chain: Path, tmp_path: Path) -> None:
+    try:
+        render(make("cartpole").mj_model, np.zeros((1, 2)), 16, 16)
+    except UserError as error:
+        pytest.skip(str(error))
+    out = tmp_path / "run.gif"
+    _main(evaluate, "--run", chain / "easi", "--episodes", 2, "--render", out)
+    with Image.open(out) as image:
+        assert image.n_frames > 10
 
 
 @pytest.mark.slow
