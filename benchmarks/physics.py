@@ -41,14 +41,13 @@ def native_rates(env: Any, population: int, steps: int, repeats: int) -> list[fl
     from easi_jax import runtime
 
     m, n = env.mj_model, population
-    steps = steps * env.machine.substeps
+    held = env.machine.substeps
     first = env.reset(env.model(), jax.random.key(0)).physics
     size = mujoco.mj_stateSize(m, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     start = np.zeros((n, size))
     start[:, 1 : 1 + m.nq] = np.asarray(first.qpos)
     start[:, 1 + m.nq : 1 + m.nq + m.nv] = np.asarray(first.qvel)
-    held = env.machine.substeps
-    ctrl = np.repeat(_commands(env, n, steps // held), held, axis=1)
+    ctrl = np.repeat(_commands(env, n, steps), held, axis=1)
     threads = runtime.cores()
     out = []
     with rollout.Rollout(nthread=threads) as pool:
@@ -56,7 +55,7 @@ def native_rates(env: Any, population: int, steps: int, repeats: int) -> list[fl
         for _ in range(repeats + 1):
             begin = time.monotonic()
             pool.rollout([m] * n, datas, start, ctrl)
-            out.append(n * steps / (time.monotonic() - begin))
+            out.append(n * steps * held / (time.monotonic() - begin))
     return out[1:]
 
 

@@ -161,7 +161,8 @@ def evaluate(
         for name, runs in logs.items():
             cut = [rows_of(run, first, len(run)) for run in runs]
             pieces = segments_from_runs(machine, cut, steps, every, fitted=True)
-            nominal, *rest = np.asarray(error(theta, to_device(pieces)), float)
+            pieces = to_device(pieces)
+            nominal, *rest = np.asarray(error(theta, pieces), float)
             middle = np.median(rest, axis=0)
             measures[measure][name] = {
                 "windows": pieces.count,
@@ -172,18 +173,12 @@ def evaluate(
                     for s, x in zip(seeds, rest, strict=True)
                 },
             }
-        pieces = segments_from_runs(
-            machine,
-            [rows_of(run, first, len(run)) for run in logs["chirp_minus"]],
-            steps,
-            every,
-            fitted=True,
-        )
-        best = _fitted_to_itself(machine, space, to_device(pieces), theta[1])
-        value = np.asarray(error(best[None], to_device(pieces)), float)[0]
-        measures[measure]["chirp_minus"]["fitted_to_itself"] = dict(
-            zip(joints, value.tolist(), strict=True)
-        )
+            if name == "chirp_minus":
+                best = _fitted_to_itself(machine, space, pieces, theta[1])
+                value = np.asarray(error(best[None], pieces), float)[0]
+                measures[measure][name]["fitted_to_itself"] = dict(
+                    zip(joints, value.tolist(), strict=True)
+                )
     jumps = {
         run.name: float(
             abs(

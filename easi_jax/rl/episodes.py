@@ -9,9 +9,8 @@ import jax.numpy as jnp
 
 from easi_jax.env import Env, EnvState, Model
 from easi_jax.rl.evaluate import evaluate
+from easi_jax.rl.learner import Info
 from easi_jax.rl.networks import PolicyParams, act
-
-Info = dict[str, jax.Array]
 
 
 @dataclass(frozen=True)

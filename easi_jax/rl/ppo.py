@@ -23,7 +23,8 @@ from flax import linen
 
 from easi_jax.env import Env, EnvState, Model
 from easi_jax.rl.config import PpoConfig
-from easi_jax.rl.episodes import Episodes, Info, finite, mean_where, raw_key
+from easi_jax.rl.episodes import Episodes, finite, mean_where, raw_key
+from easi_jax.rl.learner import Info
 from easi_jax.rl.networks import PolicyParams, make_networks, standardize
 
 

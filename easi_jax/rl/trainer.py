@@ -7,11 +7,11 @@ import jax
 
 from easi_jax.env import Env, Model
 from easi_jax.rl.config import PpoConfig, SacConfig
+from easi_jax.rl.learner import Info
 from easi_jax.rl.networks import PolicyParams
 from easi_jax.rl.ppo import Ppo
 from easi_jax.rl.sac import Sac
 
-Info = dict[str, jax.Array]
 TrainingConfig = SacConfig | PpoConfig
 
 
