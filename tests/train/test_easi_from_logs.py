@@ -315,13 +315,16 @@ def test_a_stopped_run_goes_on_bit_equal(blow, files, tmp_path):
         stderr=subprocess.PIPE,
         text=True,
     )
-    deadline = time.monotonic() + 400
-    while not any(files["out"].glob("checkpoints/search/step_*")):
-        assert child.poll() is None, child.communicate()[1]
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    child.send_signal(blow)
-    said = child.communicate(timeout=100)[1]
+    try:
+        deadline = time.monotonic() + 400
+        while not any(files["out"].glob("checkpoints/search/step_*")):
+            assert child.poll() is None, child.communicate()[1]
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        child.send_signal(blow)
+        said = child.communicate(timeout=100)[1]
+    finally:
+        child.kill()
     assert not (files["out"] / "distribution.json").exists()
     if blow == signal.SIGINT:
         assert child.returncode == 130
