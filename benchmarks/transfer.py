@@ -47,9 +47,7 @@ def run(config: Config) -> None:
     from train._robots import training_config
 
     env = make("cartpole")
-    sac = dataclasses.replace(
-        training_config("cartpole", config.env_steps), evaluate_every=0
-    )
+    sac = dataclasses.replace(training_config(env, config.env_steps), evaluate_every=0)
     pipe = Pipeline(
         env,
         PipelineConfig(

@@ -11,8 +11,11 @@ from mujoco.mjx._src import math
 from easi_jax.errors import UserError
 from easi_jax.model import Model, Sense, put_model, with_parameters
 from easi_jax.parameters import ParameterSpace
-from easi_jax.physics import Physics, at_rest, control_step
+from easi_jax.physics import WRITTEN_OUT, Physics, at_rest, control_step
 from easi_jax.recording import physics_steps
+
+_BATCH = 2048  # benchmarks/speed.py
+_WIDE_BATCH = 160  # benchmarks/physics.py
 
 
 class Machine:
@@ -26,6 +29,7 @@ class Machine:
         substeps: physics steps in a control step. The physics step is ``dt``
             divided by the smallest whole number that brings it to the model's own
             timestep or below.
+        batch: simulations at once on a device; more would leave a CPU core's cache.
 
     Raises:
         UserError: what MJX cannot simulate, or an address that the model lacks.
@@ -46,6 +50,7 @@ class Machine:
         self.substeps = physics_steps(self.dt, step)
         self.mj_model = mj_model
         self.space = space
+        self.batch = _BATCH if mj_model.nv <= WRITTEN_OUT else _WIDE_BATCH
         self.base = self._put().replace(sense=sense, sense_size=sense_size)
 
     def _put(self) -> Model:

@@ -15,7 +15,7 @@ from easi_jax.equality import with_velocity_products
 from easi_jax.scalarize import scalarized
 from easi_jax.small_linalg import unroll_small
 
-_UNROLLED = 8  # degrees of freedom up to which small matrices are written out
+WRITTEN_OUT = 8  # degrees of freedom up to which small matrices are written out
 
 
 @flax.struct.dataclass
@@ -56,8 +56,11 @@ def data_at(model: Any, state: Physics, ctrl: jax.Array) -> mjx.Data:
     )
 
 
-def forward(m: mjx.Model, d: mjx.Data) -> mjx.Data:
-    """`mjx.forward` with this package's constraint solver where it applies."""
+def forward(m: mjx.Model, d: mjx.Data, wide: bool = False) -> mjx.Data:
+    """`mjx.forward` with this package's constraint solver where it applies.
+
+    ``wide`` is the solver for batches of larger robots (`easi_jax.wide_solver`).
+    """
     if not solver.supported(m):
         return mjx.forward(m, d)
     d = mjx_forward.fwd_position(m, d)
@@ -69,15 +72,15 @@ def forward(m: mjx.Model, d: mjx.Data) -> mjx.Data:
     if d._impl.efc_J.size == 0:
         d = d.replace(qacc=d.qacc_smooth)
     else:
-        d = solver.solve(m, d, int(m.opt.iterations))
+        d = solver.solve(m, d, int(m.opt.iterations), wide)
     return mjx_sensor.sensor_acc(m, d)
 
 
-def mjx_step(m: mjx.Model, d: mjx.Data) -> mjx.Data:
+def mjx_step(m: mjx.Model, d: mjx.Data, wide: bool = False) -> mjx.Data:
     """`mjx.step`, its constraint solve and small matrices batched well."""
     if m.opt.integrator == IntegratorType.RK4:
         return mjx.step(m, d)  # RK4 solves inside its stages
-    d = forward(m, d)
+    d = forward(m, d, wide)
     if m.opt.integrator == IntegratorType.EULER:
         return mjx_forward.euler(m, d)
     return mjx_forward.implicit(_without_clamped(m, d), d)
@@ -105,9 +108,9 @@ def _without_clamped(m: mjx.Model, d: mjx.Data) -> mjx.Model:
     )
 
 
-def substep(model: Any, state: Physics, ctrl: jax.Array) -> Physics:
+def substep(model: Any, state: Physics, ctrl: jax.Array, wide: bool = False) -> Physics:
     """One physics step; the joint speed limit, which MuJoCo lacks, clips after it."""
-    d = mjx_step(model.mjx, data_at(model, state, ctrl))
+    d = mjx_step(model.mjx, data_at(model, state, ctrl), wide)
     qvel = jnp.clip(d.qvel, -model.speed_limit, model.speed_limit)
     sensed = model.sense(model.mjx, d) if model.sense else ()
     return Physics(d.qpos, qvel, d.act, d.qacc_warmstart, sensed)
@@ -115,8 +118,9 @@ def substep(model: Any, state: Physics, ctrl: jax.Array) -> Physics:
 
 def _otherwise(model: Any, state: Physics, ctrl: jax.Array) -> Physics:
     """Beyond what is written out entry by entry (benchmarks/physics.py)."""
-    small = model.mjx.nv <= _UNROLLED
-    return (_unrolled if small else substep)(model, state, ctrl)
+    if model.mjx.nv <= WRITTEN_OUT:
+        return _unrolled(model, state, ctrl)
+    return substep(model, state, ctrl, wide=True)
 
 
 _unrolled = unroll_small(substep)

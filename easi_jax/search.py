@@ -24,7 +24,6 @@ from easi_jax.search_config import SearchConfig
 from easi_jax.segments import Segments
 from easi_jax.strategies import make_strategy
 
-_CHUNK = 2048  # simulations at once on a device: more leave the cache
 _CLIP = 4.0  # innovations beyond this many spreads say no more than "far"
 
 
@@ -344,7 +343,7 @@ class Search:
                 )
                 return replay.predict(self.machine, self.machine.model(t), start)
 
-            return jax.lax.map(one, chunk, batch_size=max(1, _CHUNK // m))
+            return jax.lax.map(one, chunk, batch_size=max(1, self.machine.batch // m))
 
         # The mean model goes along as one more individual, from the starts as
         # measured: one compiled simulation serves both.
@@ -391,7 +390,7 @@ class Search:
                 )
                 return seg, self._reference(model, seg)
 
-            return jax.lax.map(one, chunk, batch_size=_CHUNK)
+            return jax.lax.map(one, chunk, batch_size=self.machine.batch)
 
         fake, reference = sharded_map(
             trajectories, self.mesh, (theta, keys), data.policy, model

@@ -16,8 +16,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from mujoco.mjx._src import support
 from mujoco.mjx._src.types import ConeType, DisableBit
+
+from easi_jax import wide_solver
 
 
 def supported(model: Any) -> bool:
@@ -35,13 +38,14 @@ def newton_steps(iterations: int, rows: int) -> int:
     return min(iterations, 4 + rows // 8)
 
 
-def solve(model: Any, data: Any, iterations: int) -> Any:
+def solve(model: Any, data: Any, iterations: int, wide: bool = False) -> Any:
     """Sets ``qacc``, ``qfrc_constraint`` and ``efc_force`` of an unbatched Data.
 
     Args:
         model: `mjx.Model` with pyramidal cones.
         data: `mjx.Data` after the smooth forward pass and `make_constraint`.
         iterations: Newton steps at most (see `newton_steps`).
+        wide: for batches of robots too large to be written out entry by entry.
     """
     impl = data._impl
     mass = support.full_m(model, data)
@@ -55,6 +59,8 @@ def solve(model: Any, data: Any, iterations: int) -> Any:
     problem = _Problem(
         mass, data.qfrc_smooth, impl.efc_J, impl.efc_D, impl.efc_aref, low, high
     )
+    if wide:
+        return _solve_wide(model, data, problem, iterations)
     fixed = jax.lax.stop_gradient(problem)
     smooth, warm = jax.lax.stop_gradient((data.qacc_smooth, data.qacc_warmstart))
     qacc = smooth
@@ -75,6 +81,28 @@ def solve(model: Any, data: Any, iterations: int) -> Any:
             "qfrc_constraint": impl.efc_J.T @ force,
             "_impl.efc_force": force,
         }
+    )
+
+
+def _solve_wide(model: Any, data: Any, p: "_Problem", iterations: int) -> Any:
+    rows = wide_solver.rows_of(model, data)
+    single = np.flatnonzero(np.array(rows.single) >= 0)
+    dofs = np.array(rows.single)[single]
+    order = np.concatenate([np.array(rows.dense, int), single])
+    problem = wide_solver.Problem(
+        p.mass,
+        p.smooth,
+        p.jac[np.array(rows.dense, int)],
+        p.jac[single, dofs],
+        *(x[order] for x in (p.stiff, p.aref, p.low, p.high)),
+    )
+    cold = model.opt.disableflags & DisableBit.WARMSTART
+    warm = data.qacc_smooth if cold else data.qacc_warmstart
+    find = wide_solver.solution(rows, newton_steps(iterations, len(order)))
+    qacc, force, joint = find(problem, warm, data.qacc_smooth)
+    force = force[np.argsort(order)]
+    return data.tree_replace(
+        {"qacc": qacc, "qfrc_constraint": joint, "_impl.efc_force": force}
     )
 
 

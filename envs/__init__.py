@@ -1,6 +1,9 @@
-"""Built-in robots, by name."""
+"""Built-in robots, by name, and environments of the user's own, by file."""
 
+import importlib.util
+import traceback
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from easi_jax.errors import UserError, nearest
@@ -29,3 +32,52 @@ def make(name: str, **options: Any) -> Any:
             f'unknown robot "{name}" (known: {known}){nearest(name, REGISTRY)}'
         )
     return REGISTRY[name](**options)
+
+
+_NEEDED = (
+    *("name", "obs_size", "action_size", "episode_length", "dt", "mj_model", "space"),
+    *("machine", "model", "reset", "step", "control"),
+)
+
+
+def load(path: Path) -> Any:
+    """The environment that a Python file's ``make()`` returns.
+
+    The file runs as it is, with all rights of the user; a template is
+    ``examples/my_robot/env.py``.
+
+    Raises:
+        UserError: no such file, an error in it, or an environment that lacks something.
+    """
+    if path.suffix != ".py":
+        raise UserError(f"--env {path}: give a Python file (.py) that defines make()")
+    if not path.is_file():
+        raise UserError(f"--env {path}: there is no such file")
+    spec = importlib.util.spec_from_file_location(f"_own_env_{path.stem}", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+        if not callable(getattr(module, "make", None)):
+            raise UserError(f"--env {path}: the file defines no function make()")
+        env = module.make()
+    except UserError:
+        raise
+    except Exception as e:  # whatever the user's code does
+        frames = traceback.extract_tb(e.__traceback__)
+        lines = [f.lineno for f in frames if Path(f.filename).name == path.name]
+        own = (isinstance(e, SyntaxError) and e.lineno) or (lines or [None])[-1]
+        where = f"{path}, line {own}" if own else str(path)
+        raise UserError(f"--env {where}: {type(e).__name__}: {e}") from e
+    missing = [n for n in _NEEDED if not hasattr(env, n)]
+    if missing:
+        raise UserError(
+            f"--env {path}: the environment that make() returns lacks "
+            f"{', '.join(missing)} (template: examples/my_robot/env.py)"
+        )
+    return env
+
+
+def open_env(robot: str, path: Path | None = None) -> Any:
+    """The environment in the file ``path``, or else the built-in ``robot``."""
+    return make(robot) if path is None else load(path)

@@ -1,6 +1,9 @@
 """What the built-in robots share: model file, parameters, machine."""
 
+from collections.abc import Mapping
 from importlib import resources
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -17,13 +20,14 @@ _FACTOR = 1e3  # of the nominal value, that bounds allow either way
 
 
 class Robot:
-    """A built-in robot; subclasses say what it observes and what it is asked to do.
+    """A robot with a task; subclasses say what it observes and what it is asked to do.
 
     Attributes:
         mj_model: the robot in MuJoCo.
         space: its parameters; a search starts in [nominal / k, k nominal].
         machine: how it is simulated.
         default_target: how the pseudo-real robot differs where nothing else is said.
+        training: settings by algorithm, the default first; presets where empty.
     """
 
     name: str
@@ -33,10 +37,21 @@ class Robot:
     dt: float
     k: float = 3.0
     default_target: tuple[str, ...] = ()
+    training: Mapping[str, Any] = MappingProxyType({})
 
-    def __init__(self, addresses: dict[str, str]) -> None:
-        path = resources.files("envs") / "assets" / f"{self.name}.xml"
-        self.mj_model = mujoco.MjModel.from_xml_string(path.read_text())
+    def __init__(
+        self,
+        addresses: dict[str, str],
+        model: Path | mujoco.MjModel | None = None,
+    ) -> None:
+        """Builds the machine.
+
+        Args:
+            addresses: parameter names and what each is in the model
+                (docs/your_own_robot.md).
+            model: MJCF file or model; a built-in robot's own where not given.
+        """
+        self.mj_model = _read(self.name, model)
         self.space = parameter_space(self.mj_model, addresses, self.k)
         self.machine = Machine(self.mj_model, self.space, self.dt)
 
@@ -55,6 +70,15 @@ class Robot:
     ) -> Physics:
         """The physics after a control step."""
         return self.machine.step(model, state.physics, self.control(state, action))
+
+
+def _read(name: str, model: Path | mujoco.MjModel | None) -> mujoco.MjModel:
+    if isinstance(model, mujoco.MjModel):
+        return model
+    if model is not None:
+        return mujoco.MjModel.from_xml_path(str(model))
+    path = resources.files("envs") / "assets" / f"{name}.xml"
+    return mujoco.MjModel.from_xml_string(path.read_text())
 
 
 def parameter_space(

@@ -33,9 +33,8 @@ def run(config: "Config") -> None:
         stage_keys,
         target_parameters,
     )
-    from envs import make
 
-    udr = load_udr(config.udr)
+    udr = load_udr(config.udr, config.env)
     seeds = config.seeds or udr["seeds"]
     missing = [s for s in seeds if s not in udr["seeds"]]
     if missing:
@@ -43,7 +42,7 @@ def run(config: "Config") -> None:
             f"{config.udr} has no policy of seed {missing[0]}: it holds seeds "
             f"{list(udr['seeds'])}"
         )
-    env = make(udr["robot"])
+    env = udr["env"]
     changes = env.default_target if config.target is None else config.target
     theta = target_parameters(env.space, changes)
     noisy = any(x > 0 for x in config.noise)

@@ -161,6 +161,7 @@ def write_pseudo_real(
         "results.json",
         {
             "robot": pipe.env.name,
+            "env": folder.config.get("env"),
             "seeds": list(seeds),
             "env_steps": config.training.env_steps,
             "algorithm": algorithm_of(config.training),

@@ -6,14 +6,14 @@ from typing import Any
 
 
 def training_config(
-    robot: str, env_steps: int | None = None, algorithm: str | None = None
+    env: Any, env_steps: int | None = None, algorithm: str | None = None
 ) -> Any:
     """Training settings of a robot, with another budget or algorithm where given."""
     from dataclasses import replace
 
     from easi_jax.rl.presets import training_preset
 
-    config = training_preset(robot, algorithm)
+    config = training_preset(env, algorithm)
     return config if env_steps is None else replace(config, env_steps=env_steps)
 
 
@@ -73,6 +73,35 @@ def check_chunk(chunk: int) -> None:
         raise UserError(f"--chunk is {chunk}: give at least 1")
 
 
+def env_of(folder: Path, made_with: Any, path: Path | None) -> Any:
+    """The environment that a run folder was made with.
+
+    Args:
+        folder: named in messages.
+        made_with: ``robot`` and ``env`` as the folder holds them.
+        path: ``--env`` of this command. A folder's own word for a file is not enough:
+            the file is run, and folders are passed on.
+
+    Raises:
+        UserError: the folder needs ``--env``, or does not go with it.
+    """
+    from easi_jax.errors import UserError
+    from envs import open_env
+
+    theirs = made_with.get("env")
+    if theirs and path is None:
+        raise UserError(
+            f"{folder} was made with the environment {theirs}: say --env FILE with a "
+            "file that you trust, it will be run"
+        )
+    if path is not None and not theirs:
+        raise UserError(
+            f"{folder} was made with the built-in robot {made_with['robot']}: leave "
+            "--env out"
+        )
+    return open_env(made_with["robot"], path)
+
+
 def save_policies(folder: Any, method: str, policies: Any) -> None:
     """Keeps the policies ``(S, ...)`` of one method in a run folder."""
     from easi_jax.io import checkpoints
@@ -81,15 +110,18 @@ def save_policies(folder: Any, method: str, policies: Any) -> None:
     checkpoints.save(place, 0, policies, config_hash=folder.config_hash)
 
 
-def load_policies(folder: Path, method: str | None = None) -> dict[str, Any]:
+def load_policies(
+    folder: Path, method: str | None = None, env_file: Path | None = None
+) -> dict[str, Any]:
     """Policies of a finished run of train.udr, train.easi or train.pipeline.
 
     Args:
         folder: the run folder.
         method: UDR, EASI or Oracle; the run's own where not given.
+        env_file: see `env_of`.
 
     Returns:
-        ``robot``, ``seeds``, ``training``, ``method`` and ``policies`` ``(S, ...)``.
+        ``env``, ``seeds``, ``training``, ``method`` and ``policies`` ``(S, ...)``.
 
     Raises:
         UserError: no finished run, or none of that method.
@@ -101,7 +133,6 @@ def load_policies(folder: Path, method: str | None = None) -> dict[str, Any]:
     from easi_jax.io.files import read_json
     from easi_jax.io.runs import read_config
     from easi_jax.pipeline import Pipeline, PipelineConfig
-    from envs import make
 
     read_config(folder)
     if not (folder / "results.json").exists():
@@ -118,11 +149,9 @@ def load_policies(folder: Path, method: str | None = None) -> dict[str, Any]:
             f'{folder} has no policy "{chosen}" (it has '
             f"{', '.join(result['methods'])}){nearest(chosen, result['methods'])}"
         )
-    robot, seeds = result["robot"], tuple(result["seeds"])
-    training = training_config(
-        robot, result["env_steps"], result.get("algorithm", "sac")
-    )
-    pipe = Pipeline(make(robot), PipelineConfig(training=training))
+    env, seeds = env_of(folder, result, env_file), tuple(result["seeds"])
+    training = training_config(env, result["env_steps"], result.get("algorithm", "sac"))
+    pipe = Pipeline(env, PipelineConfig(training=training))
     keys = jax.random.split(jax.random.key(0), len(seeds))
     target = jax.eval_shape(
         lambda k: pipe.policies(
@@ -134,7 +163,7 @@ def load_policies(folder: Path, method: str | None = None) -> dict[str, Any]:
     if found is None:
         raise UserError(f"{folder} has lost its policies: run it again")
     return {
-        "robot": robot,
+        "env": env,
         "seeds": seeds,
         "training": training,
         "method": chosen,
@@ -142,8 +171,10 @@ def load_policies(folder: Path, method: str | None = None) -> dict[str, Any]:
     }
 
 
-def load_udr(folder: Path) -> dict[str, Any]:
-    """What ``train.udr`` left: robot, seeds, settings, target, training states.
+def load_udr(folder: Path, env_file: Path | None = None) -> dict[str, Any]:
+    """What ``train.udr`` left: environment, seeds, settings, training states.
+
+    ``env_file``: see `env_of`.
 
     Raises:
         UserError: the folder holds no finished UDR run.
@@ -154,7 +185,6 @@ def load_udr(folder: Path) -> dict[str, Any]:
     from easi_jax.io import checkpoints
     from easi_jax.io.runs import config_hash, read_config
     from easi_jax.pipeline import Pipeline, PipelineConfig, seed_keys
-    from envs import make
 
     config = read_config(folder)
     if "robot" not in config or "env_steps" not in config or "udr" in config:
@@ -163,10 +193,8 @@ def load_udr(folder: Path) -> dict[str, Any]:
         raise UserError(
             f"{folder} holds an unfinished run of train.udr: finish it with --resume"
         )
-    env = make(config["robot"])
-    training = training_config(
-        config["robot"], config["env_steps"], config.get("algorithm")
-    )
+    env = env_of(folder, config, env_file)
+    training = training_config(env, config["env_steps"], config.get("algorithm"))
     pipe = Pipeline(env, PipelineConfig(training=training))
     seeds = tuple(int(s) for s in config["seeds"])
     keys = seed_keys(list(seeds))
@@ -178,7 +206,7 @@ def load_udr(folder: Path) -> dict[str, Any]:
     if found is None:
         raise UserError(f"{folder} has lost its checkpoint: run train.udr again")
     return {
-        "robot": config["robot"],
+        "env": env,
         "seeds": seeds,
         "training": training,
         "states": found.state,

@@ -20,6 +20,8 @@ class Config:
 
     udr: Path = Path("results/udr")
     """Run folder of train.udr: its policy records the demonstrations."""
+    env: Path | None = None
+    """The Python file of your own environment, where train.udr was run with one."""
     out: Path = Path("results/easi")
     """Folder of the run."""
     target: tuple[str, ...] | None = None
@@ -87,6 +89,8 @@ def run(config: Config) -> None:
     check_chunk(config.search_chunk)
     if config.seeds:
         check_seeds(config.seeds)
+    if config.data and config.env:
+        raise UserError("--env goes without --data: give --model and --parameters")
     if config.data:
         from train import _from_logs
 

@@ -18,6 +18,8 @@ class Config:
 
     run: Path = Path("results/easi")
     """Folder of a finished run of train.udr, train.easi or train.pipeline."""
+    env: Path | None = None
+    """The Python file of your own environment, where the run was made with one."""
     policy: str | None = None
     """UDR, EASI or Oracle; not given: what the run was made for."""
     target: tuple[str, ...] = ()
@@ -42,15 +44,14 @@ def run(config: Config) -> None:
     from easi_jax.errors import UserError
     from easi_jax.io.files import atomic_write, to_json
     from easi_jax.pipeline import Pipeline, PipelineConfig, target_parameters
-    from envs import make
     from train._robots import load_policies
 
     if config.episodes < 1:
         raise UserError(f"--episodes is {config.episodes}: give at least 1")
     if config.render is not None and config.render.suffix not in (".gif", ".mp4"):
         raise UserError(f"--render {config.render}: a video ends in .gif or .mp4")
-    saved = load_policies(config.run, config.policy)
-    env = make(saved["robot"])
+    saved = load_policies(config.run, config.policy, config.env)
+    env = saved["env"]
     theta = target_parameters(env.space, config.target)
     pipe = Pipeline(
         env, PipelineConfig(training=saved["training"], eval_episodes=config.episodes)
@@ -65,14 +66,14 @@ def run(config: Config) -> None:
         for s, r in zip(saved["seeds"], returns, strict=True)
     ]
     show_table(
-        f"{saved['method']} policy on {saved['robot']}, target "
+        f"{saved['method']} policy on {env.name}, target "
         f"{', '.join(config.target) or 'nominal'}",
         ("seed", "mean return", "std of episodes", "worst episode"),
         rows,
     )
     if config.out is not None:
         result = {
-            "robot": saved["robot"],
+            "robot": env.name,
             "method": saved["method"],
             "target": dict(zip(env.space.names, theta.tolist(), strict=True)),
             "returns": {

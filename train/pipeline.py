@@ -19,6 +19,9 @@ class Config:
 
     robot: str = "cartpole"
     """Built-in robot."""
+    env: Path | None = None
+    """An environment of your own, a Python file, in place of --robot (template:
+    examples/my_robot/env.py)."""
     out: Path = Path("results/pipeline")
     """Folder of the run."""
     target: tuple[str, ...] | None = None
@@ -74,12 +77,12 @@ def run(config: Config) -> None:
         stage_keys,
         target_parameters,
     )
-    from envs import make
+    from envs import open_env
     from train._pseudo_real import held_out_errors
     from train._results import write_pseudo_real
     from train._stages import search_rows, training_rows
 
-    env = make(config.robot)
+    env = open_env(config.robot, config.env)
     changes = env.default_target if config.target is None else config.target
     theta = target_parameters(env.space, changes)
     noisy = any(x > 0 for x in config.noise)
@@ -95,7 +98,7 @@ def run(config: Config) -> None:
         env,
         PipelineConfig(
             search=search,
-            training=training_config(config.robot, config.env_steps, config.algorithm),
+            training=training_config(env, config.env_steps, config.algorithm),
             trajectories=config.trajectories,
             noise=config.noise,
             refine=config.refine,

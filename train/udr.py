@@ -17,6 +17,9 @@ class Config:
 
     robot: str = "cartpole"
     """Built-in robot."""
+    env: Path | None = None
+    """An environment of your own, a Python file, in place of --robot (template:
+    examples/my_robot/env.py)."""
     out: Path = Path("results/udr")
     """Folder of the run."""
     seeds: tuple[int, ...] = (0,)
@@ -62,11 +65,11 @@ def run(config: Config) -> None:
         target_parameters,
     )
     from easi_jax.rl.presets import algorithm_of
-    from envs import make
+    from envs import open_env
     from train._stages import jit_chunks, run_stage, training_curve, training_rows
 
-    env = make(config.robot)
-    training = training_config(config.robot, config.env_steps, config.algorithm)
+    env = open_env(config.robot, config.env)
+    training = training_config(env, config.env_steps, config.algorithm)
     theta = target_parameters(env.space, config.target)
     pipe = Pipeline(
         env, PipelineConfig(training=training, eval_episodes=config.eval_episodes)
@@ -100,7 +103,8 @@ def run(config: Config) -> None:
         per_seed = returns.mean(1)
         save_policies(folder, "UDR", policies)
         results = {
-            "robot": config.robot,
+            "robot": env.name,
+            "env": None if config.env is None else str(config.env),
             "seeds": list(config.seeds),
             "env_steps": training.env_steps,
             "algorithm": algorithm_of(training),
@@ -123,11 +127,11 @@ def run(config: Config) -> None:
                 )
             )
         rows = [(s, f"{r:.1f}") for s, r in zip(config.seeds, per_seed, strict=True)]
-        title = f"UDR on {config.robot}: return in the target"
+        title = f"UDR on {env.name}: return in the target"
         write_report(
             folder.path / "report.html",
             Report(
-                title=f"UDR on {config.robot}",
+                title=f"UDR on {env.name}",
                 headline=[
                     f"The policy trained under uniform randomization returns "
                     f"{np.median(per_seed):.1f} in the target (median of "

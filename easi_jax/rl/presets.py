@@ -4,6 +4,7 @@ The first algorithm of a robot is its default.
 """
 
 from dataclasses import replace
+from typing import Any
 
 from easi_jax.errors import UserError, nearest
 from easi_jax.rl.config import PpoConfig, SacConfig
@@ -36,6 +37,7 @@ _PPO = PpoConfig(
     evaluate_every=20,
 )
 
+_GENERAL: dict[str, TrainingConfig] = {"sac": _SAC, "ppo": _PPO}
 PRESETS: dict[str, dict[str, TrainingConfig]] = {
     "cartpole": {"sac": _SAC, "ppo": _PPO},
     "ant": {
@@ -53,18 +55,16 @@ PRESETS: dict[str, dict[str, TrainingConfig]] = {
 }
 
 
-def training_preset(robot: str, algorithm: str | None = None) -> TrainingConfig:
-    """Settings of a built-in robot, for its own or another algorithm.
+def training_preset(env: Any, algorithm: str | None = None) -> TrainingConfig:
+    """Settings of a robot, for its own or another algorithm.
+
+    An environment may bring its own as ``training``; what is neither built in nor
+    brings any gets general ones.
 
     Raises:
-        UserError: no robot or no algorithm of that name.
+        UserError: no algorithm of that name.
     """
-    if robot not in PRESETS:
-        known = ", ".join(sorted(PRESETS))
-        raise UserError(
-            f'unknown robot "{robot}" (known: {known}){nearest(robot, PRESETS)}'
-        )
-    mine = PRESETS[robot]
+    mine = getattr(env, "training", None) or PRESETS.get(env.name, _GENERAL)
     if algorithm is None:
         return next(iter(mine.values()))
     if algorithm not in mine:

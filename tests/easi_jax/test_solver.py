@@ -1,5 +1,6 @@
 """The constraint solver against MuJoCo C, and its derivatives."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -10,6 +11,7 @@ import pytest
 from mujoco import mjx
 
 from easi_jax import physics, solver
+from easi_jax.wide_solver import solve_spd
 
 XML = """<mujoco><option timestep="0.002" iterations="{iterations}" cone="{cone}"
   tolerance="1e-14" ls_iterations="50" solver="Newton" integrator="Euler"/>
@@ -65,7 +67,8 @@ def states() -> tuple[list[Any], np.ndarray, np.ndarray]:
     return picked, np.array(found), np.array(touching)
 
 
-def test_equals_mujoco_c_with_every_kind_of_row(states: Any) -> None:
+@pytest.mark.parametrize("wide", [False, True])
+def test_equals_mujoco_c_with_every_kind_of_row(states: Any, wide: bool) -> None:
     picked, want, touching = states
     with jax.enable_x64(True):
         put = mjx.put_model(load(iterations=12), impl="jax")
@@ -73,11 +76,11 @@ def test_equals_mujoco_c_with_every_kind_of_row(states: Any) -> None:
         @jax.jit
         def solution(qpos: jax.Array, qvel: jax.Array) -> tuple[jax.Array, jax.Array]:
             data = mjx.make_data(put).replace(qpos=qpos, qvel=qvel)
-            data = physics.forward(put, data)
+            data = physics.forward(put, data, wide)
             return data.qacc, jnp.sum(data._impl.contact.dist < 0)
 
-        out = [solution(*map(jnp.asarray, s)) for s in picked]
-        got, contacts = np.array([o[0] for o in out]), np.array([o[1] for o in out])
+        inputs = (jnp.asarray(np.array(x)) for x in zip(*picked, strict=True))
+        got, contacts = map(np.asarray, jax.vmap(solution)(*inputs))
     scale = np.abs(want).max(axis=1, keepdims=True)
     # A tilted box meets the floor with fewer corners in MJX's collision than in C's.
     same = contacts == touching
@@ -108,10 +111,12 @@ def small() -> Any:
             m = mujoco.MjModel.from_xml_string(ARM.format(iterations=iterations))
             put = mjx.put_model(m, impl="jax")
 
-            def qacc(qpos: jax.Array, qvel: jax.Array, loss: jax.Array) -> jax.Array:
+            def qacc(
+                qpos: jax.Array, qvel: jax.Array, loss: jax.Array, wide: bool = False
+            ) -> jax.Array:
                 changed = put.replace(dof_frictionloss=loss)
                 data = mjx.make_data(changed).replace(qpos=qpos, qvel=qvel)
-                return physics.forward(changed, data).qacc
+                return physics.forward(changed, data, wide).qacc
 
             return qacc
 
@@ -142,12 +147,13 @@ def test_three_newton_steps_suffice_for_a_cart_with_a_pole(
     assert (np.abs(np.asarray(one - many)) / scale).max() > 1e-6
 
 
-def test_forward_derivatives_equal_finite_differences(small: Any) -> None:
+@pytest.mark.parametrize("wide", [False, True])
+def test_forward_derivatives_equal_finite_differences(small: Any, wide: bool) -> None:
     with jax.enable_x64(True):
         qpos, qvel, loss = (jnp.asarray(x) for x in points())
         # Not at rest: there the solution has corners.
         qvel = qvel + 0.3
-        f = jax.jit(jax.vmap(small(3)))
+        f = jax.jit(jax.vmap(partial(small(4), wide=wide)))
         v = jax.random.normal(jax.random.key(1), qpos.shape)
         _, slope = jax.jvp(
             lambda e: f(qpos + e * v, qvel + e * v, loss * (1 + e)), (0.0,), (1.0,)
@@ -158,3 +164,17 @@ def test_forward_derivatives_equal_finite_differences(small: Any) -> None:
         numeric = (plus - minus) / (2 * h)
     assert np.isfinite(slope).all() and np.abs(slope).max() > 1.0
     np.testing.assert_allclose(slope, numeric, rtol=1e-5, atol=1e-5)
+
+
+def test_lanes_add_up_over_nested_batches() -> None:
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(3, 4, 6, 6))
+    a = jnp.asarray(roots @ roots.swapaxes(-1, -2) + np.eye(6), jnp.float32)
+    b = jnp.asarray(rng.normal(size=(4, 6)), jnp.float32)
+    each = jax.vmap(solve_spd)  # over 4
+    got = jax.jit(jax.vmap(each, in_axes=(0, None)))(a, b)  # over 3, the same b
+    want = np.linalg.solve(np.asarray(a, float), np.asarray(b, float)[None, ..., None])
+    np.testing.assert_allclose(got, want[..., 0], rtol=2e-3, atol=1e-4)
+    alone = solve_spd(a[1, 2], b[2])
+    np.testing.assert_allclose(got[1, 2], alone, rtol=1e-4)
+    assert np.isnan(solve_spd(a[0, 0] * jnp.nan, b[0])).all()

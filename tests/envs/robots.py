@@ -4,13 +4,16 @@ import fnmatch
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
 from easi_jax.machine import Machine
-from envs import REGISTRY, make
+from envs import REGISTRY, load, make
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,11 @@ CASES = {
         30,
         _around(lambda e: e.mj_model.key_ctrl[0], 0.25),
     ),
+    "two_link": Case(
+        lambda: load(EXAMPLES / "my_robot" / "env.py"),
+        60,
+        _around(lambda e: np.zeros(2), 0.3),
+    ),
 }
 assert set(REGISTRY) <= set(CASES), "a robot is not tested"
 
@@ -72,6 +80,8 @@ def converged(env: Any) -> Machine:
 
 def spec_of(env: Any) -> mujoco.MjSpec:
     path = resources.files("envs") / "assets" / f"{env.name}.xml"
+    if env.name == "two_link":
+        path = EXAMPLES / "my_robot" / "model.xml"
     return mujoco.MjSpec.from_string(path.read_text())
 
 
@@ -154,6 +164,7 @@ _WRITE: dict[tuple[str, str], Callable[[Any, float], None]] = {
     ("actuator", "kp"): _kp,
     ("actuator", "kv"): _kv,
     ("actuator", "force_limit"): _force_limit,
+    ("actuator", "gear"): _set_first("gear"),
     ("body", "mass"): _mass,
     ("geom", "friction"): _set_first("friction"),
     ("geom", "contact_damping"): _contact_damping,

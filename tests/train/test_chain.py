@@ -58,7 +58,8 @@ def _restored(run: Path, stage: str):
     from train._robots import training_config
 
     pipe = Pipeline(
-        make("cartpole"), PipelineConfig(training=training_config("cartpole", 2400))
+        make("cartpole"),
+        PipelineConfig(training=training_config(make("cartpole"), 2400)),
     )
     wide = pipe.spread(pipe.udr(), 1)
     target = jax.eval_shape(lambda k: pipe.train_init(k, wide), seed_keys([0]))
