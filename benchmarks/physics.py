@@ -66,12 +66,15 @@ def search_rates(
     repeats: int,
     step: Callable[..., Any] | None = None,
     fast: bool = True,
+    sensing: bool = False,
 ) -> tuple[list[float], float]:
     """Physics steps per second of a population, each individual its own model.
 
     Args:
         step: one physics step in place of the package's, ``(model, state, ctrl)``.
         fast: with `easi_jax.runtime.fast_loops`.
+        sensing: read what controllers need, such as contact forces; the replay of
+            measured motion does not.
 
     Returns:
         Rates, and the seconds that tracing and compiling took.
@@ -79,6 +82,7 @@ def search_rates(
     import jax
     import jax.numpy as jnp
 
+    from easi_jax import physics
     from easi_jax.mesh import make_mesh, sharded_map
     from easi_jax.runtime import fast_loops
 
@@ -100,12 +104,15 @@ def search_rates(
     def local(items: Any) -> Any:
         def one(u: Any, c: Any) -> Any:
             model = machine.model(env.space.to_si(u))
+            if not sensing:
+                model = model.replace(sense=None)
 
             def advance(s: Any, a: Any) -> Any:
                 s = control_step(model, s, a)
                 return s, (s.qpos, s.qvel)
 
-            return jax.lax.scan(advance, first, c)[1]
+            begin = physics.at_rest(model, first.qpos, first.qvel)
+            return jax.lax.scan(advance, begin, c)[1]
 
         return jax.vmap(one)(*items)
 
@@ -135,7 +142,8 @@ def _commands(env: Any, count: int, steps: int) -> Any:
     return middle + half * rng.uniform(-1, 1, (count, steps, len(low)))
 
 
-def _variants() -> dict[str, tuple[Callable[..., Any], bool]]:
+def _variants() -> dict[str, tuple[Callable[..., Any] | None, bool, bool]]:
+    """Label: physics step (None: the package's), newer loop emitters, sensing."""
     from mujoco import mjx
 
     from easi_jax import physics
@@ -147,19 +155,13 @@ def _variants() -> dict[str, tuple[Callable[..., Any], bool]]:
             state, qpos=d.qpos, qvel=d.qvel, warmstart=d.qacc_warmstart
         )
 
-    def blind(model: Any, state: Any, ctrl: Any) -> Any:
-        new = physics.substep(model.replace(sense=None), state, ctrl)
-        return dataclasses.replace(new, sensed=state.sensed)
-
     return {
-        "own solver, arrays": (physics.substep, False),
-        "own solver, arrays, newer emitters": (physics.substep, True),
-        "own solver, small matrices written out": (
-            unroll_small(physics.substep),
-            True,
-        ),
-        "own solver, without contact sensing": (blind, False),
-        "mjx.step": (plain_mjx, False),
+        "with contact forces read, for controllers": (None, True, True),
+        "older loop emitters": (None, False, False),
+        "solver on plain arrays": (physics.substep, True, False),
+        "solver on plain arrays, older loop emitters": (physics.substep, False, False),
+        "all small matrices written out": (unroll_small(physics.substep), True, False),
+        "mjx.step": (plain_mjx, False, False),
     }
 
 
@@ -182,8 +184,10 @@ def run(config: Config) -> None:
         ratio = float(np.median(ours) / np.median(native))
         rows = [("as the search runs it", f"{np.median(ours):,.0f}", f"{ratio:.2f}")]
         tried = {}
-        for label, (step, fast) in _variants().items() if config.variants else ():
-            rates, seconds = search_rates(env, n, steps, 2, step, fast)
+        for label, (step, fast, sensing) in _variants().items():
+            if not config.variants or (sensing and not env.machine.base.sense):
+                continue
+            rates, seconds = search_rates(env, n, steps, 2, step, fast, sensing)
             tried[label] = {"steps_per_s": rates, "compile_s": seconds}
             share = np.median(rates) / np.median(native)
             rows.append((label, f"{np.median(rates):,.0f}", f"{share:.2f}"))

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks._common import RESULTS
+from benchmarks.physics import GOALS
 from benchmarks.recovery import CASES
 from train._command import main, say
 
@@ -33,7 +34,7 @@ def run(config: Config) -> None:
     from easi_jax.io.files import atomic_write
 
     parts = ["# Results", "Made by `python -m benchmarks.summary` from the files here."]
-    for section in (_speed, _recovery, _transfer, _real):
+    for section in (_speed, _physics, _recovery, _transfer, _real):
         parts += section(config.results)
     path = config.results / "README.md"
     atomic_write(path, "\n\n".join(parts) + "\n")
@@ -106,6 +107,49 @@ def _speed(folder: Path) -> list[str]:
         "## Speed",
         f"`{r['command']}`",
         _table(("figure", "measured", "goal", ""), rows),
+    ]
+
+
+def _physics(folder: Path) -> list[str]:
+    """Physics steps per second of every robot, and ways to run a step."""
+    import numpy as np
+
+    title = "## Physics of every robot"
+    found = {name: _read(folder, f"physics_{name}") for name in GOALS}
+    if not any(found.values()):
+        return [title, "Not run (`python -m benchmarks.physics`)."]
+    rows, tried = [], []
+    for name, result in found.items():
+        if result is None:
+            rows.append((name, "not run"))
+            continue
+        native = float(np.median(result["native_steps_per_s"]))
+        ours = float(np.median(result["search_steps_per_s"]))
+        met = "met" if result["ratio"] >= result["ratio_goal"] else "**missed**"
+        rows.append(
+            (
+                name,
+                f"{ours:,.0f}",
+                f"{native:,.0f}",
+                f"{result['ratio']:.2f}",
+                f"{result['ratio_goal']:g}, {met}",
+                f"{result['compile_s']:.0f} s",
+            )
+        )
+        for label, variant in result["variants"].items():
+            rate = float(np.median(variant["steps_per_s"]))
+            compiled = f"{variant['compile_s']:.0f} s"
+            tried.append((name, label, f"{rate / native:.2f}", compiled))
+    return [
+        title,
+        "`python -m benchmarks.physics`: a population of 300, each a model of its own, "
+        "against `mujoco.rollout` on the same cores; medians, all timings in the "
+        "files.",
+        _table(
+            ("robot", "steps/s", "native", "ratio", "goal", "trace and compile"), rows
+        ),
+        "Other ways to run a step that were tried (ratio to native):",
+        _table(("robot", "step", "ratio", "trace and compile"), tried),
     ]
 
 

@@ -12,6 +12,7 @@ from mujoco import mjx
 
 from easi_jax.addresses import Writer, open_gates, resolve
 from easi_jax.constants import set_const
+from easi_jax.drives import TorqueSpeed
 from easi_jax.errors import UserError
 from easi_jax.quantities import length_of, long_axis, unit_inertia
 
@@ -30,6 +31,8 @@ class Model:
         sense: ``sense(mjx_model, data) -> (sense_size,)``, read in every physics step
             (static); None for nothing.
         sense_size: how many numbers it reads (static).
+        torque_speed: what the actuators can give at which speed, within their force
+            limits; None for no such curve.
     """
 
     mjx: mjx.Model
@@ -38,6 +41,7 @@ class Model:
     long_axes: tuple[int, ...] = flax.struct.field(pytree_node=False, default=())
     sense: Sense | None = flax.struct.field(pytree_node=False, default=None)
     sense_size: int = flax.struct.field(pytree_node=False, default=0)
+    torque_speed: TorqueSpeed | None = None
 
     if TYPE_CHECKING:  # made by flax
 

@@ -108,9 +108,19 @@ def _without_clamped(m: mjx.Model, d: mjx.Data) -> mjx.Model:
     )
 
 
+def _with_torque_speed(m: mjx.Model, limits: jax.Array) -> mjx.Model:
+    own = m.actuator_forcerange
+    low = jnp.maximum(own[:, 0], limits[:, 0])
+    high = jnp.minimum(own[:, 1], limits[:, 1])
+    return m.replace(actuator_forcerange=jnp.stack([low, high], axis=1))
+
+
 def substep(model: Any, state: Physics, ctrl: jax.Array, wide: bool = False) -> Physics:
     """One physics step; the joint speed limit, which MuJoCo lacks, clips after it."""
-    d = mjx_step(model.mjx, data_at(model, state, ctrl), wide)
+    m = model.mjx
+    if model.torque_speed is not None:
+        m = _with_torque_speed(m, model.torque_speed.limits(state.qvel))
+    d = mjx_step(m, data_at(model, state, ctrl), wide)
     qvel = jnp.clip(d.qvel, -model.speed_limit, model.speed_limit)
     sensed = model.sense(model.mjx, d) if model.sense else ()
     return Physics(d.qpos, qvel, d.act, d.qacc_warmstart, sensed)

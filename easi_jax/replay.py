@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from easi_jax.machine import Machine
+from easi_jax.physics import at_rest
 from easi_jax.segments import Segments
 
 
@@ -13,13 +14,14 @@ def predict(
     machine: Machine, model: Any, segments: Segments
 ) -> tuple[jax.Array, jax.Array]:
     """Open-loop prediction: ``qpos (M, H, nq)``, ``qvel (M, H, nv)``."""
+    model = model.replace(sense=None)  # read by controllers only
 
     def one(qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array) -> Any:
         def step(state: Any, u: jax.Array) -> Any:
             state = machine.step(model, state, u)
             return state, (state.qpos, state.qvel)
 
-        return jax.lax.scan(step, machine.start(qpos, qvel), ctrl)[1]
+        return jax.lax.scan(step, at_rest(model, qpos, qvel), ctrl)[1]
 
     return jax.vmap(one)(segments.qpos, segments.qvel, segments.ctrl)
 

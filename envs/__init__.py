@@ -1,8 +1,9 @@
 """Built-in robots, by name, and environments of the user's own, by file."""
 
 import importlib.util
+import inspect
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +25,20 @@ def make(name: str, **options: Any) -> Any:
     """The built-in robot ``name``.
 
     Raises:
-        UserError: no robot of that name.
+        UserError: no robot of that name, or none of its options.
     """
     if name not in REGISTRY:
         known = ", ".join(sorted(REGISTRY))
         raise UserError(
             f'unknown robot "{name}" (known: {known}){nearest(name, REGISTRY)}'
         )
+    known = inspect.signature(REGISTRY[name]).parameters
+    for option in options:
+        if option not in known:
+            raise UserError(
+                f'{name} has no option "{option}" (known: '
+                f"{', '.join(known) or 'none'}){nearest(option, known)}"
+            )
     return REGISTRY[name](**options)
 
 
@@ -78,6 +86,23 @@ def load(path: Path) -> Any:
     return env
 
 
-def open_env(robot: str, path: Path | None = None) -> Any:
-    """The environment in the file ``path``, or else the built-in ``robot``."""
-    return make(robot) if path is None else load(path)
+def open_env(robot: str, path: Path | None = None, options: Sequence[str] = ()) -> Any:
+    """The environment in the file ``path``, or else the built-in ``robot``.
+
+    ``options`` of a built-in robot are texts NAME=VALUE.
+    """
+    if path is None:
+        return make(robot, **dict(map(_option, options)))
+    if options:
+        raise UserError("--option is for built-in robots: set it in the --env file")
+    return load(path)
+
+
+def _option(text: str) -> tuple[str, Any]:
+    name, sign, value = text.partition("=")
+    if not sign:
+        raise UserError(f"--option {text}: write NAME=VALUE, such as parameters=full")
+    plain: dict[str, Any] = {"true": True, "false": False}
+    if value.lower() in plain:
+        return name, plain[value.lower()]
+    return name, int(value) if value.isdigit() else value

@@ -163,8 +163,12 @@ class FootLoads:
         """Finds the contacts of the feet; the floor comes first in every pair."""
         with jax.ensure_compile_time_eval():
             put = mjx.put_model(m, impl="jax")
-            data: Any = mjx.collision(put, mjx.make_data(put))
-            pairs = np.asarray(data._impl.contact.geom)
+
+            def found() -> jax.Array:
+                data: Any = mjx.collision(put, mjx.make_data(put))
+                return data._impl.contact.geom
+
+            pairs = np.asarray(jax.jit(found)())  # the compiler drops all else
         feet = [m.geom(f"{leg}_foot") for leg in LEGS]
         contacts = [int(np.flatnonzero(pairs[:, 1] == f.id)[0]) for f in feet]
         return cls(tuple(contacts), tuple(int(f.bodyid[0]) for f in feet))

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from easi_jax.drives import TorqueSpeed
 from easi_jax.env import EnvState, advance, start
 from easi_jax.errors import UserError, nearest
 from easi_jax.model import Model
@@ -60,6 +61,26 @@ class Commands:
     """Share of episodes without any command to move."""
 
 
+# Corner and free speed [rad/s], torque driving and braking [N m] of the hip and thigh
+# motors (unitree_rl_lab's T-N curve); the knee's further reduction divides the speeds
+# and multiplies the torques.
+MOTOR = (13.5, 30.0, 20.2, 23.4)
+KNEE_REDUCTION = 45.43 / 23.7
+
+
+def motor_curve() -> TorqueSpeed:
+    """The 12 motors' torque-speed curve."""
+    reduction = jnp.tile(jnp.array([1.0, 1.0, KNEE_REDUCTION]), 4)
+    corner, free, driving, braking = MOTOR
+    return TorqueSpeed(
+        corner=corner / reduction,
+        free=free / reduction,
+        driving=driving * reduction,
+        braking=braking * reduction,
+        dof=jnp.arange(6, 18),
+    )
+
+
 class Memory(NamedTuple):
     """What a Go2 episode carries.
 
@@ -100,6 +121,7 @@ class Go2(Robot):
         parameters: str = "default",
         commands: Commands | None = None,
         episode_length: int = 200,
+        torque_speed: bool = False,
     ) -> None:
         """Builds the robot.
 
@@ -109,6 +131,7 @@ class Go2(Robot):
                 joint and base mass.
             commands: what it is asked to do.
             episode_length: control steps.
+            torque_speed: let the motors' torque fall with speed, as `MOTOR` says.
 
         Raises:
             UserError: unknown set of parameters.
@@ -126,6 +149,9 @@ class Go2(Robot):
         self._pose = self._stand[7:]
         self._low, self._high = m.actuator_ctrlrange.T
         self._limit = m.actuator_forcerange[:, 1]
+        if torque_speed:
+            base = self.machine.base.replace(torque_speed=motor_curve())
+            self.machine.base = base
 
     def reset(self, model: Model, key: jax.Array) -> EnvState:
         """Standing, turned anywhere, joints and speeds a little off."""

@@ -153,8 +153,9 @@ def run(config: "Config") -> None:
         from train._results import write_pseudo_real
 
         rows = write_pseudo_real(
-            folder, pipe, estimate, theta, seeds, returns, errors, curves, notes
-        )
+            folder, pipe, estimate, theta, seeds, returns, errors, curves, notes,
+            udr["config"].get("option", ()),
+        )  # fmt: skip
     names = ", ".join(changes) or "nominal"
     show_table(
         f"Return in the target ({names})",

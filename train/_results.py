@@ -117,8 +117,12 @@ def write_pseudo_real(
     errors: dict[str, Any],
     curves: dict[str, Any],
     notes: Sequence[str],
+    option: Sequence[str],
 ) -> tuple[tuple[str, ...], list[tuple[Any, ...]]]:
-    """Writes results, figures and report; returns the parameter table."""
+    """Writes results, figures and report; returns the parameter table.
+
+    ``option``: of the built-in robot, so that its policies can be loaded again.
+    """
     import numpy as np
 
     from easi_jax.io.figures import returns_by_method, returns_by_step
@@ -162,6 +166,7 @@ def write_pseudo_real(
         {
             "robot": pipe.env.name,
             "env": folder.config.get("env"),
+            "option": list(option),
             "seeds": list(seeds),
             "env_steps": config.training.env_steps,
             "algorithm": algorithm_of(config.training),

@@ -99,7 +99,7 @@ def env_of(folder: Path, made_with: Any, path: Path | None) -> Any:
             f"{folder} was made with the built-in robot {made_with['robot']}: leave "
             "--env out"
         )
-    return open_env(made_with["robot"], path)
+    return open_env(made_with["robot"], path, made_with.get("option", ()))
 
 
 def save_policies(folder: Any, method: str, policies: Any) -> None:

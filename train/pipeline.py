@@ -19,6 +19,9 @@ class Config:
 
     robot: str = "cartpole"
     """Built-in robot."""
+    option: tuple[str, ...] = ()
+    """Options of the built-in robot, NAME=VALUE: for go2 parameters=full (25 instead of
+    8), torque_speed=true."""
     env: Path | None = None
     """An environment of your own, a Python file, in place of --robot (template:
     examples/my_robot/env.py)."""
@@ -82,7 +85,7 @@ def run(config: Config) -> None:
     from train._results import write_pseudo_real
     from train._stages import search_rows, training_rows
 
-    env = open_env(config.robot, config.env)
+    env = open_env(config.robot, config.env, config.option)
     changes = env.default_target if config.target is None else config.target
     theta = target_parameters(env.space, changes)
     noisy = any(x > 0 for x in config.noise)
@@ -152,6 +155,7 @@ def run(config: Config) -> None:
         write_pseudo_real(
             folder, pipe, out["estimate"], theta, config.seeds, returns, errors, curves,
             [f"one program: compiled in {compiled - begin:.0f} s, ran {seconds:.0f} s"],
+            config.option,
         )  # fmt: skip
     show_table(
         f"Return in the target ({', '.join(changes) or 'nominal'})",

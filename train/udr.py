@@ -17,6 +17,9 @@ class Config:
 
     robot: str = "cartpole"
     """Built-in robot."""
+    option: tuple[str, ...] = ()
+    """Options of the built-in robot, NAME=VALUE: for go2 parameters=full (25 instead of
+    8), torque_speed=true."""
     env: Path | None = None
     """An environment of your own, a Python file, in place of --robot (template:
     examples/my_robot/env.py)."""
@@ -68,7 +71,7 @@ def run(config: Config) -> None:
     from envs import open_env
     from train._stages import jit_chunks, run_stage, training_curve, training_rows
 
-    env = open_env(config.robot, config.env)
+    env = open_env(config.robot, config.env, config.option)
     training = training_config(env, config.env_steps, config.algorithm)
     theta = target_parameters(env.space, config.target)
     pipe = Pipeline(
@@ -105,6 +108,7 @@ def run(config: Config) -> None:
         results = {
             "robot": env.name,
             "env": None if config.env is None else str(config.env),
+            "option": list(config.option),
             "seeds": list(config.seeds),
             "env_steps": training.env_steps,
             "algorithm": algorithm_of(training),
