@@ -68,6 +68,10 @@ class Machine:
         """A measured state, nothing known of what came before it."""
         return at_rest(self.base, qpos, qvel)
 
+    def without_sense(self, model: Model) -> Model:
+        """The model with nothing read but the state."""
+        return model.replace(sense=None) if self.base.sense else model
+
     def step(self, model: Model, state: Physics, ctrl: jax.Array) -> Physics:
         """One control step with ``ctrl`` ``(nu,)`` held."""
         return control_step(model, state, ctrl, self.substeps)

@@ -1,12 +1,12 @@
 """Simulating measured segments under a model: logged commands, logged starts."""
 
+import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from easi_jax.machine import Machine
-from easi_jax.physics import at_rest
 from easi_jax.segments import Segments
 
 
@@ -14,14 +14,15 @@ def predict(
     machine: Machine, model: Any, segments: Segments
 ) -> tuple[jax.Array, jax.Array]:
     """Open-loop prediction: ``qpos (M, H, nq)``, ``qvel (M, H, nv)``."""
-    model = model.replace(sense=None)  # read by controllers only
+    model = machine.without_sense(model)  # only controllers read it
 
     def one(qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array) -> Any:
         def step(state: Any, u: jax.Array) -> Any:
             state = machine.step(model, state, u)
             return state, (state.qpos, state.qvel)
 
-        return jax.lax.scan(step, at_rest(model, qpos, qvel), ctrl)[1]
+        first = dataclasses.replace(machine.start(qpos, qvel), sensed=())
+        return jax.lax.scan(step, first, ctrl)[1]
 
     return jax.vmap(one)(segments.qpos, segments.qvel, segments.ctrl)
 
