@@ -105,14 +105,14 @@ def search_rates(
         def one(u: Any, c: Any) -> Any:
             model = machine.model(env.space.to_si(u))
             if not sensing:
-                model = model.replace(sense=None)
+                model = machine.without_sense(model)
 
             def advance(s: Any, a: Any) -> Any:
                 s = control_step(model, s, a)
                 return s, (s.qpos, s.qvel)
 
-            begin = physics.at_rest(model, first.qpos, first.qvel)
-            return jax.lax.scan(advance, begin, c)[1]
+            state = physics.at_rest(model, first.qpos, first.qvel)
+            return jax.lax.scan(advance, state, c)[1]
 
         return jax.vmap(one)(*items)
 

@@ -12,7 +12,7 @@ derivatives are those of the converged solution. Elliptic cones and tendon frict
 stay with MJX's own solver.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ from mujoco.mjx._src import support
 from mujoco.mjx._src.types import ConeType, DisableBit
 
 from easi_jax import wide_solver
+from easi_jax.constraint_problem import ConstraintProblem
 
 
 def supported(model: Any) -> bool:
@@ -56,7 +57,7 @@ def solve(model: Any, data: Any, iterations: int, wide: bool = False) -> Any:
     # Force on a row is clip(-D x, low, high): two-sided, Huber or one-sided.
     high = jnp.where(dry, floss, jnp.inf)
     low = jnp.where(dry, -floss, jnp.where(rows < impl.ne, -jnp.inf, 0.0))
-    problem = _Problem(
+    problem = ConstraintProblem(
         mass, data.qfrc_smooth, impl.efc_J, impl.efc_D, impl.efc_aref, low, high
     )
     if wide:
@@ -68,7 +69,7 @@ def solve(model: Any, data: Any, iterations: int, wide: bool = False) -> Any:
         better = fixed.cost(warm, smooth) < fixed.cost(smooth, smooth)
         qacc = jnp.where(better, warm, smooth)
     for _ in range(newton_steps(iterations, impl.efc_J.shape[0])):
-        qacc = fixed.newton(qacc)
+        qacc = _newton(fixed, qacc)
     # Implicit function theorem: one more step from the solution is zero in value
     # and has the solution's derivative. The iterations need none.
     grad, _ = problem.gradient(qacc)
@@ -84,21 +85,19 @@ def solve(model: Any, data: Any, iterations: int, wide: bool = False) -> Any:
     )
 
 
-def _solve_wide(model: Any, data: Any, p: "_Problem", iterations: int) -> Any:
+def _solve_wide(model: Any, data: Any, p: ConstraintProblem, iterations: int) -> Any:
     rows = wide_solver.rows_of(model, data)
-    single = np.flatnonzero(np.array(rows.single) >= 0)
-    dofs = np.array(rows.single)[single]
-    order = np.concatenate([np.array(rows.dense, int), single])
+    order = np.concatenate([rows.dense, rows.single])
     problem = wide_solver.Problem(
         p.mass,
         p.smooth,
-        p.jac[np.array(rows.dense, int)],
-        p.jac[single, dofs],
+        p.jac[rows.dense],
+        p.jac[rows.single, np.array(rows.dofs, int)],
         *(x[order] for x in (p.stiff, p.aref, p.low, p.high)),
     )
     cold = model.opt.disableflags & DisableBit.WARMSTART
     warm = data.qacc_smooth if cold else data.qacc_warmstart
-    find = wide_solver.solution(rows, newton_steps(iterations, len(order)))
+    find = wide_solver.solution(rows.dofs, newton_steps(iterations, len(order)))
     qacc, force, joint = find(problem, warm, data.qacc_smooth)
     force = force[np.argsort(order)]
     return data.tree_replace(
@@ -106,43 +105,14 @@ def _solve_wide(model: Any, data: Any, p: "_Problem", iterations: int) -> Any:
     )
 
 
-class _Problem(NamedTuple):
-    """The convex problem: mass ``(nv, nv)``, constraint rows ``(nefc, ...)``."""
-
-    mass: jax.Array
-    smooth: jax.Array
-    jac: jax.Array
-    stiff: jax.Array
-    aref: jax.Array
-    low: jax.Array
-    high: jax.Array
-
-    def force(self, x: jax.Array) -> jax.Array:
-        return jnp.clip(-self.stiff * x, self.low, self.high)
-
-    def gradient(self, a: jax.Array) -> tuple[jax.Array, jax.Array]:
-        force = self.force(self.jac @ a - self.aref)
-        return self.mass @ a - self.smooth - self.jac.T @ force, force
-
-    def hessian(self, a: jax.Array) -> jax.Array:
-        raw = -self.stiff * (self.jac @ a - self.aref)
-        active = (raw > self.low) & (raw < self.high)
-        return self.mass + (self.jac.T * (self.stiff * active)) @ self.jac
-
-    def cost(self, a: jax.Array, center: jax.Array) -> jax.Array:
-        x = self.jac @ a - self.aref
-        force, da = self.force(x), a - center
-        # s(x) = -f x - f^2 / (2 D) on every piece, f being the clipped force.
-        rows = -force * x - 0.5 * force * force / self.stiff
-        return 0.5 * da @ (self.mass @ da) + rows.sum()
-
-    def newton(self, a: jax.Array) -> jax.Array:
-        grad, force = self.gradient(a)
-        p = -_solve_spd(self.hessian(a), grad)
-        x, jv = self.jac @ a - self.aref, self.jac @ p
-        slope0, curve0 = p @ grad + jv @ force, p @ (self.mass @ p)
-        args = (x, jv, self.stiff, self.low, self.high, slope0, curve0)
-        return a + p * _exact_step(*args)
+def _newton(problem: ConstraintProblem, a: jax.Array) -> jax.Array:
+    """One Newton step with an exact line search."""
+    mass, _, jac, stiff, aref, low, high = problem
+    grad, force = problem.gradient(a)
+    p = -_solve_spd(problem.hessian(a), grad)
+    x, jv = jac @ a - aref, jac @ p
+    slope0, curve0 = p @ grad + jv @ force, p @ (mass @ p)
+    return a + p * _exact_step(x, jv, stiff, low, high, slope0, curve0)
 
 
 def _solve_spd(a: jax.Array, b: jax.Array) -> jax.Array:

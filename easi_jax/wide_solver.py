@@ -15,40 +15,43 @@ import numpy as np
 from mujoco.mjx._src.types import DisableBit, JointType
 
 from easi_jax import lanes
+from easi_jax.constraint_problem import ConstraintProblem
 from easi_jax.lanes import product, row_sum, total, transposed_product
 
 _LINE_STEPS = 2
-_UNLIMITED, _TWO_SIDED, _ONE_SIDED = range(3)  # what the force on a row may be
 
 
 class Rows(NamedTuple):
     """Where the constraint rows act.
 
     Attributes:
-        single: dof of each row that acts on one dof only, -1 for the others.
-        dense: indices of the other rows.
+        dense: indices of the rows that may act on several dofs.
+        single: indices of the rows that act on one dof only.
+        dofs: the dof of each of those.
     """
 
-    single: tuple[int, ...]
-    dense: tuple[int, ...]
+    dense: np.ndarray
+    single: np.ndarray
+    dofs: tuple[int, ...]
 
 
 def rows_of(model: Any, data: Any) -> Rows:
     """Which rows of ``efc_J`` have one entry, from the order in which MJX makes them:
     equalities, friction (dofs, tendons), limits (balls, hinges, tendons), contacts."""
     impl, off = data._impl, model.opt.disableflags
-    single = np.full(impl.efc_J.shape[0], -1)
+    dof = np.full(impl.efc_J.shape[0], -1)
     if impl.nf and not off & DisableBit.FRICTIONLOSS:
         dofs = np.flatnonzero(model._impl.dof_hasfrictionloss)
-        single[impl.ne : impl.ne + len(dofs)] = dofs
+        dof[impl.ne : impl.ne + len(dofs)] = dofs
     if impl.nl and not off & DisableBit.LIMIT:
         limited = np.asarray(model.jnt_limited).astype(bool)
         balls = (model.jnt_type == JointType.BALL) & limited
         hinges = np.isin(model.jnt_type, (JointType.SLIDE, JointType.HINGE)) & limited
         first = impl.ne + impl.nf + int(balls.sum())
         dofs = np.asarray(model.jnt_dofadr)[hinges]
-        single[first : first + len(dofs)] = dofs
-    return Rows(tuple(single.tolist()), tuple(np.flatnonzero(single < 0).tolist()))
+        dof[first : first + len(dofs)] = dofs
+    single = np.flatnonzero(dof >= 0)
+    return Rows(np.flatnonzero(dof < 0), single, tuple(dof[single].tolist()))
 
 
 class Problem(NamedTuple):
@@ -151,9 +154,9 @@ class _Newton:
         way = lanes.solve_upper(chol, y, hold)
         jv = hold(self._along(p, way))
         mw = hold(product(p.mass, way))
-        slope = hold(total([way[i] * grad[i] for i in range(nv)]) + row_sum(jv * force))
+        descent = hold(total([way[i] * grad[i] for i in range(nv)]))
         curve = hold(total([way[i] * mw[i] for i in range(nv)]))
-        t = self._line(p, x, jv, slope, curve, hold)
+        t = self._line(p, x, jv, descent, hold(row_sum(jv * force)), curve, hold)
         return jnp.stack([a[i] + way[i] * t for i in range(nv)])
 
     def _line(
@@ -161,12 +164,21 @@ class _Newton:
         p: Problem,
         x: jax.Array,
         jv: jax.Array,
-        slope0: jax.Array,
+        descent: jax.Array,
+        pushed: jax.Array,
         curve0: jax.Array,
         hold: lanes.Hold,
     ) -> jax.Array:
         """Where the cost at ``x + t jv`` is least, ``(lanes,)``; see
-        `easi_jax.solver._exact_step`."""
+        `easi_jax.solver._exact_step`.
+
+        Args:
+            descent: slope of the cost at t = 0; its curvature there is ``-descent``,
+                since the way is Newton's.
+            pushed: what the rows' forces take off that slope.
+            curve0: curvature without the rows.
+        """
+        slope0 = hold(descent + pushed)
 
         def at(t: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             raw = -p.stiff * (x + t * jv)
@@ -185,7 +197,7 @@ class _Newton:
             return pick((up,) * 3, point, lo), pick((down,) * 3, point, hi)
 
         zero = jnp.zeros_like(slope0)
-        lo, hi = at(zero), (zero + jnp.inf, zero + 1.0, zero + 1.0)
+        lo, hi = (zero, descent, -descent), (zero + jnp.inf, zero + 1.0, zero + 1.0)
         lo, hi = closer((lo, hi), at(zero + 1.0))
         for _ in range(_LINE_STEPS):
             middle = jnp.where(jnp.isfinite(hi[0]), 0.5 * (lo[0] + hi[0]), 2 * lo[0])
@@ -208,21 +220,17 @@ def _secant(lo: Any, hi: Any) -> jax.Array:
     return jnp.where(jnp.isfinite(hi[0]), jnp.where(rise > 0, between, lo[0]), beyond)
 
 
+@lru_cache(maxsize=64)
 def solution(
-    rows: Rows, steps: int
+    dofs: tuple[int, ...], steps: int
 ) -> Callable[..., tuple[jax.Array, jax.Array, jax.Array]]:
-    """The solver for rows of these kinds, ``f(problem, warm, start)``, unbatched.
+    """The solver ``f(problem, warm, start)``, unbatched, for `Rows.dofs`.
 
     ``problem``'s arrays are without lanes; it starts from the better of ``start``, the
     acceleration without constraints, and ``warm``. Returns acceleration, force on each
     row (dense ones first), force on each joint. Derivatives are those of the converged
     solution.
     """
-    return _solution(tuple(j for j in rows.single if j >= 0), steps)
-
-
-@lru_cache(maxsize=64)
-def _solution(dofs: tuple[int, ...], steps: int) -> Callable[..., Any]:
     newton = lanes.lanes(_Newton(dofs, steps))
 
     @jax.custom_jvp
@@ -234,16 +242,12 @@ def _solution(dofs: tuple[int, ...], steps: int) -> Callable[..., Any]:
         a, force, joint = solve(*primals)
 
         def residual(q: Problem, at: jax.Array) -> Any:
-            jac = _whole(q, dofs)
-            f = jnp.clip(-q.stiff * (jac @ at - q.aref), q.low, q.high)
-            return q.mass @ at - q.smooth - jac.T @ f, f, jac.T @ f
+            whole = _whole(q, dofs)
+            grad, f = whole.gradient(at)
+            return grad, f, whole.jac.T @ f
 
         _, (grad, _, _) = jax.jvp(lambda q: residual(q, a), (p,), (dp,))
-        jac = _whole(p, dofs)
-        raw = -p.stiff * (jac @ a - p.aref)
-        weight = jnp.where((raw > p.low) & (raw < p.high), p.stiff, 0.0)
-        hessian = p.mass + (jac.T * weight) @ jac
-        da = -solve_spd(hessian, grad)
+        da = -solve_spd(_whole(p, dofs).hessian(a), grad)
         _, (_, df, dj) = jax.jvp(residual, (p, a), (dp, da))
         return (a, force, joint), (da, df, dj)
 
@@ -251,11 +255,12 @@ def _solution(dofs: tuple[int, ...], steps: int) -> Callable[..., Any]:
     return solve
 
 
-def _whole(p: Problem, dofs: tuple[int, ...]) -> jax.Array:
-    if not dofs:
-        return p.dense
-    single = jnp.eye(p.mass.shape[0], dtype=p.mass.dtype)[np.array(dofs)]
-    return jnp.concatenate([p.dense, p.signs[:, None] * single])
+def _whole(p: Problem, dofs: tuple[int, ...]) -> ConstraintProblem:
+    jac = p.dense
+    if dofs:
+        single = jnp.eye(p.mass.shape[0], dtype=p.mass.dtype)[np.array(dofs)]
+        jac = jnp.concatenate([jac, p.signs[:, None] * single])
+    return ConstraintProblem(p.mass, p.smooth, jac, p.stiff, p.aref, p.low, p.high)
 
 
 @lanes.lanes
