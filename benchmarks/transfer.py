@@ -79,7 +79,7 @@ def run(config: Config) -> None:
         compiler_options=fast_loops(),
     )
     estimate, demonstrate = jax.jit(pipe.estimate), jax.jit(pipe.demonstrate)
-    returns = jax.jit(pipe.returns)
+    returns = jax.jit(lambda *a: pipe.play(*a)[0])
 
     nominal = jnp.asarray(env.space.nominal, jnp.float32)
     begin = time.monotonic()

@@ -17,16 +17,24 @@ TRAJECTORIES = 20
 def relative_errors(
     machine: Any, model: Any, pieces: Segments, speed_limit: Any
 ) -> jax.Array:
-    """RMS error at each piece's end, as a share of the RMS motion, ``(2 nv,)``.
+    """`errors_by_step` at the end of each piece, ``(2 nv,)``."""
+    return errors_by_step(machine, model, pieces, speed_limit)[-1]
+
+
+def errors_by_step(
+    machine: Any, model: Any, pieces: Segments, speed_limit: Any
+) -> jax.Array:
+    """RMS error after each step of a piece, as a share of the RMS motion,
+    ``(H, 2 nv)``.
 
     Pieces that touch a joint's speed limit ``(nv,)`` are left out: there the share
     says whether the limit was met, not how good the model is.
     """
-    error = replay.errors(machine, model, pieces)[:, -1]
-    moved = replay.motion(machine, pieces)[:, -1]
+    error = replay.errors(machine, model, pieces)
+    moved = replay.motion(machine, pieces)
     fast = jnp.concatenate([pieces.qvel[:, None], pieces.next_qvel], 1)
     slow = (jnp.abs(fast) < 0.98 * speed_limit).all((1, 2))
-    w = (pieces.weight * slow)[:, None]
+    w = (pieces.weight * slow)[:, None, None]
     return jnp.sqrt((w * error**2).sum(0) / jnp.maximum((w * moved**2).sum(0), 1e-30))
 
 
@@ -52,13 +60,9 @@ def shares(
             TRAJECTORIES,
             env.episode_length,
         )
+        pieces = windows(trajectories, steps, steps)
         limit = truth.speed_limit
-        model = env.model(t)
-        short = windows(trajectories, 1, 1)
-        long = windows(trajectories, steps, steps)
-        return (
-            relative_errors(env.machine, model, short, limit),
-            relative_errors(env.machine, model, long, limit),
-        )
+        error = errors_by_step(env.machine, env.model(t), pieces, limit)
+        return error[0], error[-1]
 
     return jax.lax.map(one, (policies, theta, keys))

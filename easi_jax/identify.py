@@ -63,6 +63,7 @@ def estimate(
     mesh: Mesh | None = None,
     misfit: jax.Array | None = None,
     robust: int | jax.Array = 6,
+    free_starts: bool = True,
 ) -> Estimate:
     """The result of a search at ``mean``, ``cov`` (unit coordinates); pure.
 
@@ -71,7 +72,8 @@ def estimate(
     initial range as prior. A direction that the data do not show keeps the initial
     spread, whatever the search has drifted to. Without ``informed`` it is the search's
     own covariance alone. ``misfit (2 nv,)`` is what the model itself errs by in every
-    step, on top of the noise; it and ``robust`` go to `easi_jax.refine.refine`.
+    step, on top of the noise; it, ``robust`` and ``free_starts`` go to
+    `easi_jax.refine.refine`.
     """
     assumed = effective_noise(machine, pieces, noise)
     n = space.size
@@ -85,13 +87,14 @@ def estimate(
             mesh=mesh,
             misfit=misfit,
             robust=robust,
+            free_starts=free_starts,
         )
         center, hessian = fit.unit, fit.hessian
         cost, delta = fit.cost, fit.delta
     else:
         weight = step_weights(pieces, assumed, misfit)
         zero = jnp.zeros((pieces.count, len(noise)))
-        paired = PairedFit(machine, space, pieces, assumed, mesh)
+        paired = PairedFit(machine, space, pieces, assumed, mesh, free_starts)
         eq = paired.normal(mean, zero, weight)
         center, hessian = mean, eq.hessian
         cost, delta = jnp.zeros(0), eq.start_step

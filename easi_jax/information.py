@@ -1,8 +1,8 @@
 """What measured segments say about the parameters: Fisher information.
 
-Forward-mode derivatives through the simulation; the start state of each segment is
-unknown within its noise and eliminated (Schur complement). The inverse is the
-Cramer-Rao bound.
+Derivatives of the simulation are forward-mode or, for larger robots, central
+differences. The start state of each segment is unknown within its noise and eliminated
+(Schur complement). The inverse is the Cramer-Rao bound.
 """
 
 import re
@@ -19,11 +19,14 @@ from easi_jax import replay
 from easi_jax.machine import Machine
 from easi_jax.mesh import make_mesh, sharded_map
 from easi_jax.parameters import ParameterSpace
+from easi_jax.physics import WRITTEN_OUT
 from easi_jax.segments import Segments
 
 _WEAK = 0.5  # std of a log ratio beyond which a direction is called undetermined
 _ALONE = 0.998  # of a parameter's own direction unseen: it leaves no trace
 _CHUNK = 256  # segments simulated at once
+_STEP = 0.01  # of an initial range, for differences along a parameter
+_MOVE = 1e-4  # at least, along a start [m, rad, m/s, rad/s]
 _NUMERIC = 1e-4  # relative singular value that single precision cannot resolve
 
 
@@ -64,6 +67,7 @@ class PairedFit:
         segments: M of H control steps.
         noise: standard deviations of measured positions and velocities, ``(2 nv,)``.
         mesh: devices that share the segments; all of them by default.
+        free_starts: whether starts are free within the noise, or known exactly.
     """
 
     machine: Machine
@@ -71,6 +75,7 @@ class PairedFit:
     segments: Segments
     noise: jax.Array
     mesh: Mesh | None = None
+    free_starts: bool = True
 
     def normal(self, unit: jax.Array, delta: jax.Array, weight: jax.Array) -> Normal:
         """Gauss-Newton system at parameters ``unit (n,)`` and start shifts ``delta``.
@@ -80,35 +85,31 @@ class PairedFit:
             weight: of each measured number, ``(M, H, 2 nv)``.
         """
         n, nv2 = self.space.size, 2 * self.machine.mj_model.nv
-        directions = jnp.eye(n + nv2)
         noise = self.noise
 
         def one(item: Any) -> Any:
             s, d, w = item
-
-            def f(x: jax.Array) -> jax.Array:
-                return self._residual(unit + x[:n], d + x[n:], s)
-
-            zero = jnp.zeros(n + nv2)
-            r, push = f(zero), lambda v: jax.jvp(f, (zero,), (v,))[1]
-            jac = jnp.moveaxis(jax.vmap(push)(directions), 0, -1)  # (H, 2nv, n + nv2)
+            r, jac = self._linear(unit, d, s)
             root = jnp.sqrt(w) / noise
             # A piece of weight zero may hold anything, not finite included.
             on = w > 0
             rw = jnp.where(on, r * root, 0.0).reshape(-1)
             jw = jnp.where(on[..., None], jac * root[..., None], 0.0)
-            jw = jw.reshape(-1, n + nv2)
+            jw = jw.reshape(rw.shape[0], -1)
             a, b = jw[:, :n], jw[:, n:]
+            hess, grad = a.T @ a, a.T @ rw
+            cost = 0.5 * (rw @ rw + jnp.sum((d / noise) ** 2))
+            if not self.free_starts:
+                return hess, grad, cost, jnp.zeros(nv2), jnp.zeros((nv2, n))
             # The start was measured too: its own shift costs d / noise.
             fxx = b.T @ b + jnp.diag(1 / noise**2)
             fxu, gx = b.T @ a, b.T @ rw + d / noise**2
             sol = jnp.linalg.solve(fxx, jnp.concatenate([fxu, gx[:, None]], 1))
-            hess = a.T @ a - fxu.T @ sol[:, :n]
-            grad = a.T @ rw - fxu.T @ sol[:, n]
-            cost = 0.5 * (rw @ rw + jnp.sum((d / noise) ** 2))
+            hess, grad = hess - fxu.T @ sol[:, :n], grad - fxu.T @ sol[:, n]
             return hess, grad, cost, -sol[:, n], -sol[:, :n]
 
-        hess, grad, cost, step, gain = self._each(one, delta, weight)
+        points = 1 if self._written_out else 1 + 2 * self._directions
+        hess, grad, cost, step, gain = self._each(one, points, delta, weight)
         return Normal(hess.sum(0), grad.sum(0), cost.sum(), step, gain)
 
     def costs(self, unit: jax.Array, delta: jax.Array, weight: jax.Array) -> jax.Array:
@@ -134,15 +135,73 @@ class PairedFit:
 
             return jax.vmap(cost)(unit, d)
 
-        return self._each(one, jnp.swapaxes(delta, 0, 1), weight).T
+        shifts = jnp.swapaxes(delta, 0, 1)
+        return self._each(one, unit.shape[0], shifts, weight).T
 
-    def _each(self, one: Any, *items: jax.Array) -> Any:
-        """``one`` of every segment with its ``items``, shared among the devices."""
+    @property
+    def _written_out(self) -> bool:
+        return self.machine.mj_model.nv <= WRITTEN_OUT
+
+    @property
+    def _directions(self) -> int:
+        starts = 2 * self.machine.mj_model.nv if self.free_starts else 0
+        return self.space.size + starts
+
+    def _each(self, one: Any, points: int, *items: jax.Array) -> Any:
+        """``one`` of every segment with its ``items``, shared among the devices.
+
+        ``points``: simulations that ``one`` makes of a segment.
+        """
+        mesh = self.mesh or make_mesh()
+        share = -(-self.segments.count // mesh.size)
+        wanted = _CHUNK if self._written_out else self.machine.batch // points
+        batch = min(share, max(1, wanted))
+        rounds = -(-share // batch)
+        batch = -(-share // rounds)  # even ones: a shorter last one compiles again
 
         def local(block: Any) -> Any:
-            return jax.lax.map(one, block, batch_size=_CHUNK)
+            return jax.lax.map(one, block, batch_size=batch)
 
-        return sharded_map(local, self.mesh or make_mesh(), (self.segments, *items))
+        given = (self.segments, *items)
+        return sharded_map(local, mesh, given, multiple=batch)
+
+    def _linear(
+        self, unit: jax.Array, d: jax.Array, s: Segments
+    ) -> tuple[jax.Array, jax.Array]:
+        """Residual ``(H, 2 nv)`` of one segment and its slopes ``(..., directions)``
+        along parameters and, where starts are free, along the start."""
+        n = self.space.size
+        if not self._written_out:
+            return self._differences(unit, d, s)
+
+        def f(x: jax.Array) -> jax.Array:
+            shift = d + x[n:] if self.free_starts else d
+            return self._residual(unit + x[:n], shift, s)
+
+        zero = jnp.zeros(self._directions)
+        r, push = f(zero), lambda v: jax.jvp(f, (zero,), (v,))[1]
+        return r, jnp.moveaxis(jax.vmap(push)(jnp.eye(len(zero))), 0, -1)
+
+    def _differences(
+        self, unit: jax.Array, d: jax.Array, s: Segments
+    ) -> tuple[jax.Array, jax.Array]:
+        """`_linear` by central differences: batches of larger robots simulate many
+        times faster than derivatives go through them (`easi_jax.lanes`)."""
+        n, m = self.space.size, self._directions
+        low, high = self.space.unit_bounds
+        far = jnp.concatenate([jnp.full(n, _STEP), jnp.maximum(self.noise, _MOVE)])
+        ways = jnp.eye(m, n + len(d)) * far
+        ways = jnp.concatenate([jnp.zeros((1, n + len(d))), ways, -ways])
+        units = jnp.clip(unit + ways[:, :n], low, high)
+        r = jax.vmap(lambda u, x: self._residual(u, x, s))(units, d + ways[:, n:])
+        # Between bounds a parameter may have less than its step to go.
+        gone = jnp.concatenate(
+            [
+                jnp.diagonal(units[1 : n + 1] - units[m + 1 : m + n + 1]),
+                2.0 * far[n:m],
+            ]
+        )
+        return r[0], jnp.moveaxis(r[1 : m + 1] - r[m + 1 :], 0, -1) / gone
 
     def _residual(self, unit: jax.Array, d: jax.Array, s: Segments) -> jax.Array:
         """Predicted minus measured, ``(H, 2 nv)``, of one segment; its start moved."""

@@ -17,15 +17,22 @@ def make_mesh(devices: int | None = None) -> Mesh:
     return Mesh(np.array(found[: devices or len(found)]), (AXIS,))
 
 
-def sharded_map(fun: Callable[..., Any], mesh: Mesh, sharded: Any, *shared: Any) -> Any:
+def sharded_map(
+    fun: Callable[..., Any],
+    mesh: Mesh,
+    sharded: Any,
+    *shared: Any,
+    multiple: int = 1,
+) -> Any:
     """``fun(sharded, *shared)`` with the leading axis of ``sharded`` split.
 
     ``fun`` sees a slice of the leading axis and returns arrays with the same one;
     ``shared`` goes whole to every device. The axis is padded by repetition where it
-    does not divide, so that no device count is a special case.
+    does not divide, so that no device count is a special case, and every slice gets
+    a ``multiple`` of so many rows.
     """
     n = jax.tree.leaves(sharded)[0].shape[0]
-    pad = -n % mesh.size
+    pad = -n % (mesh.size * multiple)
 
     def padded(x: jax.Array) -> jax.Array:
         return jnp.concatenate([x, jnp.repeat(x[-1:], pad, axis=0)]) if pad else x

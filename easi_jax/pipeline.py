@@ -20,8 +20,9 @@ from easi_jax.identify import Estimate, estimate
 from easi_jax.machine import Machine
 from easi_jax.mesh import make_mesh, sharded_map
 from easi_jax.parameters import ParameterSpace
+from easi_jax.physics import WRITTEN_OUT
 from easi_jax.rl.config import SacConfig
-from easi_jax.rl.evaluate import evaluate
+from easi_jax.rl.evaluate import play
 from easi_jax.rl.networks import PolicyParams, act
 from easi_jax.rl.seeds import init_seeds, run_seeds
 from easi_jax.rl.trainer import TrainingConfig, make_trainer
@@ -29,6 +30,8 @@ from easi_jax.rollout import collect, measured
 from easi_jax.search import Search, SearchData, SearchInfo, SearchState
 from easi_jax.search_config import SearchConfig
 from easi_jax.segments import Segments, windows
+
+_WIDE_PIECES = 128
 
 
 @dataclass(frozen=True)
@@ -45,8 +48,11 @@ class PipelineConfig:
     """Measurement noise of positions, then velocities (SI); empty: none."""
     refine: bool = False
     """Finish with least squares on the paired data."""
-    refine_horizon: int = 25
-    """Control steps of a piece in the least-squares finish."""
+    refine_horizon: int | None = None
+    """Control steps of a piece in the least-squares finish; not given: 25, or a
+    quarter of a second for larger robots, whose motion is stiffer."""
+    refine_pieces: int | None = None
+    """Pieces that it takes; not given: all, or 128 for larger robots."""
     eval_episodes: int = 100
     """Episodes of a final evaluation."""
 
@@ -232,34 +238,46 @@ class Pipeline:
     def estimate(self, states: SearchState, demos: Segments) -> Estimate:
         """Results of searches, refined where asked, ``(S, ...)``."""
 
+        noisy = any(x > 0 for x in self.config.noise)
+
         def one(item: Any) -> Estimate:
             mean, cov, demo = item
-            h = self.config.refine_horizon
             return estimate(
                 self.machine,
                 self.space,
                 mean,
                 cov,
-                windows(demo, h, h + 1),
+                self.pieces(demo),
                 self.noise,
                 self.config.refine,
                 self.config.search.informed_spread,
                 self.mesh,
+                free_starts=noisy,
             )
 
         return jax.lax.map(one, (states.result_mean, states.result_cov, demos))
 
-    def returns(
+    def pieces(self, demos: Segments) -> Segments:
+        """Pieces of one seed for the least-squares finish, from ``(B, T, 1, ...)``."""
+        c, wide = self.config, self.env.mj_model.nv > WRITTEN_OUT
+        steps = c.refine_horizon or (round(0.25 / self.env.dt) if wide else 25)
+        steps = max(1, min(steps, demos.weight.shape[1]))
+        found = windows(demos, steps, steps + 1)
+        most = c.refine_pieces or (_WIDE_PIECES if wide else found.count)
+        return found.spread(most) if most < found.count else found
+
+    def play(
         self, policies: PolicyParams, target: jax.Array, keys: jax.Array
-    ) -> jax.Array:
-        """Returns in the target, deterministic policy, ``(S, episodes)``."""
+    ) -> tuple[jax.Array, jax.Array]:
+        """Deterministic policies in the target: returns ``(S, episodes)``, and
+        positions of the first episodes ``(S, T + 1, nq)``."""
         model = self.env.model(target)
 
-        def local(items: Any) -> jax.Array:
-            def one(item: Any) -> jax.Array:
+        def local(items: Any) -> Any:
+            def one(item: Any) -> Any:
                 policy, key = item
                 n = self.config.eval_episodes
-                return evaluate(self.env, model, policy, act, key, n)
+                return play(self.env, model, policy, act, key, n)
 
             return jax.lax.map(one, items)
 
@@ -272,7 +290,8 @@ class Pipeline:
 
         Returns:
             ``udr``, ``easi``: policies; ``udr_returns``, ``easi_returns``
-            ``(S, episodes)`` in the target; ``udr_history``, ``easi_history``;
+            ``(S, episodes)`` in the target; ``motion``: EASI's `play`;
+            ``udr_history``, ``easi_history``;
             ``search``: SearchInfo; ``estimate``: Estimate.
         """
         n = self.config.training.iterations
@@ -296,13 +315,16 @@ class Pipeline:
             self.final_iterations(),
         )
         easi = self.policies(final)
+        udr_returns, _ = self.play(udr, target, k["evaluate"])
+        easi_returns, motion = self.play(easi, target, k["evaluate"])
         return {
             "udr": udr,
             "easi": easi,
             "udr_history": udr_history,
             "easi_history": easi_history,
-            "udr_returns": self.returns(udr, target, k["evaluate"]),
-            "easi_returns": self.returns(easi, target, k["evaluate"]),
+            "udr_returns": udr_returns,
+            "easi_returns": easi_returns,
+            "motion": motion,
             "search": info,
             "estimate": found,
         }

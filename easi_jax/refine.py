@@ -1,8 +1,8 @@
 """A least-squares finish on paired data (multiple shooting).
 
 Maximum likelihood under independent measurement noise: parameters and the true start
-of every segment are fitted together by Levenberg-Marquardt with forward-mode
-derivatives through the simulation. Each round tries several dampings, and jumps of
+of every segment are fitted together by Levenberg-Marquardt (derivatives:
+`easi_jax.information`). Each round tries several dampings, and jumps of
 single parameters: a speed limit that no simulation reaches has no slope, yet the data
 may show that it is lower. In the first rounds pieces that fit far worse than most
 count less. Starting at the found mean, it is the natural last
@@ -63,6 +63,7 @@ def refine(
     mesh: Mesh | None = None,
     misfit: jax.Array | None = None,
     robust: int | jax.Array = 6,
+    free_starts: bool = True,
 ) -> RefineResult:
     """Levenberg-Marquardt from ``unit (n,)``; pure, for use inside jit.
 
@@ -75,8 +76,9 @@ def refine(
             ``(2 nv,)`` on top of the noise; inf leaves a channel's steps out.
         robust: in so many first rounds, pieces that fit far worse than most count
             less.
+        free_starts: whether the true starts are fitted too, or those given are exact.
     """
-    paired = PairedFit(machine, space, segments, noise, mesh)
+    paired = PairedFit(machine, space, segments, noise, mesh, free_starts)
     low, high = space.unit_bounds
     anchor = unit
     pull = jnp.full(space.size, 1.0 / prior_std**2)

@@ -1,5 +1,6 @@
 """Short pieces of measured motion: where they start, what was sent, what came."""
 
+import dataclasses
 from typing import Any
 
 import flax.struct
@@ -38,6 +39,18 @@ class Segments:
     def take(self, index: Any) -> "Segments":
         """The segments at ``index`` (an array of integers or a slice)."""
         return jax.tree.map(lambda x: x[index], self)
+
+    def spread(self, count: int) -> "Segments":
+        """``count`` segments at even distances among those that count; jit-friendly.
+
+        Where fewer count, some come twice and the weights are lowered accordingly.
+        """
+        order = jnp.argsort(self.weight <= 0, stable=True)
+        found = jnp.sum(self.weight > 0)
+        index = jnp.arange(count) * found // count
+        few = self.take(order[index])
+        share = jnp.minimum(found, count) / count
+        return dataclasses.replace(few, weight=few.weight * share)
 
 
 def cut(

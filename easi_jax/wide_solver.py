@@ -81,10 +81,12 @@ class _Newton:
     def __init__(self, dofs: tuple[int, ...], steps: int) -> None:
         self.dofs = dofs
         self.steps = steps
+        # Traced once for all the programs and transformations that it is part of.
+        self._traced = jax.jit(self._solve, inline=True)
 
     def __call__(self, p: Problem, warm: jax.Array, start: jax.Array) -> Any:
         """Acceleration ``(nv, lanes)``, force on the rows, force on the joints."""
-        return lanes.from_stored(self._solve, (*p, warm, start), p.stiff[0] > 0)
+        return lanes.from_stored(self._traced, (*p, warm, start), p.stiff[0] > 0)
 
     def _solve(self, *args: jax.Array) -> Any:
         p, (warm, start) = Problem(*args[:-2]), args[-2:]

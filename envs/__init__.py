@@ -3,7 +3,7 @@
 import importlib.util
 import inspect
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -91,18 +91,34 @@ def open_env(robot: str, path: Path | None = None, options: Sequence[str] = ()) 
 
     ``options`` of a built-in robot are texts NAME=VALUE.
     """
-    if path is None:
-        return make(robot, **dict(map(_option, options)))
-    if options:
-        raise UserError("--option is for built-in robots: set it in the --env file")
-    return load(path)
+    if path is not None:
+        if options:
+            raise UserError("--option is for built-in robots: set it in the --env file")
+        return load(path)
+    if not options or robot not in REGISTRY:
+        return make(robot)
+    known = inspect.signature(REGISTRY[robot]).parameters
+    return make(robot, **dict(_option(text, known) for text in options))
 
 
-def _option(text: str) -> tuple[str, Any]:
+_WORDS = {"true": True, "false": False}
+
+
+def _option(text: str, known: Mapping[str, inspect.Parameter]) -> tuple[str, Any]:
     name, sign, value = text.partition("=")
     if not sign:
         raise UserError(f"--option {text}: write NAME=VALUE, such as parameters=full")
-    plain: dict[str, Any] = {"true": True, "false": False}
-    if value.lower() in plain:
-        return name, plain[value.lower()]
-    return name, int(value) if value.isdigit() else value
+    if name not in known:
+        return name, value  # `make` says which there are
+    like = known[name].default
+    if isinstance(like, bool):
+        if value.lower() not in _WORDS:
+            raise UserError(f"--option {text}: the value must be true or false")
+        return name, _WORDS[value.lower()]
+    if isinstance(like, int):
+        if not (value.isascii() and value.isdigit() and int(value) > 0):
+            raise UserError(f"--option {text}: the value must be a whole number from 1")
+        return name, int(value)
+    if not isinstance(like, str):
+        raise UserError(f"--option {text}: {name} cannot be given on the command line")
+    return name, value

@@ -126,7 +126,8 @@ def run(config: "Config") -> None:
             lambda: pipe.final_init(keys["final"], estimate.distribution, found),
             pipe.final_iterations(),
         )
-        trained = {"UDR": policies, "EASI": pipe.policies(final)}
+        first = udr["method"]
+        trained = {first: policies, "EASI": pipe.policies(final)}
         if config.oracle:
             many = pipe.spread(pipe.point(target), len(seeds))
             oracle = train(
@@ -138,23 +139,21 @@ def run(config: "Config") -> None:
             trained["Oracle"] = pipe.policies(oracle)
         for name, policy in trained.items():
             save_policies(folder, name, policy)
-        evaluate = jax.jit(pipe.returns)
-        returns = {
-            name: np.asarray(evaluate(p, target, keys["evaluate"])).mean(1)
-            for name, p in trained.items()
-        }
+        play = jax.jit(pipe.play)
+        played = {n: play(p, target, keys["evaluate"]) for n, p in trained.items()}
+        returns = {name: np.asarray(p[0]).mean(1) for name, p in played.items()}
         errors = held_out_errors(pipe, estimate, theta, policies, keys["evaluate"])
         curves = {"EASI": training_curve(folder.path, "final", seeds)}
         udr_steps = training_curve(config.udr, "train", seeds)
         if udr["config"]["target"] == list(changes):
-            curves = {"UDR": udr_steps, **curves}
+            curves = {first: udr_steps, **curves}
         if config.oracle:
             curves["Oracle"] = training_curve(folder.path, "oracle", seeds)
         from train._results import write_pseudo_real
 
         rows = write_pseudo_real(
-            folder, pipe, estimate, theta, seeds, returns, errors, curves, notes,
-            udr["config"].get("option", ()),
+            folder, pipe, estimate, theta, seeds, returns, errors, curves,
+            played["EASI"][1][0], notes, udr["config"].get("option", ()),
         )  # fmt: skip
     names = ", ".join(changes) or "nominal"
     show_table(

@@ -107,6 +107,34 @@ def history_figure(
     )
 
 
+def motion_strip(env: Any, qpos: Any, method: str, notes: list[str]) -> list[Any]:
+    """An episode ``qpos (T + 1, nq)`` as a strip of frames; where nothing can be drawn,
+    a note and no picture."""
+    import numpy as np
+
+    from easi_jax.errors import UserError
+    from easi_jax.io.report import Picture
+    from easi_jax.io.video import FRAMES, render, strip
+
+    moving = np.flatnonzero(np.any(np.diff(np.asarray(qpos), axis=0) != 0, axis=1))
+    end = int(moving[-1]) + 1 if moving.size else 0
+    chosen = np.linspace(0, end, FRAMES).round().astype(int)
+    try:
+        frames = render(env.mj_model, np.asarray(qpos)[chosen], 300, 200, limit=60)
+    except UserError as error:
+        notes.append(f"no frames of the motion: {error}")
+        return []
+    return [
+        Picture(
+            "An episode",
+            strip(frames),
+            f"Frames of an episode of the {method} policy in the target",
+            f"{method} policy in the target, the first {end * env.dt:.2g} s from left "
+            "to right.",
+        )
+    ]
+
+
 def write_pseudo_real(
     folder: Any,
     pipe: Any,
@@ -116,12 +144,14 @@ def write_pseudo_real(
     returns: dict[str, Any],
     errors: dict[str, Any],
     curves: dict[str, Any],
+    motion: Any,
     notes: Sequence[str],
     option: Sequence[str],
 ) -> tuple[tuple[str, ...], list[tuple[Any, ...]]]:
     """Writes results, figures and report; returns the parameter table.
 
-    ``option``: of the built-in robot, so that its policies can be loaded again.
+    ``motion (T + 1, nq)``: an episode of the EASI policy. ``option``: of the built-in
+    robot, so that its policies can be loaded again.
     """
     import numpy as np
 
@@ -137,7 +167,7 @@ def write_pseudo_real(
     from easi_jax.io.versions import versions
     from easi_jax.rl.presets import algorithm_of
 
-    space, config = pipe.space, pipe.config
+    space, config, notes = pipe.space, pipe.config, list(notes)
     dist = estimate.distribution
     results = []
     for i in range(len(seeds)):
@@ -206,9 +236,10 @@ def write_pseudo_real(
         for i, p in enumerate(space.parameters)
     ]
     medians = {k: float(np.median(v)) for k, v in returns.items()}
+    first = next(iter(returns))
     headline = [
-        f"In the target the EASI policy returns {medians['EASI']:.1f}, the UDR policy "
-        f"it started from {medians['UDR']:.1f}"
+        f"In the target the EASI policy returns {medians['EASI']:.1f}, the {first} "
+        f"policy it started from {medians[first]:.1f}"
         + (f", the Oracle {medians['Oracle']:.1f}" if "Oracle" in medians else "")
         + f" (medians of {len(seeds)} seed{'s' if len(seeds) > 1 else ''})."
     ]
@@ -252,7 +283,8 @@ def write_pseudo_real(
             ],
             pictures=[
                 p for p in _pictures(methods, steps, by_generation, seeds[0]) if p.svg
-            ],
+            ]
+            + motion_strip(pipe.env, motion, "EASI", notes),
             diagnostics=[
                 Diagnostic(
                     "non-finite simulations",

@@ -117,7 +117,7 @@ def load_policies(
 
     Args:
         folder: the run folder.
-        method: UDR, EASI or Oracle; the run's own where not given.
+        method: UDR, Fixed, EASI or Oracle; the run's own where not given.
         env_file: see `env_of`.
 
     Returns:
@@ -142,7 +142,7 @@ def load_policies(
         raise UserError(
             f"{folder} holds no policies: it identified a machine from logs"
         )
-    own = "EASI" if "EASI" in result["methods"] else "UDR"
+    own = "EASI" if "EASI" in result["methods"] else result["methods"][0]
     chosen = method or own
     if chosen not in result["methods"]:
         raise UserError(
@@ -211,4 +211,5 @@ def load_udr(folder: Path, env_file: Path | None = None) -> dict[str, Any]:
         "training": training,
         "states": found.state,
         "config": config,
+        "method": "Fixed" if config.get("fixed") else "UDR",
     }

@@ -2,7 +2,6 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 from train._command import main, say, show_table
 
@@ -21,7 +20,7 @@ class Config:
     env: Path | None = None
     """The Python file of your own environment, where the run was made with one."""
     policy: str | None = None
-    """UDR, EASI or Oracle; not given: what the run was made for."""
+    """UDR, Fixed, EASI or Oracle; not given: what the run was made for."""
     target: tuple[str, ...] = ()
     """The robot to test in: parameters that differ from the nominal ones, as
     NAME*FACTOR or NAME=VALUE."""
@@ -58,8 +57,9 @@ def run(config: Config) -> None:
     )
     key = jax.random.key(config.seed)
     keys = jax.random.split(key, len(saved["seeds"]))
-    returns = np.asarray(
-        jax.jit(pipe.returns)(saved["policies"], jnp.asarray(theta, jnp.float32), keys)
+    target = jnp.asarray(theta, jnp.float32)
+    returns, motion = map(
+        np.asarray, jax.jit(pipe.play)(saved["policies"], target, keys)
     )
     rows = [
         (s, f"{r.mean():.1f}", f"{r.std():.1f}", f"{r.min():.1f}")
@@ -85,17 +85,9 @@ def run(config: Config) -> None:
         say(f"written: {config.out}")
     if config.render is not None:
         from easi_jax.io.video import render, write_video
-        from easi_jax.rl.evaluate import record
-        from easi_jax.rl.networks import act
 
-        @jax.jit
-        def episode(policies: Any, theta: Any, key: Any) -> Any:
-            first = jax.tree.map(lambda x: x[0], policies)
-            return record(env, env.model(theta), first, act, key)
-
-        qpos = episode(saved["policies"], jnp.asarray(theta, jnp.float32), keys[0])
         every = max(1, round(1 / (_FPS * env.dt)))
-        frames = render(env.mj_model, np.asarray(qpos)[::every])
+        frames = render(env.mj_model, motion[0][::every])
         write_video(config.render, frames, 1 / (every * env.dt))
         say(f"written: {config.render}")
 

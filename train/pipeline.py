@@ -154,6 +154,7 @@ def run(config: Config) -> None:
         )
         write_pseudo_real(
             folder, pipe, out["estimate"], theta, config.seeds, returns, errors, curves,
+            out["motion"][0],
             [f"one program: compiled in {compiled - begin:.0f} s, ran {seconds:.0f} s"],
             config.option,
         )  # fmt: skip

@@ -30,6 +30,9 @@ class Config:
     target: tuple[str, ...] = ()
     """Where the policy is evaluated: the nominal robot with parameters changed, as
     NAME*FACTOR or NAME=VALUE."""
+    fixed: bool = False
+    """Train in the target itself, without randomization: the nominal model where no
+    target is given."""
     env_steps: int | None = None
     """Control steps of training; the robot's preset where not given."""
     algorithm: str | None = None
@@ -47,7 +50,6 @@ class Config:
 
 def run(config: Config) -> None:
     """Trains, evaluates and writes the run folder."""
-    from train._results import per_seed_json
     from train._robots import check_chunk, check_seeds, save_policies, training_config
 
     check_seeds(config.seeds)
@@ -69,11 +71,14 @@ def run(config: Config) -> None:
     )
     from easi_jax.rl.presets import algorithm_of
     from envs import open_env
+    from train._results import motion_strip, per_seed_json
     from train._stages import jit_chunks, run_stage, training_curve, training_rows
 
     env = open_env(config.robot, config.env, config.option)
     training = training_config(env, config.env_steps, config.algorithm)
     theta = target_parameters(env.space, config.target)
+    method = "Fixed" if config.fixed else "UDR"
+    how = "in the target itself" if config.fixed else "under uniform randomization"
     pipe = Pipeline(
         env, PipelineConfig(training=training, eval_episodes=config.eval_episodes)
     )
@@ -87,7 +92,8 @@ def run(config: Config) -> None:
         overwrite=config.overwrite,
     ) as folder:
         notes: list[str] = []
-        wide = pipe.spread(pipe.udr(), len(config.seeds))
+        physics = pipe.point(target) if config.fixed else pipe.udr()
+        wide = pipe.spread(physics, len(config.seeds))
         step = jit_chunks(
             lambda states, dist, target, n: pipe.train_chunk(states, dist, target, n)
         )
@@ -102,9 +108,9 @@ def run(config: Config) -> None:
             notes,
         )
         policies = pipe.policies(states)
-        returns = np.asarray(jax.jit(pipe.returns)(policies, target, keys["evaluate"]))
-        per_seed = returns.mean(1)
-        save_policies(folder, "UDR", policies)
+        returns, motion = jax.jit(pipe.play)(policies, target, keys["evaluate"])
+        per_seed = np.asarray(returns).mean(1)
+        save_policies(folder, method, policies)
         results = {
             "robot": env.name,
             "env": None if config.env is None else str(config.env),
@@ -112,32 +118,32 @@ def run(config: Config) -> None:
             "seeds": list(config.seeds),
             "env_steps": training.env_steps,
             "algorithm": algorithm_of(training),
-            "methods": ["UDR"],
+            "methods": [method],
             "target": dict(zip(env.space.names, theta.tolist(), strict=True)),
-            "returns": {"UDR": per_seed_json(config.seeds, per_seed)},
+            "returns": {method: per_seed_json(config.seeds, per_seed)},
         }
         folder.write_json("results.json", results)
         steps, curve = training_curve(folder.path, "train", config.seeds)
-        pictures = []
+        pictures = motion_strip(env, motion[0], method, notes)
         if steps:
-            svg = returns_by_step({"UDR": (steps, curve)})
+            svg = returns_by_step({method: (steps, curve)})
             folder.write("figures/returns.svg", svg)
             pictures.append(
                 Picture(
                     "Return by training step",
                     svg,
-                    "Return of the UDR policy in the target against training steps",
+                    f"Return of the {method} policy in the target by training step",
                     "Deterministic policy in the target, every seed and their median.",
                 )
             )
         rows = [(s, f"{r:.1f}") for s, r in zip(config.seeds, per_seed, strict=True)]
-        title = f"UDR on {env.name}: return in the target"
+        title = f"{method} on {env.name}: return in the target"
         write_report(
             folder.path / "report.html",
             Report(
-                title=f"UDR on {env.name}",
+                title=f"{method} on {env.name}",
                 headline=[
-                    f"The policy trained under uniform randomization returns "
+                    f"The policy trained {how} returns "
                     f"{np.median(per_seed):.1f} in the target (median of "
                     f"{len(config.seeds)} seeds, {config.eval_episodes} episodes each)."
                 ],

@@ -15,17 +15,23 @@ from PIL import Image
 
 from easi_jax.errors import UserError
 
+FRAMES = 6  # of a strip
 _LIMIT = 300  # s
 _WAYS = ("egl", "osmesa", "glfw")
 
 
 def render(
-    m: mujoco.MjModel, qpos: np.ndarray, width: int = 480, height: int = 320
+    m: mujoco.MjModel,
+    qpos: np.ndarray,
+    width: int = 480,
+    height: int = 320,
+    limit: float = _LIMIT,
 ) -> np.ndarray:
     """Frames ``(T, height, width, 3)`` uint8 of positions ``qpos (T, nq)``.
 
     Through the model's first camera, or from outside where it has none. The way to
-    OpenGL is ``MUJOCO_GL``'s, or the first of EGL, OSMesa and GLFW that works.
+    OpenGL is ``MUJOCO_GL``'s, or the first of EGL, OSMesa and GLFW that works within
+    ``limit`` seconds.
 
     Raises:
         UserError: none works here.
@@ -46,10 +52,10 @@ def render(
                     env={**os.environ, "MUJOCO_GL": way},
                     capture_output=True,
                     text=True,
-                    timeout=_LIMIT,
+                    timeout=limit,
                 )
             except subprocess.TimeoutExpired:
-                reasons.append(f"{way}: no picture within {_LIMIT} s")
+                reasons.append(f"{way}: no picture within {limit:g} s")
                 continue
             if done.returncode == 0:
                 return np.load(files[2])
@@ -87,12 +93,16 @@ def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
         height, width = frames.shape[1:3]
         wanted = ("-pix_fmt", "yuv420p")
         kind = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
-        done = subprocess.run(
-            [tool, "-y", *kind, "-r", f"{fps:g}", "-i", "-", *wanted, str(part)],
-            input=np.ascontiguousarray(frames).tobytes(),
-            capture_output=True,
-            timeout=_LIMIT,
-        )
+        try:
+            done = subprocess.run(
+                [tool, "-y", *kind, "-r", f"{fps:g}", "-i", "-", *wanted, str(part)],
+                input=np.ascontiguousarray(frames).tobytes(),
+                capture_output=True,
+                timeout=_LIMIT,
+            )
+        except subprocess.TimeoutExpired:
+            part.unlink(missing_ok=True)
+            raise UserError(f"{path}: ffmpeg took more than {_LIMIT} s") from None
         if done.returncode:
             part.unlink(missing_ok=True)
             last = done.stderr.decode(errors="replace").strip().splitlines()[-1]
@@ -102,7 +112,7 @@ def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
     part.replace(path)
 
 
-def strip(frames: np.ndarray, count: int = 6) -> str:
+def strip(frames: np.ndarray, count: int = FRAMES) -> str:
     """``count`` frames side by side as SVG that holds its picture within itself."""
     chosen = frames[np.linspace(0, len(frames) - 1, count).round().astype(int)]
     wide = np.concatenate(list(chosen), axis=1)

@@ -42,37 +42,60 @@ def evaluate(
     """
 
     def episode(model: Model, key: jax.Array) -> jax.Array:
-        k_reset, k_act = jax.random.split(key)
-
-        def step(carry: Any, k: jax.Array) -> tuple[Any, None]:
-            state, total = carry
-            done = (state.terminated + state.truncated) > 0
-            new = env.step(model, state, act(policy, state.obs, k, deterministic))
-            gain = jnp.where(jnp.isfinite(new.obs).all(), new.reward, jnp.nan)
-            state = jax.tree.map(lambda a, b: jnp.where(done, a, b), state, new)
-            return (state, total + jnp.where(done, 0.0, gain)), None
-
-        start = (env.reset(model, k_reset), jnp.zeros(()))
-        keys = jax.random.split(k_act, env.episode_length)
-        (_, total), _ = jax.lax.scan(step, start, keys)
-        return total
+        return _episode(env, model, policy, act, key, deterministic, _nothing)[0]
 
     keys = jax.random.split(key, num_envs)
     return jax.vmap(episode, in_axes=(0 if batched else None, 0))(models, keys)
 
 
-def record(
-    env: Env, model: Model, policy: PolicyParams, act: Act, key: jax.Array
-) -> jax.Array:
-    """Positions ``(T + 1, nq)`` of one episode, deterministic; it stands at its end."""
+def play(
+    env: Env,
+    model: Model,
+    policy: PolicyParams,
+    act: Act,
+    key: jax.Array,
+    num_envs: int,
+) -> tuple[jax.Array, jax.Array]:
+    """`evaluate` in one model, deterministic, watched.
 
-    def step(state: Any, k: jax.Array) -> tuple[Any, jax.Array]:
-        done = (state.terminated + state.truncated) > 0
-        new = env.step(model, state, act(policy, state.obs, k, True))
-        state = jax.tree.map(lambda a, b: jnp.where(done, a, b), state, new)
-        return state, state.physics.qpos
+    Returns:
+        Returns ``(num_envs,)``; positions ``(T + 1, nq)`` of the first episode, which
+        stands still at its end.
+    """
 
+    def episode(key: jax.Array) -> Any:
+        return _episode(env, model, policy, act, key, True, lambda s: s.physics.qpos)
+
+    returns, qpos = jax.vmap(episode)(jax.random.split(key, num_envs))
+    return returns, qpos[0]
+
+
+def _nothing(state: Any) -> None:
+    del state
+
+
+def _episode(
+    env: Env,
+    model: Model,
+    policy: PolicyParams,
+    act: Act,
+    key: jax.Array,
+    deterministic: bool,
+    watch: Callable[[Any], Any],
+) -> tuple[jax.Array, Any]:
+    """Return of one episode; what ``watch`` sees of its states, ``(T + 1, ...)``."""
     k_reset, k_act = jax.random.split(key)
+
+    def step(carry: Any, k: jax.Array) -> tuple[Any, Any]:
+        state, total = carry
+        done = (state.terminated + state.truncated) > 0
+        new = env.step(model, state, act(policy, state.obs, k, deterministic))
+        gain = jnp.where(jnp.isfinite(new.obs).all(), new.reward, jnp.nan)
+        state = jax.tree.map(lambda a, b: jnp.where(done, a, b), state, new)
+        return (state, total + jnp.where(done, 0.0, gain)), watch(state)
+
     first = env.reset(model, k_reset)
-    _, qpos = jax.lax.scan(step, first, jax.random.split(k_act, env.episode_length))
-    return jnp.concatenate([first.physics.qpos[None], qpos])
+    keys = jax.random.split(k_act, env.episode_length)
+    (_, total), seen = jax.lax.scan(step, (first, jnp.zeros(())), keys)
+    whole = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), watch(first), seen)
+    return total, whole

@@ -1,0 +1,301 @@
+"""Searches on one robot: their time, what they recover, what memory they take.
+
+    python -m train.udr --robot ant --seeds 0 1 --out results/udr_ant
+    python -m benchmarks.robots --udr results/udr_ant
+
+The policy of ``train.udr`` records in the nominal robot, without noise; the search
+never sees that robot's parameters. ``recovery``: the search, then the least-squares
+finish, from UDR's range and from ranges that exclude the truth. ``time``: a search of
+50 generations of 300 individuals, compiled before. ``memory``: a generation of 4,096.
+"""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+from train._command import main, say, show_table
+
+STARTS: dict[str, tuple[float, float] | None] = {
+    "within": None,
+    "low": (0.05, 0.5),
+    "high": (2.0, 4.0),
+}
+STEPS = {"ballbalance": 50}  # control steps of an individual in the timed search
+PARTS = ("recovery", "time", "memory")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Times searches of a robot and recovers its known parameters."""
+
+    udr: Path = Path("results/udr")
+    """Run folder of train.udr."""
+    option: tuple[str, ...] = ()
+    """Options of the built-in robot in place of those of the run."""
+    parts: tuple[str, ...] = PARTS
+    """What to run: recovery, time, memory."""
+    starts: tuple[str, ...] = tuple(STARTS)
+    """Where searches start: within, low, high."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Seeds of demonstrations and search."""
+    trajectories: int = 50
+    """Demonstration trajectories."""
+    segments: int = 32
+    """Pieces that each individual replays in a recovery."""
+    population: int = 300
+    """Individuals."""
+    generations: int = 50
+    """Generations."""
+    steps: int | None = None
+    """Control steps of an individual in the timed search; 200 (ballbalance: 50) where
+    not given."""
+
+
+def run(config: Config) -> None:
+    """Runs the parts, each written when it is done."""
+    from easi_jax.errors import UserError, nearest
+    from envs import open_env
+    from train._robots import load_policies
+
+    for chosen, known in ((config.parts, PARTS), (config.starts, STARTS)):
+        for name in chosen:
+            if name not in known:
+                raise UserError(f'unknown "{name}"{nearest(name, known)}')
+    saved = load_policies(config.udr)
+    env = saved["env"]
+    label = env.name
+    if config.option:
+        env = open_env(env.name, None, config.option)
+        label += "_" + "_".join(o.replace("=", "_") for o in config.option)
+    if "time" in config.parts:
+        _time(config, env, saved, label)
+    if "memory" in config.parts:
+        _memory(config, env, saved, label)
+    if "recovery" in config.parts:
+        for start in config.starts:
+            _recovery(config, env, saved, label, start)
+
+
+def _pipe(config: Config, env: Any, start: str = "within", **search: Any) -> Any:
+    from easi_jax.pipeline import Pipeline, PipelineConfig
+    from easi_jax.search_config import preset
+
+    return Pipeline(
+        env,
+        PipelineConfig(
+            search=preset("default", **search),
+            trajectories=config.trajectories,
+            refine=True,
+        ),
+        start=STARTS[start],
+    )
+
+
+def _demonstrations(pipe: Any, saved: Any, seeds: Any) -> Any:
+    """Keys, policies and demonstrations; the run's first policy for every seed."""
+    import jax
+    import jax.numpy as jnp
+
+    from easi_jax.pipeline import seed_keys, stage_keys
+
+    keys = stage_keys(seed_keys(list(seeds)))
+    policies = jax.tree.map(
+        lambda x: jnp.broadcast_to(x[0], (len(seeds), *x.shape[1:])), saved["policies"]
+    )
+    nominal = jnp.asarray(pipe.env.space.nominal, jnp.float32)
+    demos = jax.jit(pipe.demonstrate)(policies, nominal, keys["demonstrate"])
+    return keys, policies, jax.block_until_ready(demos)
+
+
+def _first(tree: Any, i: int) -> Any:
+    import jax
+
+    return jax.tree.map(lambda x: x[i : i + 1], tree)
+
+
+def peak_gib() -> float:
+    """Peak resident size of this process [GiB]."""
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def _searched(pipe: Any, demos: Any, keys: Any, policies: Any) -> Any:
+    """The compiled search ``f(state)``, its first state, seconds to compile."""
+    import jax
+
+    from easi_jax.runtime import fast_loops
+
+    state = pipe.search_init(keys["search"][:1], _first(demos, 0), _first(policies, 0))
+    begin = time.monotonic()
+    compiled = (
+        jax.jit(
+            lambda s, d, p: pipe.search_chunk(s, d, p, pipe.search.config.generations),
+            compiler_options=fast_loops(),
+        )
+        .lower(state, _first(demos, 0), _first(policies, 0))
+        .compile()
+    )
+    return compiled, state, time.monotonic() - begin
+
+
+def _time(config: Config, env: Any, saved: Any, label: str) -> None:
+    import jax
+
+    from benchmarks._common import write_result
+
+    steps = config.steps or STEPS.get(env.name, 200)
+    pipe = _pipe(
+        config,
+        env,
+        segments=steps,
+        population=config.population,
+        generations=config.generations,
+    )
+    keys, policies, demos = _demonstrations(pipe, saved, config.seeds[:1])
+    compiled, state, seconds = _searched(pipe, demos, keys, policies)
+    begin = time.monotonic()
+    jax.block_until_ready(compiled(state, demos, policies))
+    ran = time.monotonic() - begin
+    say(
+        f"{label}: {config.generations} generations of {config.population} x {steps} "
+        f"steps in {ran:.0f} s, compiled in {seconds:.0f} s, peak {peak_gib():.1f} GiB"
+    )
+    short = "" if config.generations == Config.generations else "_short"
+    path = write_result(
+        f"search_{label}_{steps}{short}",
+        f"python -m benchmarks.robots --udr {config.udr} --parts time --steps {steps}",
+        config,
+        robot=env.name,
+        steps=steps,
+        generations=config.generations,
+        population=config.population,
+        search_s=ran,
+        trace_and_compile_s=seconds,
+        peak_gib=peak_gib(),
+    )
+    say(f"written: {path}")
+
+
+def _memory(config: Config, env: Any, saved: Any, label: str) -> None:
+    import jax
+
+    from benchmarks._common import write_result
+
+    population = 4096
+    pipe = _pipe(config, env, population=population, generations=1)
+    keys, policies, demos = _demonstrations(pipe, saved, config.seeds[:1])
+    compiled, state, _ = _searched(pipe, demos, keys, policies)
+    jax.block_until_ready(compiled(state, demos, policies))
+    say(f"{label}: a generation of {population}, peak {peak_gib():.2f} GiB")
+    path = write_result(
+        f"memory_{label}",
+        f"python -m benchmarks.robots --udr {config.udr} --parts memory",
+        config,
+        robot=env.name,
+        population=population,
+        peak_gib=peak_gib(),
+        goal_gib=8.0,
+    )
+    say(f"written: {path}")
+
+
+def _recovery(config: Config, env: Any, saved: Any, label: str, start: str) -> None:
+    import jax
+    import numpy as np
+
+    from benchmarks._common import write_result
+    from easi_jax.information import describe, identifiability
+
+    pipe = _pipe(
+        config,
+        env,
+        start,
+        segments=config.segments,
+        population=config.population,
+        generations=config.generations,
+    )
+    keys, policies, demos = _demonstrations(pipe, saved, config.seeds)
+    search, _, compile_s = _searched(pipe, demos, keys, policies)
+    finish = jax.jit(pipe.estimate)
+    truth = np.asarray(env.space.nominal)
+
+    def error(unit: Any) -> list[float]:
+        si = np.maximum(np.asarray(pipe.space.to_si(unit)), 1e-30)
+        return np.log(si / truth).tolist()
+
+    rows = []
+    for i, seed in enumerate(config.seeds):
+        demo, policy = _first(demos, i), _first(policies, i)
+        state = pipe.search_init(keys["search"][i : i + 1], demo, policy)
+        begin = time.monotonic()
+        state, info = jax.block_until_ready(search(state, demo, policy))
+        searched = time.monotonic()
+        found = jax.block_until_ready(finish(state, demo))
+        done = time.monotonic()
+        ident = identifiability(pipe.space, np.asarray(found.hessian[0]))
+        cost = np.asarray(found.cost[0])
+        rows.append(
+            {
+                "seed": seed,
+                "search_s": searched - begin,
+                "finish_s": done - searched,
+                "non_finite": int(info.non_finite.sum()),
+                "default": {"log_ratio": error(state.result_mean[0])},
+                "refine": {"log_ratio": error(found.distribution.mean[0])},
+                "cost": [float(cost[0]), float(cost[-1])],
+                "rank": ident.rank,
+                "cramer_rao_std": ident.std.tolist(),
+                "determined": ident.determined.tolist(),
+                "undetermined": [describe(d) for d in ident.undetermined],
+            }
+        )
+        worst = max(abs(x) for x in rows[-1]["refine"]["log_ratio"])
+        say(
+            f"{label} {start} seed {seed}: search {searched - begin:.0f} s, finish "
+            f"{done - searched:.0f} s, rank {ident.rank} of {pipe.space.size}, worst "
+            f"|log ratio| {worst:.3f}"
+        )
+    summary = {
+        m: {
+            f"{name}_abs_log_ratio": fun(
+                np.abs([r[m]["log_ratio"] for r in rows]), axis=0
+            ).tolist()
+            for name, fun in (("median", np.median), ("worst", np.max))
+        }
+        for m in ("default", "refine")
+    }
+    path = write_result(
+        f"robots_{label}_{start}",
+        f"python -m benchmarks.robots --udr {config.udr} --parts recovery "
+        f"--starts {start}",
+        config,
+        robot=env.name,
+        start=STARTS[start],
+        parameters=pipe.space.names,
+        search_compile_s=compile_s,
+        peak_gib=peak_gib(),
+        summary=summary,
+        seeds=rows,
+    )
+    show_table(
+        f"{label} {start}: |log ratio| to the truth, median (worst) of {len(rows)}",
+        ("parameter", *summary),
+        [
+            (
+                name,
+                *(
+                    f"{s['median_abs_log_ratio'][k]:.4f} "
+                    f"({s['worst_abs_log_ratio'][k]:.3f})"
+                    for s in summary.values()
+                ),
+            )
+            for k, name in enumerate(pipe.space.names)
+        ],
+    )
+    say(f"written: {path}")
+
+
+if __name__ == "__main__":
+    main(Config, run, name="benchmarks.robots")
