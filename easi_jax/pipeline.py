@@ -31,7 +31,7 @@ from easi_jax.search import Search, SearchData, SearchInfo, SearchState
 from easi_jax.search_config import SearchConfig
 from easi_jax.segments import Segments, windows
 
-_WIDE_PIECES = 128
+_WIDE_PIECES = 64
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class PipelineConfig:
     """Control steps of a piece in the least-squares finish; not given: 25, or a
     quarter of a second for larger robots, whose motion is stiffer."""
     refine_pieces: int | None = None
-    """Pieces that it takes; not given: all, or 128 for larger robots."""
+    """Pieces that it takes; not given: all, or 64 for larger robots."""
     eval_episodes: int = 100
     """Episodes of a final evaluation."""
 
