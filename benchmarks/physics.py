@@ -47,7 +47,7 @@ def native_rates(env: Any, population: int, steps: int, repeats: int) -> list[fl
     start = np.zeros((n, size))
     start[:, 1 : 1 + m.nq] = np.asarray(first.qpos)
     start[:, 1 + m.nq : 1 + m.nq + m.nv] = np.asarray(first.qvel)
-    ctrl = np.repeat(_commands(env, n, steps), held, axis=1)
+    ctrl = np.repeat(random_commands(env, n, steps), held, axis=1)
     threads = runtime.cores()
     out = []
     with rollout.Rollout(nthread=threads) as pool:
@@ -87,7 +87,7 @@ def search_rates(
     from easi_jax.runtime import fast_loops
 
     machine, n = env.machine, population
-    ctrl = jnp.asarray(_commands(env, n, steps), jnp.float32)
+    ctrl = jnp.asarray(random_commands(env, n, steps), jnp.float32)
     unit = jax.random.uniform(jax.random.key(1), (n, env.space.size))
     first = env.reset(env.model(), jax.random.key(0)).physics
 
@@ -132,7 +132,7 @@ def search_rates(
     return out[1:], compiled
 
 
-def _commands(env: Any, count: int, steps: int) -> Any:
+def random_commands(env: Any, count: int, steps: int) -> Any:
     """Random commands ``(count, steps, nu)`` in a half of the actuators' range."""
     import numpy as np
 

@@ -194,7 +194,7 @@ def _memory(config: Config, env: Any, saved: Any, label: str) -> None:
         f"python -m benchmarks.robots --udr {config.udr} --parts memory",
         config,
         robot=env.name,
-        population=population,
+        what=f"search, population {population}",
         peak_gib=peak_gib(),
         goal_gib=8.0,
     )

@@ -15,6 +15,7 @@ from typing import Any
 from benchmarks._common import RESULTS
 from benchmarks.physics import GOALS
 from benchmarks.recovery import CASES
+from benchmarks.robots import STARTS
 from train._command import main, say
 
 FACTORS = (0.25, 0.5, 2, 4)
@@ -34,7 +35,7 @@ def run(config: Config) -> None:
     from easi_jax.io.files import atomic_write
 
     parts = ["# Results", "Made by `python -m benchmarks.summary` from the files here."]
-    for section in (_speed, _physics, _recovery, _transfer, _real):
+    for section in (_speed, _physics, _robots, _policies, _recovery, _transfer, _real):
         parts += section(config.results)
     path = config.results / "README.md"
     atomic_write(path, "\n\n".join(parts) + "\n")
@@ -151,6 +152,140 @@ def _physics(folder: Path) -> list[str]:
         "Other ways to run a step that were tried (ratio to native):",
         _table(("robot", "step", "ratio", "trace and compile"), tried),
     ]
+
+
+SEARCH_GOALS = {"ant_200": 180, "go2_200": 480, "ballbalance_50": 480}  # s
+ROBOTS = ("ant", "ballbalance", "go2", "go2_parameters_full")
+
+
+def _robots(folder: Path) -> list[str]:
+    """Searches on the larger robots: time, memory, recovery."""
+    import numpy as np
+
+    out = ["## Searches on the other robots"]
+    rows = []
+    for path in sorted(folder.glob("search_*.json")):
+        r = _read(folder, path.stem)
+        name = path.stem.removeprefix("search_")
+        goal = SEARCH_GOALS.get(name)
+        rows.append(
+            (
+                r["robot"],
+                f"{r['generations']} x {r['population']} x {r['steps']}",
+                f"{r['search_s']:.0f} s",
+                f"{goal} s, {_met(r['search_s'] < goal)}" if goal else "",
+                f"{r['trace_and_compile_s']:.0f} s",
+                f"{r['peak_gib']:.1f}",
+            )
+        )
+    if rows:
+        out.append("`python -m benchmarks.robots --udr RUN --parts time`")
+        head = (
+            *("robot", "generations x individuals x control steps", "search", "goal"),
+            *("trace and compile", "peak GiB"),
+        )
+        out.append(_table(head, rows))
+    rows = []
+    for path in sorted(folder.glob("memory_*.json")):
+        r = _read(folder, path.stem)
+        ok = _met(r["peak_gib"] < r["goal_gib"])
+        rows.append((r["robot"], r["what"], f"{r['peak_gib']:.1f}", ok))
+    if rows:
+        out.append("`python -m benchmarks.robots --udr RUN --parts memory`")
+        out.append(_table(("robot", "run", "peak GiB", "goal 8"), rows))
+    rows, said, missing = [], [], []
+    for name in ROBOTS:
+        for start in STARTS:
+            r = _read(folder, f"robots_{name}_{start}")
+            if r is None:
+                missing.append(f"{name} {start}")
+                continue
+            seeds = r["seeds"]
+            std = np.median(np.array([s["cramer_rao_std"] for s in seeds], float), 0)
+            known = np.flatnonzero(std < KNOWN)
+            for method, s in r["summary"].items():
+                middle = np.array(s["median_abs_log_ratio"])[known]
+                worst = np.array(s["worst_abs_log_ratio"])[known]
+                k = int(np.argmax(worst))
+                rows.append(
+                    (
+                        name,
+                        start,
+                        method,
+                        len(seeds),
+                        f"{len(known)} of {len(std)}",
+                        f"{_percent(float(np.median(middle)))} %",
+                        f"{_percent(float(worst[k]))} % ({r['parameters'][known[k]]})",
+                    )
+                )
+            ranks = sorted({s["rank"] for s in seeds})
+            open_ = sorted({d for s in seeds for d in s["undetermined"]})
+            said.append(
+                f"- {name}, {start}: the data determine "
+                f"{' or '.join(map(str, ranks))} of {len(std)} directions"
+                + (f"; {'; '.join(open_)}" if open_ else "")
+                + "."
+            )
+    if rows:
+        head = (
+            *("robot", "start", "method", "seeds", "known to 2 %"),
+            *("median error of these", "worst error of these, any seed"),
+        )
+        out.append(
+            "`python -m benchmarks.robots --udr RUN --parts recovery`: `default` is "
+            "the search alone, `refine` with the least-squares finish; `high` and "
+            "`low` start at 2 to 4 and 0.05 to 0.5 times the truth. What the data can "
+            "know to 2 % is read from their Fisher information."
+        )
+        out += [_table(head, rows), "\n".join(said)]
+    if missing:
+        out.append(f"Not run: {', '.join(missing)}.")
+    return out
+
+
+def _policies(folder: Path) -> list[str]:
+    """Policies of the larger robots: how long they trained and what they reach."""
+    out, rows, speeds = ["## Policies of the other robots"], [], []
+    for path in sorted(folder.glob("policies_*.json")):
+        r = _read(folder, path.stem)
+        for run in r["runs"]:
+            goal = r["goal_minutes"]
+            rows.append(
+                (
+                    r["robot"],
+                    run["method"],
+                    f"{run['algorithm']}, {run['env_steps']:,}",
+                    f"{run['minutes']:.0f}",
+                    f"{goal}, {_met(run['minutes'] <= goal)}",
+                    ", ".join(f"{x:.1f}" for x in run["returns"].values()),
+                )
+            )
+            if "tracking" in run:
+                t = run["tracking"]
+                for speed, fallen in zip(t["speed"], t["fallen"], strict=True):
+                    speeds.append(
+                        (
+                            run["method"],
+                            *(
+                                ("fell" if v is None else f"{v:.2f}")
+                                + (f" ({n} fell)" if n and v is not None else "")
+                                for v, n in zip(speed, fallen, strict=True)
+                            ),
+                        )
+                    )
+                head = ("policy", *(f"{c:g} m/s" for c in t["commands"]))
+    if not rows:
+        return [*out, "Not run: `python -m benchmarks.policies`."]
+    out.append(
+        "`python -m benchmarks.policies --runs RUN...`: trained under randomization "
+        "(UDR) or in the nominal model (Fixed), return of each seed in the nominal "
+        "robot. The curves are in the files."
+    )
+    columns = ("robot", "trained", "algorithm, steps", "minutes", "goal", "returns")
+    out.append(_table(columns, rows))
+    if speeds:
+        out += ["Speed of Go2 at forward commands:", _table(head, speeds)]
+    return out
 
 
 def _recovery(folder: Path) -> list[str]:

@@ -84,33 +84,101 @@ class PairedFit:
             delta: ``(M, 2 nv)``.
             weight: of each measured number, ``(M, H, 2 nv)``.
         """
-        n, nv2 = self.space.size, 2 * self.machine.mj_model.nv
-        noise = self.noise
+        if self.by_differences:
+            units, deltas = self.around(unit, delta)
+            return self.sweep(units, deltas, weight)[0]
 
         def one(item: Any) -> Any:
             s, d, w = item
-            r, jac = self._linear(unit, d, s)
-            root = jnp.sqrt(w) / noise
-            # A piece of weight zero may hold anything, not finite included.
-            on = w > 0
-            rw = jnp.where(on, r * root, 0.0).reshape(-1)
-            jw = jnp.where(on[..., None], jac * root[..., None], 0.0)
-            jw = jw.reshape(rw.shape[0], -1)
-            a, b = jw[:, :n], jw[:, n:]
-            hess, grad = a.T @ a, a.T @ rw
-            cost = 0.5 * (rw @ rw + jnp.sum((d / noise) ** 2))
-            if not self.free_starts:
-                return hess, grad, cost, jnp.zeros(nv2), jnp.zeros((nv2, n))
-            # The start was measured too: its own shift costs d / noise.
-            fxx = b.T @ b + jnp.diag(1 / noise**2)
-            fxu, gx = b.T @ a, b.T @ rw + d / noise**2
-            sol = jnp.linalg.solve(fxx, jnp.concatenate([fxu, gx[:, None]], 1))
-            hess, grad = hess - fxu.T @ sol[:, :n], grad - fxu.T @ sol[:, n]
-            return hess, grad, cost, -sol[:, n], -sol[:, :n]
+            r, jac = self._pushed(unit, d, s)
+            return self._equations(r, jac, d, w)
 
-        points = 1 if self._written_out else 1 + 2 * self._directions
-        hess, grad, cost, step, gain = self._each(one, points, delta, weight)
+        return self._summed(self._each(one, 1, delta, weight))
+
+    @property
+    def by_differences(self) -> bool:
+        """Whether derivatives are central differences: batches of larger robots
+        simulate many times faster than derivatives go through them
+        (`easi_jax.lanes`)."""
+        return self.machine.mj_model.nv > WRITTEN_OUT
+
+    def around(self, unit: jax.Array, delta: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Points whose `sweep` holds the derivatives at ``unit (n,)`` and ``delta
+        (M, 2 nv)``: themselves, then steps up, then steps down; ``(K, n)``,
+        ``(K, M, 2 nv)``."""
+        n, m, nv2 = self.space.size, self._directions, delta.shape[1]
+        low, high = self.space.unit_bounds
+        ways = jnp.eye(m, n + nv2) * self._steps()
+        ways = jnp.concatenate([jnp.zeros((1, n + nv2)), ways, -ways])
+        # Between bounds a parameter may have less than its step to go.
+        units = jnp.clip(unit + ways[:, :n], low, high)
+        return units, delta + ways[:, None, n:]
+
+    def sweep(
+        self, units: jax.Array, deltas: jax.Array, weight: jax.Array
+    ) -> tuple[Normal, jax.Array]:
+        """Simulates every piece from several points ``(K, n)``, ``(K, M, 2 nv)``.
+
+        One simulation for derivatives and for trials, so that it is compiled once.
+
+        Returns:
+            The system of `normal`, where the first points are those of `around`; the
+            `costs` ``(K, M)``.
+        """
+        n, m = self.space.size, self._directions
+
+        def one(item: Any) -> Any:
+            s, d, w = item
+            r = jax.vmap(lambda u, x: self._residual(u, x, s))(units, d)
+            up, down = slice(1, m + 1), slice(m + 1, 2 * m + 1)
+            gone = jnp.concatenate(
+                [
+                    jnp.diagonal(units[up][:n] - units[down][:n]),
+                    jnp.diagonal((d[up] - d[down])[n:]),
+                ]
+            )
+            safe = jnp.where(gone > 0, gone, 1.0)
+            jac = jnp.moveaxis(r[up] - r[down], 0, -1) / safe
+            cost = jax.vmap(lambda a, b: self._cost(a, b, w))(r, d)
+            return self._equations(r[0], jac, d[0], w), cost
+
+        shifts = jnp.swapaxes(deltas, 0, 1)
+        equations, cost = self._each(one, units.shape[0], shifts, weight)
+        return self._summed(equations), cost.T
+
+    def _steps(self) -> jax.Array:
+        along = jnp.full(self.space.size, _STEP)
+        return jnp.concatenate([along, jnp.maximum(self.noise, _MOVE)])
+
+    def _equations(self, r: jax.Array, jac: jax.Array, d: jax.Array, w: Any) -> Any:
+        """One piece's part of `Normal`, from its residual and slopes."""
+        n, nv2, noise = self.space.size, len(d), self.noise
+        root = jnp.sqrt(w) / noise
+        # A piece of weight zero may hold anything, not finite included.
+        on = w > 0
+        rw = jnp.where(on, r * root, 0.0).reshape(-1)
+        jw = jnp.where(on[..., None], jac * root[..., None], 0.0)
+        jw = jw.reshape(rw.shape[0], -1)
+        a, b = jw[:, :n], jw[:, n:]
+        hess, grad = a.T @ a, a.T @ rw
+        cost = 0.5 * (rw @ rw + jnp.sum((d / noise) ** 2))
+        if not self.free_starts:
+            return hess, grad, cost, jnp.zeros(nv2), jnp.zeros((nv2, n))
+        # The start was measured too: its own shift costs d / noise.
+        fxx = b.T @ b + jnp.diag(1 / noise**2)
+        fxu, gx = b.T @ a, b.T @ rw + d / noise**2
+        sol = jnp.linalg.solve(fxx, jnp.concatenate([fxu, gx[:, None]], 1))
+        hess, grad = hess - fxu.T @ sol[:, :n], grad - fxu.T @ sol[:, n]
+        return hess, grad, cost, -sol[:, n], -sol[:, :n]
+
+    def _summed(self, parts: Any) -> Normal:
+        hess, grad, cost, step, gain = parts
         return Normal(hess.sum(0), grad.sum(0), cost.sum(), step, gain)
+
+    def _cost(self, r: jax.Array, d: jax.Array, w: jax.Array) -> jax.Array:
+        square = jnp.where(w > 0, w * (r / self.noise) ** 2, 0.0).sum()
+        total = 0.5 * (square + jnp.sum((d / self.noise) ** 2))
+        return jnp.where(jnp.isfinite(total), total, jnp.inf)
 
     def costs(self, unit: jax.Array, delta: jax.Array, weight: jax.Array) -> jax.Array:
         """The cost of `normal`, piece by piece and for several points at once.
@@ -128,19 +196,12 @@ class PairedFit:
             s, d, w = item
 
             def cost(u: jax.Array, x: jax.Array) -> jax.Array:
-                r = self._residual(u, x, s)
-                square = jnp.where(w > 0, w * (r / self.noise) ** 2, 0.0).sum()
-                total = 0.5 * (square + jnp.sum((x / self.noise) ** 2))
-                return jnp.where(jnp.isfinite(total), total, jnp.inf)
+                return self._cost(self._residual(u, x, s), x, w)
 
             return jax.vmap(cost)(unit, d)
 
         shifts = jnp.swapaxes(delta, 0, 1)
         return self._each(one, unit.shape[0], shifts, weight).T
-
-    @property
-    def _written_out(self) -> bool:
-        return self.machine.mj_model.nv <= WRITTEN_OUT
 
     @property
     def _directions(self) -> int:
@@ -154,7 +215,7 @@ class PairedFit:
         """
         mesh = self.mesh or make_mesh()
         share = -(-self.segments.count // mesh.size)
-        wanted = _CHUNK if self._written_out else self.machine.batch // points
+        wanted = self.machine.batch // points if self.by_differences else _CHUNK
         batch = min(share, max(1, wanted))
         rounds = -(-share // batch)
         batch = -(-share // rounds)  # even ones: a shorter last one compiles again
@@ -165,14 +226,12 @@ class PairedFit:
         given = (self.segments, *items)
         return sharded_map(local, mesh, given, multiple=batch)
 
-    def _linear(
+    def _pushed(
         self, unit: jax.Array, d: jax.Array, s: Segments
     ) -> tuple[jax.Array, jax.Array]:
         """Residual ``(H, 2 nv)`` of one segment and its slopes ``(..., directions)``
-        along parameters and, where starts are free, along the start."""
+        along parameters and, where starts are free, along the start; forward-mode."""
         n = self.space.size
-        if not self._written_out:
-            return self._differences(unit, d, s)
 
         def f(x: jax.Array) -> jax.Array:
             shift = d + x[n:] if self.free_starts else d
@@ -181,27 +240,6 @@ class PairedFit:
         zero = jnp.zeros(self._directions)
         r, push = f(zero), lambda v: jax.jvp(f, (zero,), (v,))[1]
         return r, jnp.moveaxis(jax.vmap(push)(jnp.eye(len(zero))), 0, -1)
-
-    def _differences(
-        self, unit: jax.Array, d: jax.Array, s: Segments
-    ) -> tuple[jax.Array, jax.Array]:
-        """`_linear` by central differences: batches of larger robots simulate many
-        times faster than derivatives go through them (`easi_jax.lanes`)."""
-        n, m = self.space.size, self._directions
-        low, high = self.space.unit_bounds
-        far = jnp.concatenate([jnp.full(n, _STEP), jnp.maximum(self.noise, _MOVE)])
-        ways = jnp.eye(m, n + len(d)) * far
-        ways = jnp.concatenate([jnp.zeros((1, n + len(d))), ways, -ways])
-        units = jnp.clip(unit + ways[:, :n], low, high)
-        r = jax.vmap(lambda u, x: self._residual(u, x, s))(units, d + ways[:, n:])
-        # Between bounds a parameter may have less than its step to go.
-        gone = jnp.concatenate(
-            [
-                jnp.diagonal(units[1 : n + 1] - units[m + 1 : m + n + 1]),
-                2.0 * far[n:m],
-            ]
-        )
-        return r[0], jnp.moveaxis(r[1 : m + 1] - r[m + 1 :], 0, -1) / gone
 
     def _residual(self, unit: jax.Array, d: jax.Array, s: Segments) -> jax.Array:
         """Predicted minus measured, ``(H, 2 nv)``, of one segment; its start moved."""

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from easi_jax.information import PairedFit
+from easi_jax.information import Normal, PairedFit
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
 from easi_jax.segments import Segments
@@ -98,33 +98,17 @@ def refine(
     def step(carry: Any, moving: jax.Array, trusting: jax.Array) -> Any:
         u, shift, damp, near, far, pieces, _ = carry
         trust = jnp.where(trusting, 1.0, _trust(pieces, segments.weight > 0))
-        eq = paired.normal(u, shift, weight * trust[:, None, None])
-        slope = jax.jvp(away, (u,), (jnp.ones(n),))[1]
-        grad = eq.gradient + pull * slope * away(u)
-        # A parameter that its bound holds back takes no part in the step.
-        free = ~((u <= low) & (grad > 0) | (u >= high) & (grad < 0))
-        hess = eq.hessian + jnp.diag(pull * slope**2 + _TINY)
-        # By powers of ten, Fisher information spans more than single precision has.
-        scale = jnp.where(free, 1.0 / jnp.sqrt(jnp.diag(hess)), 0.0)
-        scaled = hess * scale[:, None] * scale + jnp.diag(jnp.where(free, 0.0, 1.0))
-
-        def trial(damp: jax.Array) -> tuple[jax.Array, jax.Array]:
-            lifted = scaled + damp * jnp.eye(n)
-            du = -scale * jnp.linalg.solve(lifted, scale * grad)
-            new = jnp.clip(_moved(space, u, du), low, high)
-            gain = jnp.einsum("mdn,n->md", eq.start_gain, new - u)
-            return new, shift + eq.start_step + gain
-
-        newton, shifted = jax.vmap(trial)(damp * _DAMPING)
+        trusted = weight * trust[:, None, None]
         # Bisection, per parameter and side, between where a change has left the cost
         # as it was and where it has raised it: at the edge of a plateau it may fall.
         reach = 0.5 * (near + far)
         hops = jnp.clip(u + (reach * sides)[..., None] * jnp.eye(n), low, high)
-        hops = hops.reshape(2 * n, n)
-        units = jnp.concatenate([u[None], newton, hops])
-        stay = jnp.broadcast_to(shift, (2 * n + 1, *shift.shape))
-        shifts = jnp.concatenate([stay[:1], shifted, stay[1:]])
-        each = paired.costs(units, shifts, weight)
+        if paired.by_differences:
+            eq, units, shifts, each = swept(u, shift, damp, hops, weight, trusted)
+        else:
+            eq = paired.normal(u, shift, trusted)
+            units, shifts = trials(u, shift, damp, hops, eq)
+            each = paired.costs(units, shifts, weight)
         data = (each * trust).sum(1)
         costs = data + prior(units)
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
@@ -147,6 +131,53 @@ def refine(
             eq.hessian,
         )
         return new, each[0].sum() + prior(u)
+
+    def trials(u: Any, shift: Any, damp: Any, hops: Any, eq: Normal) -> Any:
+        """Where the cost is tried: here, Newton steps, jumps of single parameters."""
+        slope = jax.jvp(away, (u,), (jnp.ones(n),))[1]
+        grad = eq.gradient + pull * slope * away(u)
+        # A parameter that its bound holds back takes no part in the step.
+        free = ~((u <= low) & (grad > 0) | (u >= high) & (grad < 0))
+        hess = eq.hessian + jnp.diag(pull * slope**2 + _TINY)
+        # By powers of ten, Fisher information spans more than single precision has.
+        scale = jnp.where(free, 1.0 / jnp.sqrt(jnp.diag(hess)), 0.0)
+        scaled = hess * scale[:, None] * scale + jnp.diag(jnp.where(free, 0.0, 1.0))
+
+        def trial(damp: jax.Array) -> tuple[jax.Array, jax.Array]:
+            lifted = scaled + damp * jnp.eye(n)
+            du = -scale * jnp.linalg.solve(lifted, scale * grad)
+            new = jnp.clip(_moved(space, u, du), low, high)
+            gain = jnp.einsum("mdn,n->md", eq.start_gain, new - u)
+            return new, shift + eq.start_step + gain
+
+        newton, shifted = jax.vmap(trial)(damp * _DAMPING)
+        units = jnp.concatenate([u[None], newton, hops.reshape(2 * n, n)])
+        stay = jnp.broadcast_to(shift, (2 * n + 1, *shift.shape))
+        return units, jnp.concatenate([stay[:1], shifted, stay[1:]])
+
+    def swept(
+        u: Any, shift: Any, damp: Any, hops: Any, weight: Any, trusted: Any
+    ) -> Any:
+        """Derivatives, then trials, by one simulation that is compiled once."""
+        size = 1 + len(_DAMPING) + 2 * n
+        points = paired.around(u, shift)
+        most = max(size, points[0].shape[0])
+
+        def padded(x: jax.Array) -> jax.Array:
+            last = jnp.broadcast_to(x[:1], (most - x.shape[0], *x.shape[1:]))
+            return jnp.concatenate([x, last])
+
+        def turn(points: Any, weights: jax.Array) -> Any:
+            eq, each = paired.sweep(points[0], points[1], weights)
+            tried = trials(u, shift, damp, hops, eq)
+            return jax.tree.map(padded, tried), (eq, tried, each[:size])
+
+        points = jax.tree.map(padded, points)
+        out = jax.lax.scan(turn, points, jnp.stack([trusted, weight]))[1]
+        (eq, (units, shifts), _), (_, _, each) = (
+            jax.tree.map(lambda x, i=i: x[i], out) for i in range(2)
+        )
+        return eq, units, shifts, each
 
     init = (
         unit,

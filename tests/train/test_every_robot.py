@@ -1,0 +1,72 @@
+"""The whole pipeline for the larger robots, small; Cartpole's is in `test_chain`."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from train import easi, evaluate, pipeline, udr
+from train._command import main
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(3000)]
+
+SEARCH = (
+    *("--generations", "3", "--population", "24", "--trajectories", "4"),
+    *("--set", "segments=16", "real_batch=64", "discriminator_updates=2"),
+)
+TARGETS = {
+    "ant": "torso_mass*0.5",
+    "ballbalance": "ball_mass*0.5",
+    "go2": "thigh_kp*0.5",
+}
+
+
+def _main(module, *args: object) -> None:
+    main(module.Config, module.run, name=module.__name__, args=[str(a) for a in args])
+
+
+def _check(run: Path, robot: str) -> None:
+    result = json.loads((run / "results.json").read_text())
+    assert result["robot"] == robot and result["methods"] == ["UDR", "EASI"]
+    assert np.isfinite([*result["returns"]["EASI"].values()]).all()
+    found = json.loads((run / "distribution.json").read_text())
+    seed = found["seeds"]["0"]
+    assert np.isfinite(seed["mean"]).all()
+    # What the data determine, the finish finds, however short the search.
+    for p, x, flag in zip(
+        found["parameters"], seed["mean"], seed["flags"], strict=True
+    ):
+        if flag == "determined":
+            truth = found["truth"][p["name"]]
+            assert abs(np.log(x / truth)) < 0.2, p["name"]
+    report = (run / "report.html").read_text()
+    # Figs 5 and 6 of the paper.
+    assert "Return by training step" in report and "Return by method" in report
+
+
+@pytest.mark.parametrize("robot", list(TARGETS))
+def test_from_udr_to_evaluation(robot: str, tmp_path: Path) -> None:
+    target = ("--target", TARGETS[robot])
+    steps = ("--env-steps", 10_240, "--algorithm", "ppo", "--eval-episodes", 4)
+    _main(udr, "--robot", robot, "--out", tmp_path / "udr", *steps, *target)
+    _main(
+        easi,
+        *("--udr", tmp_path / "udr", "--out", tmp_path / "easi", *SEARCH, *target),
+        *("--eval-episodes", 4),
+    )
+    _check(tmp_path / "easi", robot)
+    out = tmp_path / "returns.json"
+    _main(evaluate, "--run", tmp_path / "easi", "--episodes", 2, "--out", out)
+    assert json.loads(out.read_text())["method"] == "EASI"
+
+
+@pytest.mark.parametrize("robot", list(TARGETS))
+def test_as_one_program(robot: str, tmp_path: Path) -> None:
+    _main(
+        pipeline,
+        *("--robot", robot, "--out", tmp_path / "run", "--algorithm", "ppo"),
+        *("--env-steps", 10_240, "--eval-episodes", 4, *SEARCH),
+        *("--target", TARGETS[robot]),
+    )
+    _check(tmp_path / "run", robot)
