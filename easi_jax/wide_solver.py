@@ -97,10 +97,19 @@ class _Newton:
         better = self._cost(p, warm, start, hold) < self._cost(p, start, start, hold)
         a = jnp.where(better, warm, start)
 
-        def step(a: jax.Array, _: None) -> tuple[jax.Array, None]:
-            return self._step(p, a, hold), None
+        settled = jnp.sqrt(jnp.finfo(a.dtype).eps)
 
-        a = jax.lax.scan(step, a, None, length=self.steps)[0]
+        def going(state: Any) -> jax.Array:
+            return state[1] < self.steps
+
+        def step(state: Any) -> Any:
+            a, k = state
+            new = self._step(p, a, hold)
+            # Newton's step is exact once no row changes: a small one was the last.
+            moved = jnp.abs(new - a).max(0) > settled * jnp.abs(new).max(0)
+            return new, jnp.where(moved.any(), k + 1, self.steps)
+
+        a, _ = jax.lax.while_loop(going, step, (a, jnp.asarray(0)))
         force = jnp.clip(-p.stiff * hold(self._along(p, a) - p.aref), p.low, p.high)
         return a, force, self._back(p, force)
 
