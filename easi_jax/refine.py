@@ -29,6 +29,7 @@ _TINY = 1e-12
 _PATIENCE = 6  # rounds without progress that end the fit
 _TOLD_APART = 0.05  # of the cost, which is minus a logarithm of likelihood
 _ROUNDING = 3e-6  # of the cost, which the best of many trials takes for progress
+_ROUGH = 1e-3  # of the cost: less progress than that is not to be had by differences
 _MOVING, _LOOKING, _FINISHED = range(3)
 _FARTHEST = 0.8, 2.5  # jump that is tried, in initial ranges, in log ratios
 _OUTLYING = 9.0  # times the median cost: such a piece counts half
@@ -90,6 +91,7 @@ def refine(
         return 0.5 * jnp.sum(pull * away(u) ** 2, axis=-1)
 
     n, count = space.size, segments.count
+    rounding = _ROUGH if paired.by_differences else _ROUNDING
     # A start range may be narrow, and wrong.
     wide = np.maximum(_FARTHEST[0], _FARTHEST[1] / space.log_width)
     farthest = np.where(space.log, wide, _FARTHEST[0])
@@ -199,7 +201,7 @@ def refine(
         carry, cost = step(carry, moving, ~moving | (k > robust))
         costs = jnp.where(jnp.arange(iterations + 2) >= k, cost, costs)
         # By less than this the data cannot tell two results apart.
-        told_apart = _TOLD_APART + _ROUNDING * cost
+        told_apart = _TOLD_APART + rounding * cost
         settled = costs[jnp.maximum(k - _PATIENCE, 0)] - cost < told_apart
         settled &= k > robust + _PATIENCE
         over = settled | (k >= iterations)

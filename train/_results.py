@@ -129,8 +129,7 @@ def motion_strip(env: Any, qpos: Any, method: str, notes: list[str]) -> list[Any
             "An episode",
             strip(frames),
             f"Frames of an episode of the {method} policy in the target",
-            f"{method} policy in the target, the first {end * env.dt:.2g} s from left "
-            "to right.",
+            f"{method} policy in the target: {FRAMES} moments of {end * env.dt:.2g} s.",
         )
     ]
 
@@ -250,10 +249,11 @@ def write_pseudo_real(
     bad = [
         n for n, f in zip(space.names, best["flags"], strict=True) if f != "determined"
     ]
+    cases = [(k, model) for k in ("one_step", "open_loop") for model in shares[k]]
+    labels = {"one_step": "one step", "open_loop": "0.2 s"}
     error_rows = [
-        (label, model, *(f"{100 * x:.2f} %" for x in shares[kind][model].values()))
-        for kind, label in (("one_step", "one step"), ("open_loop", "0.2 s"))
-        for model in shares[kind]
+        (channel, *(f"{100 * shares[k][model][channel]:.2f} %" for k, model in cases))
+        for channel in errors["channels"]
     ]
     write_report(
         folder.path / "report.html",
@@ -275,7 +275,7 @@ def write_pseudo_real(
                 ),
                 Table(
                     "Prediction error on fresh motion of the target",
-                    ("prediction", "model", *errors["channels"]),
+                    ("channel", *(f"{labels[k]}, {model}" for k, model in cases)),
                     error_rows,
                     "RMS error as a share of the RMS motion, noise-free, pieces at a "
                     "speed limit left out; median over seeds. Never searched on.",

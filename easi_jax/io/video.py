@@ -16,6 +16,7 @@ from PIL import Image
 from easi_jax.errors import UserError
 
 FRAMES = 6  # of a strip
+_ROW = 3
 _LIMIT = 300  # s
 _WAYS = ("egl", "osmesa", "glfw")
 
@@ -113,9 +114,12 @@ def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
 
 
 def strip(frames: np.ndarray, count: int = FRAMES) -> str:
-    """``count`` frames side by side as SVG that holds its picture within itself."""
+    """``count`` frames, three in a row, as SVG that holds its picture within itself."""
     chosen = frames[np.linspace(0, len(frames) - 1, count).round().astype(int)]
-    wide = np.concatenate(list(chosen), axis=1)
+    rows = [chosen[i : i + _ROW] for i in range(0, count, _ROW)]
+    blank = np.full_like(chosen[:1], 255)
+    rows[-1] = np.concatenate([rows[-1], *[blank] * (min(_ROW, count) - len(rows[-1]))])
+    wide = np.concatenate([np.concatenate(list(row), axis=1) for row in rows])
     buffer = io.BytesIO()
     Image.fromarray(wide).save(buffer, "JPEG", quality=80)
     data = base64.b64encode(buffer.getvalue()).decode()

@@ -41,6 +41,21 @@ def test_join_and_take() -> None:
     np.testing.assert_array_equal(some.next_qpos[..., 0], [[103, 104], [1, 2]])
 
 
+def test_spread_picks_at_even_distances_among_those_that_count() -> None:
+    s = segments.cut(*record(12), horizon=1, every=1)
+    assert s is not None and s.count == 11
+    s = segments.to_device(s.replace(weight=np.array([0.0, 1] * 5 + [1])))  # type: ignore[attr-defined]
+    some = s.spread(3)
+    np.testing.assert_array_equal(some.qpos[:, 0], [1, 5, 9])
+    np.testing.assert_array_equal(some.weight, [1, 1, 1])
+    # Too few: some twice, none counted twice.
+    many = s.spread(12)
+    assert set(np.asarray(many.qpos[:, 0])) == {1, 3, 5, 7, 9, 10}
+    assert float(many.weight.sum()) == 6
+    none = s.replace(weight=0 * s.weight).spread(2)  # type: ignore[attr-defined]
+    assert float(none.weight.sum()) == 0
+
+
 def test_windows_of_trajectories_count_only_where_all_their_steps_do() -> None:
     b, t = 2, 7
     row = jnp.arange(t, dtype=float) + 10 * jnp.arange(b)[:, None]

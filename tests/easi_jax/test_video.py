@@ -51,3 +51,8 @@ def test_what_cannot_be_is_said(
     with pytest.raises(UserError, match="EGL or OSMesa"):
         render(cartpole.mj_model, np.zeros((1, 2)))
     assert not list(tmp_path.iterdir())
+
+
+def test_a_strip_breaks_into_rows(frames: np.ndarray) -> None:
+    svg = strip(frames, 5)
+    assert 'viewBox="0 0 480 240"' in svg

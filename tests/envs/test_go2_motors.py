@@ -85,6 +85,10 @@ def test_options_by_name_and_their_mistakes() -> None:
         (("parameter=full",), 'no option "parameter"'),
         (("full",), "write NAME=VALUE"),
         (("parameters=all",), "unknown parameters"),
+        (("torque_speed=maybe",), "true or false"),
+        (("episode_length=\u00b2",), "whole number"),
+        (("episode_length=0",), "whole number"),
+        (("commands=3",), "cannot be given on the command line"),
     ):
         with pytest.raises(UserError, match=said):
             open_env("go2", None, options)

@@ -90,7 +90,8 @@ def test_every_parameter_moves_the_rollout(runs: Runs) -> None:
         assert np.abs(moved - runs.ours[0]).max() > 1e-4, name
 
 
-@pytest.fixture(scope="module", params=list(CASES))
+# Go2's 25 parameters reach no further than its 8 do.
+@pytest.fixture(scope="module", params=[c for c in CASES if c != "go2_full"])
 def episodes(request: pytest.FixtureRequest) -> Any:
     """Random actions from a reset, at random corners of the parameter box."""
     case = CASES[request.param]
