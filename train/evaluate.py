@@ -42,13 +42,14 @@ def run(config: Config) -> None:
 
     from easi_jax.errors import UserError
     from easi_jax.io.files import atomic_write, to_json
+    from easi_jax.io.video import check_video, render, write_video
     from easi_jax.pipeline import Pipeline, PipelineConfig, target_parameters
     from train._robots import load_policies
 
     if config.episodes < 1:
         raise UserError(f"--episodes is {config.episodes}: give at least 1")
-    if config.render is not None and config.render.suffix not in (".gif", ".mp4"):
-        raise UserError(f"--render {config.render}: a video ends in .gif or .mp4")
+    if config.render is not None:
+        check_video(config.render)
     saved = load_policies(config.run, config.policy, config.env)
     env = saved["env"]
     theta = target_parameters(env.space, config.target)
@@ -84,8 +85,6 @@ def run(config: Config) -> None:
         atomic_write(config.out, to_json(result))
         say(f"written: {config.out}")
     if config.render is not None:
-        from easi_jax.io.video import render, write_video
-
         every = max(1, round(1 / (_FPS * env.dt)))
         frames = render(env.mj_model, motion[0][::every])
         write_video(config.render, frames, 1 / (every * env.dt))

@@ -145,7 +145,8 @@ def run(config: Config) -> None:
                 headline=[
                     f"The policy trained {how} returns "
                     f"{np.median(per_seed):.1f} in the target (median of "
-                    f"{len(config.seeds)} seeds, {config.eval_episodes} episodes each)."
+                    f"{len(config.seeds)} seed{'s' if len(config.seeds) > 1 else ''}, "
+                    f"{config.eval_episodes} episodes each)."
                 ],
                 command="python -m train.udr",
                 tables=[Table(title, ("seed", "return"), rows)],

@@ -68,12 +68,22 @@ def render(
     )
 
 
+def check_video(path: Path) -> None:
+    """Raises UserError where `write_video` could not write ``path``: another ending
+    than ``.gif`` and ``.mp4``, or no ffmpeg for an MP4."""
+    if path.suffix not in (".gif", ".mp4"):
+        raise UserError(f"{path}: a video ends in .gif or .mp4")
+    if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
+        raise UserError(f"{path}: an MP4 needs ffmpeg, which is not here; give .gif")
+
+
 def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
     """Writes ``frames (T, H, W, 3)`` as ``.gif``, or as ``.mp4`` with ffmpeg.
 
     Raises:
-        UserError: another ending, or no ffmpeg for an MP4.
+        UserError: see `check_video`; ffmpeg failed.
     """
+    check_video(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.part{path.suffix}")
     if path.suffix == ".gif":
@@ -85,18 +95,23 @@ def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
             duration=max(20, round(1000 / fps)),
             loop=0,
         )
-    elif path.suffix == ".mp4":
-        tool = shutil.which("ffmpeg")
-        if tool is None:
-            raise UserError(
-                f"{path}: an MP4 needs ffmpeg, which is not here; give .gif"
-            )
+    else:
         height, width = frames.shape[1:3]
         wanted = ("-pix_fmt", "yuv420p")
         kind = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
         try:
             done = subprocess.run(
-                [tool, "-y", *kind, "-r", f"{fps:g}", "-i", "-", *wanted, str(part)],
+                [
+                    "ffmpeg",
+                    "-y",
+                    *kind,
+                    "-r",
+                    f"{fps:g}",
+                    "-i",
+                    "-",
+                    *wanted,
+                    str(part),
+                ],
                 input=np.ascontiguousarray(frames).tobytes(),
                 capture_output=True,
                 timeout=_LIMIT,
@@ -108,8 +123,6 @@ def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
             part.unlink(missing_ok=True)
             last = done.stderr.decode(errors="replace").strip().splitlines()[-1]
             raise UserError(f"{path}: ffmpeg failed: {last}")
-    else:
-        raise UserError(f"{path}: a video ends in .gif or .mp4")
     part.replace(path)
 
 
