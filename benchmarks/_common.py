@@ -8,6 +8,21 @@ from typing import Any
 RESULTS = Path(__file__).parent / "results"
 
 
+def command_of(module: str, config: Any) -> str:
+    """The command that makes ``config``: every field that is not its default."""
+    words = [f"python -m {module}"]
+    for field in dataclasses.fields(config):
+        value, flag = getattr(config, field.name), field.name.replace("_", "-")
+        if value == field.default:
+            continue
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+        else:
+            items = value if isinstance(value, tuple) else (value,)
+            words += [f"--{flag}", *map(str, items)]
+    return " ".join(words)
+
+
 def write_result(
     name: str, command: str, config: Any, folder: Path = RESULTS, **figures: Any
 ) -> Path:

@@ -34,15 +34,15 @@ class Config:
 
 def run(config: Config) -> None:
     """Writes one file a robot."""
-    from benchmarks._common import write_result
+    from benchmarks._common import command_of, write_result
     from envs import make
 
     for name in config.robots:
-        env = make(name)
+        env, chosen = make(name), dataclasses.replace(config, robots=(name,))
         found = _compare(env, config)
         path = write_result(
             f"accuracy_{name}",
-            f"python -m benchmarks.accuracy --robots {name}",
+            command_of("benchmarks.accuracy", chosen),
             config,
             used=int(env.mj_model.opt.iterations),
             times_s=TIMES,
@@ -77,8 +77,7 @@ def _compare(env: Any, config: Config) -> dict[str, list[list[float]]]:
         m = env.mj_model.__copy__()
         m.opt.iterations = iterations
         m.opt.timestep = env.dt / (env.machine.substeps * finer)
-        old = env.machine.base
-        return Machine(m, env.space, env.dt, old.sense, old.sense_size)
+        return Machine(m, env.space, env.dt)
 
     def positions(machine: Machine, first: Any, ctrl: jax.Array) -> Any:
         def one(t: jax.Array, state: Any, u: jax.Array) -> Any:

@@ -31,7 +31,7 @@ class Config:
 
 def run(config: Config) -> None:
     """Reads the folders and writes the robot's file."""
-    from benchmarks._common import write_result
+    from benchmarks._common import command_of, write_result
     from easi_jax.errors import UserError
     from easi_jax.io.files import read_json
     from easi_jax.io.metrics import read_metrics
@@ -43,6 +43,8 @@ def run(config: Config) -> None:
     for folder in config.runs:
         saved = load_policies(folder)
         env = saved["env"]
+        if saved["method"] not in ("UDR", "Fixed"):
+            raise UserError(f"{folder} holds no run of train.udr")
         robots.add(env.name)
         lines = read_metrics(folder / "metrics.jsonl", "train")
         versions = read_json(folder / "versions.json")
@@ -51,6 +53,9 @@ def run(config: Config) -> None:
         seconds = (folder / "results.json").stat().st_mtime - begin
         result = read_json(folder / "results.json")
         method = saved["method"]
+        nominal = dict(zip(env.space.names, env.space.nominal.tolist(), strict=True))
+        if result["target"] != nominal:
+            raise UserError(f"{folder} was tested in another target than the nominal")
         row = {
             "method": method,
             "algorithm": result["algorithm"],
@@ -75,8 +80,7 @@ def run(config: Config) -> None:
     (robot,) = robots
     path = write_result(
         f"policies_{robot}",
-        "python -m benchmarks.policies --runs "
-        + " ".join(str(folder) for folder in config.runs),
+        command_of("benchmarks.policies", config),
         config,
         robot=robot,
         goal_minutes=GOAL_MINUTES.get(robot),
@@ -100,17 +104,16 @@ def run(config: Config) -> None:
 
 
 def _tracking(saved: Any) -> dict[str, Any]:
-    """Mean speed over the last two seconds at each forward command, and its error,
-    ``(commands, seeds)`` [m/s]; the other commands are zero."""
+    """Mean forward speed [m/s] over the last two seconds and falls, at each forward
+    command, by seed; the other commands are zero."""
     import jax
     import jax.numpy as jnp
     import numpy as np
 
     from easi_jax.rl.networks import act
     from envs.frames import matrix
-    from envs.go2 import Commands, Go2
 
-    env = Go2(commands=Commands(still=0.0))
+    env = saved["env"]
     model = env.model()
 
     @jax.jit

@@ -10,6 +10,7 @@ finish, from UDR's range and from ranges that exclude the truth. ``time``: a sea
 """
 
 import dataclasses
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -33,8 +34,8 @@ class Config:
     """Run folder of train.udr."""
     option: tuple[str, ...] = ()
     """Options of the built-in robot in place of those of the run."""
-    parts: tuple[str, ...] = PARTS
-    """What to run: recovery, time, memory."""
+    part: str = "recovery"
+    """What to run: recovery, time or memory."""
     starts: tuple[str, ...] = tuple(STARTS)
     """Where searches start: within, low, high."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
@@ -55,24 +56,26 @@ class Config:
 def run(config: Config) -> None:
     """Runs the parts, each written when it is done."""
     from easi_jax.errors import UserError, nearest
+    from easi_jax.io.files import read_json
     from envs import open_env
-    from train._robots import load_policies
+    from train._robots import check_seeds, load_policies
 
-    for chosen, known in ((config.parts, PARTS), (config.starts, STARTS)):
+    check_seeds(config.seeds)
+    for chosen, known in (((config.part,), PARTS), (config.starts, STARTS)):
         for name in chosen:
             if name not in known:
                 raise UserError(f'unknown "{name}"{nearest(name, known)}')
     saved = load_policies(config.udr)
     env = saved["env"]
-    label = env.name
+    option = config.option or read_json(config.udr / "results.json")["option"]
     if config.option:
         env = open_env(env.name, None, config.option)
-        label += "_" + "_".join(o.replace("=", "_") for o in config.option)
-    if "time" in config.parts:
+    label = "_".join([env.name, *(o.replace("=", "_") for o in option)])
+    if config.part == "time":
         _time(config, env, saved, label)
-    if "memory" in config.parts:
+    elif config.part == "memory":
         _memory(config, env, saved, label)
-    if "recovery" in config.parts:
+    else:
         for start in config.starts:
             _recovery(config, env, saved, label, start)
 
@@ -118,7 +121,8 @@ def peak_gib() -> float:
     """Peak resident size of this process [GiB]."""
     import resource
 
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**30 if sys.platform == "darwin" else 2**20)
 
 
 def _searched(pipe: Any, demos: Any, keys: Any, policies: Any) -> Any:
@@ -143,7 +147,7 @@ def _searched(pipe: Any, demos: Any, keys: Any, policies: Any) -> Any:
 def _time(config: Config, env: Any, saved: Any, label: str) -> None:
     import jax
 
-    from benchmarks._common import write_result
+    from benchmarks._common import command_of, write_result
 
     steps = config.steps or STEPS.get(env.name, 200)
     pipe = _pipe(
@@ -162,10 +166,11 @@ def _time(config: Config, env: Any, saved: Any, label: str) -> None:
         f"{label}: {config.generations} generations of {config.population} x {steps} "
         f"steps in {ran:.0f} s, compiled in {seconds:.0f} s, peak {peak_gib():.1f} GiB"
     )
-    short = "" if config.generations == Config.generations else "_short"
+    usual = (Config.generations, Config.population)
+    short = "" if (config.generations, config.population) == usual else "_short"
     path = write_result(
         f"search_{label}_{steps}{short}",
-        f"python -m benchmarks.robots --udr {config.udr} --parts time --steps {steps}",
+        command_of("benchmarks.robots", config),
         config,
         robot=env.name,
         steps=steps,
@@ -181,7 +186,7 @@ def _time(config: Config, env: Any, saved: Any, label: str) -> None:
 def _memory(config: Config, env: Any, saved: Any, label: str) -> None:
     import jax
 
-    from benchmarks._common import write_result
+    from benchmarks._common import command_of, write_result
 
     population = 4096
     pipe = _pipe(config, env, population=population, generations=1)
@@ -191,7 +196,7 @@ def _memory(config: Config, env: Any, saved: Any, label: str) -> None:
     say(f"{label}: a generation of {population}, peak {peak_gib():.2f} GiB")
     path = write_result(
         f"memory_{label}",
-        f"python -m benchmarks.robots --udr {config.udr} --parts memory",
+        command_of("benchmarks.robots", config),
         config,
         robot=env.name,
         what=f"search, population {population}",
@@ -205,7 +210,7 @@ def _recovery(config: Config, env: Any, saved: Any, label: str, start: str) -> N
     import jax
     import numpy as np
 
-    from benchmarks._common import write_result
+    from benchmarks._common import command_of, write_result
     from easi_jax.information import describe, identifiability
 
     pipe = _pipe(
@@ -218,7 +223,10 @@ def _recovery(config: Config, env: Any, saved: Any, label: str, start: str) -> N
     )
     keys, policies, demos = _demonstrations(pipe, saved, config.seeds)
     search, _, compile_s = _searched(pipe, demos, keys, policies)
-    finish = jax.jit(pipe.estimate)
+    first = pipe.search_init(keys["search"][:1], _first(demos, 0), _first(policies, 0))
+    begin = time.monotonic()
+    finish = jax.jit(pipe.estimate).lower(first, _first(demos, 0)).compile()
+    finish_compile_s = time.monotonic() - begin
     truth = np.asarray(env.space.nominal)
 
     def error(unit: Any) -> list[float]:
@@ -268,13 +276,13 @@ def _recovery(config: Config, env: Any, saved: Any, label: str, start: str) -> N
     }
     path = write_result(
         f"robots_{label}_{start}",
-        f"python -m benchmarks.robots --udr {config.udr} --parts recovery "
-        f"--starts {start}",
+        command_of("benchmarks.robots", dataclasses.replace(config, starts=(start,))),
         config,
         robot=env.name,
         start=STARTS[start],
         parameters=pipe.space.names,
         search_compile_s=compile_s,
+        finish_compile_s=finish_compile_s,
         peak_gib=peak_gib(),
         summary=summary,
         seeds=rows,

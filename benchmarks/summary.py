@@ -170,7 +170,7 @@ def _robots(folder: Path) -> list[str]:
         goal = SEARCH_GOALS.get(name)
         rows.append(
             (
-                r["robot"],
+                name.rpartition("_")[0],
                 f"{r['generations']} x {r['population']} x {r['steps']}",
                 f"{r['search_s']:.0f} s",
                 f"{goal} s, {_met(r['search_s'] < goal)}" if goal else "",
@@ -179,7 +179,7 @@ def _robots(folder: Path) -> list[str]:
             )
         )
     if rows:
-        out.append("`python -m benchmarks.robots --udr RUN --parts time`")
+        out.append("`python -m benchmarks.robots --udr RUN --part time`")
         head = (
             *("robot", "generations x individuals x control steps", "search", "goal"),
             *("trace and compile", "peak GiB"),
@@ -189,9 +189,10 @@ def _robots(folder: Path) -> list[str]:
     for path in sorted(folder.glob("memory_*.json")):
         r = _read(folder, path.stem)
         ok = _met(r["peak_gib"] < r["goal_gib"])
-        rows.append((r["robot"], r["what"], f"{r['peak_gib']:.1f}", ok))
+        label = path.stem.removeprefix("memory_")
+        rows.append((label, r["what"], f"{r['peak_gib']:.1f}", ok))
     if rows:
-        out.append("`python -m benchmarks.robots --udr RUN --parts memory`")
+        out.append("`python -m benchmarks.robots --udr RUN --part memory`")
         out.append(_table(("robot", "run", "peak GiB", "goal 8"), rows))
     rows, said, missing = [], [], []
     for name in ROBOTS:
@@ -204,6 +205,9 @@ def _robots(folder: Path) -> list[str]:
             std = np.median(np.array([s["cramer_rao_std"] for s in seeds], float), 0)
             known = np.flatnonzero(std < KNOWN)
             for method, s in r["summary"].items():
+                if not len(known):
+                    rows.append((name, start, method, len(seeds), f"0 of {len(std)}"))
+                    continue
                 middle = np.array(s["median_abs_log_ratio"])[known]
                 worst = np.array(s["worst_abs_log_ratio"])[known]
                 k = int(np.argmax(worst))
@@ -232,7 +236,7 @@ def _robots(folder: Path) -> list[str]:
             *("median error of these", "worst error of these, any seed"),
         )
         out.append(
-            "`python -m benchmarks.robots --udr RUN --parts recovery`: `default` is "
+            "`python -m benchmarks.robots --udr RUN`: `default` is "
             "the search alone, `refine` with the least-squares finish; `high` and "
             "`low` start at 2 to 4 and 0.05 to 0.5 times the truth. What the data can "
             "know to 2 % is read from their Fisher information."
@@ -256,7 +260,7 @@ def _policies(folder: Path) -> list[str]:
                     run["method"],
                     f"{run['algorithm']}, {run['env_steps']:,}",
                     f"{run['minutes']:.0f}",
-                    f"{goal}, {_met(run['minutes'] <= goal)}",
+                    f"{goal}, {_met(run['minutes'] <= goal)}" if goal else "",
                     ", ".join(f"{x:.1f}" for x in run["returns"].values()),
                 )
             )

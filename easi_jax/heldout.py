@@ -28,14 +28,15 @@ def errors_by_step(
     ``(H, 2 nv)``.
 
     Pieces that touch a joint's speed limit ``(nv,)`` are left out: there the share
-    says whether the limit was met, not how good the model is.
+    says whether the limit was met, not how good the model is. NaN where none is left.
     """
     error = replay.errors(machine, model, pieces)
     moved = replay.motion(machine, pieces)
     fast = jnp.concatenate([pieces.qvel[:, None], pieces.next_qvel], 1)
     slow = (jnp.abs(fast) < 0.98 * speed_limit).all((1, 2))
     w = (pieces.weight * slow)[:, None, None]
-    return jnp.sqrt((w * error**2).sum(0) / jnp.maximum((w * moved**2).sum(0), 1e-30))
+    share = (w * error**2).sum(0) / jnp.maximum((w * moved**2).sum(0), 1e-30)
+    return jnp.where(w.sum() > 0, jnp.sqrt(share), jnp.nan)
 
 
 def shares(
@@ -44,11 +45,12 @@ def shares(
     """Relative errors of models ``theta (S, n)`` in the target, noise-free.
 
     Returns:
-        One-step and 0.2 s open-loop errors, ``(S, 2 nv)`` each.
+        Errors after the first step and at the end of pieces of 0.2 s, one after the
+        other along each trajectory; ``(S, 2 nv)`` each.
     """
     env = pipe.env
     truth = env.model(target)
-    steps = max(1, round(OPEN_LOOP / env.dt))
+    steps = min(max(1, round(OPEN_LOOP / env.dt)), env.episode_length)
 
     def one(item: Any) -> tuple[jax.Array, jax.Array]:
         policy, t, key = item

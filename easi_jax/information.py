@@ -154,8 +154,9 @@ class PairedFit:
         """One piece's part of `Normal`, from its residual and slopes."""
         n, nv2, noise = self.space.size, len(d), self.noise
         root = jnp.sqrt(w) / noise
-        # A piece of weight zero may hold anything, not finite included.
-        on = w > 0
+        # A piece of weight zero may hold anything; one that the simulation does not
+        # get through has no slopes.
+        on = (w > 0) & jnp.isfinite(r).all() & jnp.isfinite(jac).all()
         rw = jnp.where(on, r * root, 0.0).reshape(-1)
         jw = jnp.where(on[..., None], jac * root[..., None], 0.0)
         jw = jw.reshape(rw.shape[0], -1)

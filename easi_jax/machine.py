@@ -60,6 +60,14 @@ class Machine:
             step = jnp.asarray(self.dt / self.substeps, model.mjx.opt.timestep.dtype)
             return model.replace(mjx=model.mjx.tree_replace({"opt.timestep": step}))
 
+    def with_space(self, space: ParameterSpace) -> "Machine":
+        """The same machine, what it senses and its drives included, with other
+        parameters."""
+        old = self.base
+        new = Machine(self.mj_model, space, self.dt, old.sense, old.sense_size)
+        new.base = new.base.replace(torque_speed=old.torque_speed)
+        return new
+
     def model(self, theta: jax.Array) -> Model:
         """The model at parameters ``theta`` ``(n,)`` in SI units."""
         return with_parameters(self.base, theta)

@@ -28,8 +28,8 @@ def sharded_map(
 
     ``fun`` sees a slice of the leading axis and returns arrays with the same one;
     ``shared`` goes whole to every device. The axis is padded by repetition where it
-    does not divide, so that no device count is a special case, and every slice gets
-    a ``multiple`` of so many rows.
+    does not divide, so that no device count is a special case; each slice has a
+    multiple of ``multiple`` rows.
     """
     n = jax.tree.leaves(sharded)[0].shape[0]
     pad = -n % (mesh.size * multiple)

@@ -17,7 +17,6 @@ from easi_jax import distribution
 from easi_jax.distribution import Distribution
 from easi_jax.errors import UserError, nearest
 from easi_jax.identify import Estimate, estimate
-from easi_jax.machine import Machine
 from easi_jax.mesh import make_mesh, sharded_map
 from easi_jax.parameters import ParameterSpace
 from easi_jax.physics import WRITTEN_OUT
@@ -62,6 +61,10 @@ class PipelineConfig:
             raise UserError(f"trajectories is {self.trajectories}: give at least 1")
         if self.eval_episodes < 1:
             raise UserError(f"eval_episodes is {self.eval_episodes}: give at least 1")
+        for name in ("refine_horizon", "refine_pieces"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise UserError(f"{name} is {value}: give at least 1")
         if any(not np.isfinite(x) or x < 0 for x in self.noise):
             raise UserError(f"noise is {self.noise}: give finite numbers, 0 or more")
 
@@ -124,7 +127,7 @@ class Pipeline:
             )
         self.env, self.config, self.mesh = env, config, mesh or make_mesh()
         space = env.space if start is None else env.space.scaled(*start)
-        self.machine = Machine(env.mj_model, space, env.dt)
+        self.machine = env.machine.with_space(space)
         self.trainer = make_trainer(env, config.training, env.model, self._draw)
         self.search = Search(
             self.machine,

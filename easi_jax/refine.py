@@ -111,7 +111,8 @@ def refine(
             eq = paired.normal(u, shift, trusted)
             units, shifts = trials(u, shift, damp, hops, eq)
             each = paired.costs(units, shifts, weight)
-        data = (each * trust).sum(1)
+        # A piece without trust may be infinitely bad.
+        data = jnp.where(trust > 0, each * trust, 0.0).sum(1)
         costs = data + prior(units)
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
         best = jnp.where(moving, jnp.argmin(costs), 0)

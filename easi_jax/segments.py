@@ -1,6 +1,5 @@
 """Short pieces of measured motion: where they start, what was sent, what came."""
 
-import dataclasses
 from typing import Any
 
 import flax.struct
@@ -43,14 +42,13 @@ class Segments:
     def spread(self, count: int) -> "Segments":
         """``count`` segments at even distances among those that count; jit-friendly.
 
-        Where fewer count, some come twice and the weights are lowered accordingly.
+        Where fewer count, all of them, and the others weigh nothing.
         """
         order = jnp.argsort(self.weight <= 0, stable=True)
         found = jnp.sum(self.weight > 0)
-        index = jnp.arange(count) * found // count
-        few = self.take(order[index])
-        share = jnp.minimum(found, count) / count
-        return dataclasses.replace(few, weight=few.weight * share)
+        each = jnp.arange(count)
+        index = jnp.where(found >= count, each * found // count, each)
+        return self.take(order[index])
 
 
 def cut(

@@ -105,7 +105,8 @@ class _Newton:
         def step(state: Any) -> Any:
             a, k = state
             new = self._step(p, a, hold)
-            # Newton's step is exact once no row changes: a small one was the last.
+            # A full Newton step is exact where no row changes: a small one was the
+            # last. A short one is small too, where the line search finds no way.
             moved = jnp.abs(new - a).max(0) > settled * jnp.abs(new).max(0)
             return new, jnp.where(moved.any(), k + 1, self.steps)
 
@@ -237,7 +238,8 @@ def solution(
 ) -> Callable[..., tuple[jax.Array, jax.Array, jax.Array]]:
     """The solver ``f(problem, warm, start)``, unbatched, for `Rows.dofs`.
 
-    ``problem``'s arrays are without lanes; it starts from the better of ``start``, the
+    ``problem``'s arrays are without lanes; it takes ``steps`` Newton steps at most,
+    from the better of ``start``, the
     acceleration without constraints, and ``warm``. Returns acceleration, force on each
     row (dense ones first), force on each joint. Derivatives are those of the converged
     solution.

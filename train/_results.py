@@ -107,6 +107,14 @@ def history_figure(
     )
 
 
+def _finite(values: Any) -> list[float | None]:
+    return [float(x) if x == x else None for x in values]
+
+
+def _share(x: float | None) -> str:
+    return "not measured" if x is None else f"{100 * x:.2f} %"
+
+
 def motion_strip(env: Any, qpos: Any, method: str, notes: list[str]) -> list[Any]:
     """An episode ``qpos (T + 1, nq)`` as a strip of frames; where nothing can be drawn,
     a note and no picture."""
@@ -129,7 +137,7 @@ def motion_strip(env: Any, qpos: Any, method: str, notes: list[str]) -> list[Any
             "An episode",
             strip(frames),
             f"Frames of an episode of the {method} policy in the target",
-            f"{method} policy in the target: {FRAMES} moments of {end * env.dt:.2g} s.",
+            f"{method} policy in the target: {FRAMES} moments of {end * env.dt:.1f} s.",
         )
     ]
 
@@ -175,7 +183,7 @@ def write_pseudo_real(
         results.append(seed_result(space, dist.mean[i], cov, estimate.hessian[i]))
     shares = {
         kind: {
-            model: dict(zip(errors["channels"], np.median(v, 0).tolist(), strict=True))
+            model: dict(zip(errors["channels"], _finite(np.median(v, 0)), strict=True))
             for model, v in errors[kind].items()
         }
         for kind in ("one_step", "open_loop")
@@ -252,7 +260,7 @@ def write_pseudo_real(
     cases = [(k, model) for k in ("one_step", "open_loop") for model in shares[k]]
     labels = {"one_step": "one step", "open_loop": "0.2 s"}
     error_rows = [
-        (channel, *(f"{100 * shares[k][model][channel]:.2f} %" for k, model in cases))
+        (channel, *(_share(shares[k][model][channel]) for k, model in cases))
         for channel in errors["channels"]
     ]
     write_report(

@@ -177,7 +177,7 @@ def load_udr(folder: Path, env_file: Path | None = None) -> dict[str, Any]:
     ``env_file``: see `env_of`.
 
     Raises:
-        UserError: the folder holds no finished UDR run.
+        UserError: the folder holds no finished run of train.udr.
     """
     import jax
 

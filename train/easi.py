@@ -13,9 +13,9 @@ class Config:
 
     With a built-in robot, the policy of ``train.udr`` records demonstrations in a
     pseudo-real target, the search never sees the target's parameters, and the final
-    policy is tested there against UDR (and, with --oracle, against a policy trained in
-    the target itself). With --data, logs of a real machine take the target's place:
-    give --model and --parameters for a machine of your own.
+    policy is tested there against the first (and, with --oracle, against a policy
+    trained in the target itself). With --data, logs of a real machine take the
+    target's place: give --model and --parameters for a machine of your own.
     """
 
     udr: Path = Path("results/udr")

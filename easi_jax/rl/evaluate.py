@@ -41,11 +41,9 @@ def evaluate(
         ``(num_envs,)``; NaN where the simulation did not stay finite.
     """
 
-    def episode(model: Model, key: jax.Array) -> jax.Array:
-        return _episode(env, model, policy, act, key, deterministic, _nothing)[0]
-
     keys = jax.random.split(key, num_envs)
-    return jax.vmap(episode, in_axes=(0 if batched else None, 0))(models, keys)
+    run = _episodes(env, models, policy, act, keys, deterministic, batched)
+    return run(lambda _: None)[0]
 
 
 def play(
@@ -63,39 +61,43 @@ def play(
         stands still at its end.
     """
 
-    def episode(key: jax.Array) -> Any:
-        return _episode(env, model, policy, act, key, True, lambda s: s.physics.qpos)
-
-    returns, qpos = jax.vmap(episode)(jax.random.split(key, num_envs))
-    return returns, qpos[0]
+    keys = jax.random.split(key, num_envs)
+    run = _episodes(env, model, policy, act, keys, True, False)
+    return run(lambda states: states.physics.qpos[0])
 
 
-def _nothing(state: Any) -> None:
-    del state
-
-
-def _episode(
+def _episodes(
     env: Env,
-    model: Model,
+    models: Model,
     policy: PolicyParams,
     act: Act,
-    key: jax.Array,
+    keys: jax.Array,
     deterministic: bool,
-    watch: Callable[[Any], Any],
-) -> tuple[jax.Array, Any]:
-    """Return of one episode; what ``watch`` sees of its states, ``(T + 1, ...)``."""
-    k_reset, k_act = jax.random.split(key)
+    batched: bool,
+) -> Callable[[Callable[[Any], Any]], tuple[jax.Array, Any]]:
+    """``run(watch)``: returns of all episodes ``(n,)``, and what ``watch`` sees of all
+    their states together at every time, ``(T + 1, ...)``."""
+    axis = 0 if batched else None
+    k_reset, k_act = jax.vmap(jax.random.split, out_axes=1)(keys)
 
-    def step(carry: Any, k: jax.Array) -> tuple[Any, Any]:
-        state, total = carry
+    def one(model: Model, state: Any, total: jax.Array, k: jax.Array) -> Any:
         done = (state.terminated + state.truncated) > 0
         new = env.step(model, state, act(policy, state.obs, k, deterministic))
         gain = jnp.where(jnp.isfinite(new.obs).all(), new.reward, jnp.nan)
         state = jax.tree.map(lambda a, b: jnp.where(done, a, b), state, new)
-        return (state, total + jnp.where(done, 0.0, gain)), watch(state)
+        return state, total + jnp.where(done, 0.0, gain)
 
-    first = env.reset(model, k_reset)
-    keys = jax.random.split(k_act, env.episode_length)
-    (_, total), seen = jax.lax.scan(step, (first, jnp.zeros(())), keys)
-    whole = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), watch(first), seen)
-    return total, whole
+    def run(watch: Callable[[Any], Any]) -> tuple[jax.Array, Any]:
+        def step(carry: Any, ks: jax.Array) -> tuple[Any, Any]:
+            each = jax.vmap(one, in_axes=(axis, 0, 0, 0))
+            carry = each(models, carry[0], carry[1], ks)
+            return carry, watch(carry[0])
+
+        first = jax.vmap(env.reset, in_axes=(axis, 0))(models, k_reset)
+        split = jax.vmap(lambda k: jax.random.split(k, env.episode_length), out_axes=1)
+        start = (first, jnp.zeros(len(keys)))
+        (_, total), seen = jax.lax.scan(step, start, split(k_act))
+        join = lambda a, b: jnp.concatenate([a[None], b])  # noqa: E731
+        return total, jax.tree.map(join, watch(first), seen)
+
+    return run

@@ -48,10 +48,10 @@ def test_spread_picks_at_even_distances_among_those_that_count() -> None:
     some = s.spread(3)
     np.testing.assert_array_equal(some.qpos[:, 0], [1, 5, 9])
     np.testing.assert_array_equal(some.weight, [1, 1, 1])
-    # Too few: some twice, none counted twice.
-    many = s.spread(12)
-    assert set(np.asarray(many.qpos[:, 0])) == {1, 3, 5, 7, 9, 10}
-    assert float(many.weight.sum()) == 6
+    # Too few: all of them, once.
+    many = s.spread(9)
+    counted = np.asarray(many.qpos[:, 0])[np.asarray(many.weight) > 0]
+    assert sorted(counted) == [1, 3, 5, 7, 9, 10]
     none = s.replace(weight=0 * s.weight).spread(2)  # type: ignore[attr-defined]
     assert float(none.weight.sum()) == 0
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from easi_jax.errors import UserError
+from easi_jax.pipeline import Pipeline, PipelineConfig
 from envs import make, open_env
 from envs.go2 import MOTOR, motor_curve
 
@@ -94,3 +95,11 @@ def test_options_by_name_and_their_mistakes() -> None:
             open_env("go2", None, options)
     with pytest.raises(UserError, match="no option"):
         open_env("cartpole", None, ("parameters=full",))
+
+
+def test_a_search_simulates_the_motors_too() -> None:
+    env = make("go2", torque_speed=True)
+    pipe = Pipeline(env, PipelineConfig(), start=(0.5, 2.0))
+    assert pipe.machine.base.torque_speed is not None
+    ant = Pipeline(make("ant"), PipelineConfig())
+    assert ant.machine.base.sense_size == make("ant").machine.base.sense_size > 0

@@ -33,6 +33,7 @@ def _check(run: Path, robot: str) -> None:
     found = json.loads((run / "distribution.json").read_text())
     seed = found["seeds"]["0"]
     assert np.isfinite(seed["mean"]).all()
+    assert "determined" in seed["flags"]
     # What the data determine, the finish finds, however short the search.
     for p, x, flag in zip(
         found["parameters"], seed["mean"], seed["flags"], strict=True
