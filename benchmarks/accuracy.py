@@ -43,7 +43,7 @@ def run(config: Config) -> None:
         path = write_result(
             f"accuracy_{name}",
             command_of("benchmarks.accuracy", chosen),
-            config,
+            chosen,
             used=int(env.mj_model.opt.iterations),
             times_s=TIMES,
             percentiles=SHARES,
@@ -77,7 +77,7 @@ def _compare(env: Any, config: Config) -> dict[str, list[list[float]]]:
         m = env.mj_model.__copy__()
         m.opt.iterations = iterations
         m.opt.timestep = env.dt / (env.machine.substeps * finer)
-        return Machine(m, env.space, env.dt)
+        return env.machine.rebuilt(m)
 
     def positions(machine: Machine, first: Any, ctrl: jax.Array) -> Any:
         def one(t: jax.Array, state: Any, u: jax.Array) -> Any:

@@ -77,7 +77,8 @@ def run(config: Config) -> None:
         _memory(config, env, saved, label)
     else:
         for start in config.starts:
-            _recovery(config, env, saved, label, start)
+            chosen = dataclasses.replace(config, starts=(start,))
+            _recovery(chosen, env, saved, label, start)
 
 
 def _pipe(config: Config, env: Any, start: str = "within", **search: Any) -> Any:
@@ -222,8 +223,7 @@ def _recovery(config: Config, env: Any, saved: Any, label: str, start: str) -> N
         generations=config.generations,
     )
     keys, policies, demos = _demonstrations(pipe, saved, config.seeds)
-    search, _, compile_s = _searched(pipe, demos, keys, policies)
-    first = pipe.search_init(keys["search"][:1], _first(demos, 0), _first(policies, 0))
+    search, first, compile_s = _searched(pipe, demos, keys, policies)
     begin = time.monotonic()
     finish = jax.jit(pipe.estimate).lower(first, _first(demos, 0)).compile()
     finish_compile_s = time.monotonic() - begin
@@ -276,7 +276,7 @@ def _recovery(config: Config, env: Any, saved: Any, label: str, start: str) -> N
     }
     path = write_result(
         f"robots_{label}_{start}",
-        command_of("benchmarks.robots", dataclasses.replace(config, starts=(start,))),
+        command_of("benchmarks.robots", config),
         config,
         robot=env.name,
         start=STARTS[start],

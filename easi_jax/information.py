@@ -1,8 +1,9 @@
 """What measured segments say about the parameters: Fisher information.
 
 Derivatives of the simulation are forward-mode or, for larger robots, central
-differences. The start state of each segment is unknown within its noise and eliminated
-(Schur complement). The inverse is the Cramer-Rao bound.
+differences: their batches simulate many times faster than derivatives go through them
+(`easi_jax.lanes`). The start state of each segment is unknown within its noise and
+eliminated (Schur complement). The inverse is the Cramer-Rao bound.
 """
 
 import re
@@ -19,7 +20,6 @@ from easi_jax import replay
 from easi_jax.machine import Machine
 from easi_jax.mesh import make_mesh, sharded_map
 from easi_jax.parameters import ParameterSpace
-from easi_jax.physics import WRITTEN_OUT
 from easi_jax.segments import Segments
 
 _WEAK = 0.5  # std of a log ratio beyond which a direction is called undetermined
@@ -84,7 +84,7 @@ class PairedFit:
             delta: ``(M, 2 nv)``.
             weight: of each measured number, ``(M, H, 2 nv)``.
         """
-        if self.by_differences:
+        if self.machine.wide:
             units, deltas = self.around(unit, delta)
             return self.sweep(units, deltas, weight)[0]
 
@@ -94,13 +94,6 @@ class PairedFit:
             return self._equations(r, jac, d, w)
 
         return self._summed(self._each(one, 1, delta, weight))
-
-    @property
-    def by_differences(self) -> bool:
-        """Whether derivatives are central differences: batches of larger robots
-        simulate many times faster than derivatives go through them
-        (`easi_jax.lanes`)."""
-        return self.machine.mj_model.nv > WRITTEN_OUT
 
     def around(self, unit: jax.Array, delta: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Points whose `sweep` holds the derivatives at ``unit (n,)`` and ``delta
@@ -216,7 +209,7 @@ class PairedFit:
         """
         mesh = self.mesh or make_mesh()
         share = -(-self.segments.count // mesh.size)
-        wanted = self.machine.batch // points if self.by_differences else _CHUNK
+        wanted = self.machine.batch // points if self.machine.wide else _CHUNK
         batch = min(share, max(1, wanted))
         rounds = -(-share // batch)
         batch = -(-share // rounds)  # even ones: a shorter last one compiles again

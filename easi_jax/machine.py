@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from mujoco.mjx._src import math
 
+from easi_jax.drives import TorqueSpeed
 from easi_jax.errors import UserError
 from easi_jax.model import Model, Sense, put_model, with_parameters
 from easi_jax.parameters import ParameterSpace
@@ -29,6 +30,7 @@ class Machine:
         substeps: physics steps in a control step. The physics step is ``dt``
             divided by the smallest whole number that brings it to the model's own
             timestep or below.
+        wide: whether it is too large to be written out entry by entry.
         batch: simulations at once on a device; more would leave a CPU core's cache.
 
     Raises:
@@ -42,6 +44,7 @@ class Machine:
         dt: float | None = None,
         sense: Sense | None = None,
         sense_size: int = 0,
+        torque_speed: TorqueSpeed | None = None,
     ) -> None:
         step = float(mj_model.opt.timestep)
         self.dt = float(dt) if dt is not None else step
@@ -50,8 +53,11 @@ class Machine:
         self.substeps = physics_steps(self.dt, step)
         self.mj_model = mj_model
         self.space = space
-        self.batch = _BATCH if mj_model.nv <= WRITTEN_OUT else _WIDE_BATCH
-        self.base = self._put().replace(sense=sense, sense_size=sense_size)
+        self.wide = mj_model.nv > WRITTEN_OUT
+        self.batch = _WIDE_BATCH if self.wide else _BATCH
+        self.base = self._put().replace(
+            sense=sense, sense_size=sense_size, torque_speed=torque_speed
+        )
 
     def _put(self) -> Model:
         # Eagerly, also where a machine is made while something is traced.
@@ -60,13 +66,22 @@ class Machine:
             step = jnp.asarray(self.dt / self.substeps, model.mjx.opt.timestep.dtype)
             return model.replace(mjx=model.mjx.tree_replace({"opt.timestep": step}))
 
-    def with_space(self, space: ParameterSpace) -> "Machine":
-        """The same machine, what it senses and its drives included, with other
-        parameters."""
-        old = self.base
-        new = Machine(self.mj_model, space, self.dt, old.sense, old.sense_size)
-        new.base = new.base.replace(torque_speed=old.torque_speed)
-        return new
+    def rebuilt(
+        self,
+        mj_model: mujoco.MjModel | None = None,
+        space: ParameterSpace | None = None,
+    ) -> "Machine":
+        """The same machine, what it senses and its drives included, of another model
+        or with other parameters."""
+        base = self.base
+        return Machine(
+            self.mj_model if mj_model is None else mj_model,
+            self.space if space is None else space,
+            self.dt,
+            base.sense,
+            base.sense_size,
+            base.torque_speed,
+        )
 
     def model(self, theta: jax.Array) -> Model:
         """The model at parameters ``theta`` ``(n,)`` in SI units."""

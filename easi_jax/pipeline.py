@@ -19,7 +19,6 @@ from easi_jax.errors import UserError, nearest
 from easi_jax.identify import Estimate, estimate
 from easi_jax.mesh import make_mesh, sharded_map
 from easi_jax.parameters import ParameterSpace
-from easi_jax.physics import WRITTEN_OUT
 from easi_jax.rl.config import SacConfig
 from easi_jax.rl.evaluate import play
 from easi_jax.rl.networks import PolicyParams, act
@@ -127,7 +126,7 @@ class Pipeline:
             )
         self.env, self.config, self.mesh = env, config, mesh or make_mesh()
         space = env.space if start is None else env.space.scaled(*start)
-        self.machine = env.machine.with_space(space)
+        self.machine = env.machine.rebuilt(space=space)
         self.trainer = make_trainer(env, config.training, env.model, self._draw)
         self.search = Search(
             self.machine,
@@ -262,7 +261,7 @@ class Pipeline:
 
     def pieces(self, demos: Segments) -> Segments:
         """Pieces of one seed for the least-squares finish, from ``(B, T, 1, ...)``."""
-        c, wide = self.config, self.env.mj_model.nv > WRITTEN_OUT
+        c, wide = self.config, self.machine.wide
         steps = c.refine_horizon or (round(0.25 / self.env.dt) if wide else 25)
         steps = max(1, min(steps, demos.weight.shape[1]))
         found = windows(demos, steps, steps + 1)

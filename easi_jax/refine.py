@@ -91,7 +91,7 @@ def refine(
         return 0.5 * jnp.sum(pull * away(u) ** 2, axis=-1)
 
     n, count = space.size, segments.count
-    rounding = _ROUGH if paired.by_differences else _ROUNDING
+    rounding = _ROUGH if machine.wide else _ROUNDING
     # A start range may be narrow, and wrong.
     wide = np.maximum(_FARTHEST[0], _FARTHEST[1] / space.log_width)
     farthest = np.where(space.log, wide, _FARTHEST[0])
@@ -105,7 +105,7 @@ def refine(
         # as it was and where it has raised it: at the edge of a plateau it may fall.
         reach = 0.5 * (near + far)
         hops = jnp.clip(u + (reach * sides)[..., None] * jnp.eye(n), low, high)
-        if paired.by_differences:
+        if machine.wide:
             eq, units, shifts, each = swept(u, shift, damp, hops, weight, trusted)
         else:
             eq = paired.normal(u, shift, trusted)

@@ -239,10 +239,9 @@ def solution(
     """The solver ``f(problem, warm, start)``, unbatched, for `Rows.dofs`.
 
     ``problem``'s arrays are without lanes; it takes ``steps`` Newton steps at most,
-    from the better of ``start``, the
-    acceleration without constraints, and ``warm``. Returns acceleration, force on each
-    row (dense ones first), force on each joint. Derivatives are those of the converged
-    solution.
+    from the better of ``start``, the acceleration without constraints, and ``warm``.
+    Returns acceleration, force on each row (dense ones first), force on each joint.
+    Derivatives are those of the converged solution.
     """
     newton = lanes.lanes(_Newton(dofs, steps))
 

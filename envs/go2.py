@@ -16,6 +16,7 @@ import numpy as np
 from easi_jax.drives import TorqueSpeed
 from easi_jax.env import EnvState, advance, start
 from easi_jax.errors import UserError, nearest
+from easi_jax.machine import Machine
 from easi_jax.model import Model
 from easi_jax.physics import Physics
 from envs.frames import from_yaw, matrix
@@ -150,8 +151,7 @@ class Go2(Robot):
         self._low, self._high = m.actuator_ctrlrange.T
         self._limit = m.actuator_forcerange[:, 1]
         if torque_speed:
-            base = self.machine.base.replace(torque_speed=motor_curve())
-            self.machine.base = base
+            self.machine = Machine(m, self.space, self.dt, torque_speed=motor_curve())
 
     def reset(self, model: Model, key: jax.Array) -> EnvState:
         """Standing, turned anywhere, joints and speeds a little off."""

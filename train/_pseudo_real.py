@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from train._command import say, show_table
-from train._robots import load_udr, save_policies, search_config
+from train._robots import load_udr, save_policies, search_config, target_of
 from train._stages import (
     jit_chunks,
     run_stage,
@@ -43,7 +43,7 @@ def run(config: "Config") -> None:
             f"{list(udr['seeds'])}"
         )
     env = udr["env"]
-    changes = env.default_target if config.target is None else config.target
+    changes = target_of(env, config.target)
     theta = target_parameters(env.space, changes)
     noisy = any(x > 0 for x in config.noise)
     horizon = steps_of(config.horizon, env.dt, noisy)

@@ -102,6 +102,11 @@ def env_of(folder: Path, made_with: Any, path: Path | None) -> Any:
     return open_env(made_with["robot"], path, made_with.get("option", ()))
 
 
+def target_of(env: Any, given: tuple[str, ...] | None) -> tuple[str, ...]:
+    """Changes of the pseudo-real robot; the environment's own where none are given."""
+    return getattr(env, "default_target", ()) if given is None else given
+
+
 def save_policies(folder: Any, method: str, policies: Any) -> None:
     """Keeps the policies ``(S, ...)`` of one method in a run folder."""
     from easi_jax.io import checkpoints

@@ -64,7 +64,13 @@ class Config:
 def run(config: Config) -> None:
     """Compiles, runs and reports."""
     from train._pseudo_real import steps_of
-    from train._robots import check_seeds, save_policies, search_config, training_config
+    from train._robots import (
+        check_seeds,
+        save_policies,
+        search_config,
+        target_of,
+        training_config,
+    )
 
     check_seeds(config.seeds)
     import jax
@@ -86,7 +92,7 @@ def run(config: Config) -> None:
     from train._stages import search_rows, training_rows
 
     env = open_env(config.robot, config.env, config.option)
-    changes = env.default_target if config.target is None else config.target
+    changes = target_of(env, config.target)
     theta = target_parameters(env.space, changes)
     noisy = any(x > 0 for x in config.noise)
     search = search_config(

@@ -42,8 +42,9 @@ def evaluate(
     """
 
     keys = jax.random.split(key, num_envs)
-    run = _episodes(env, models, policy, act, keys, deterministic, batched)
-    return run(lambda _: None)[0]
+    return _episodes(
+        env, models, policy, act, keys, deterministic, batched, lambda _: None
+    )[0]
 
 
 def play(
@@ -60,10 +61,10 @@ def play(
         Returns ``(num_envs,)``; positions ``(T + 1, nq)`` of the first episode, which
         stands still at its end.
     """
-
     keys = jax.random.split(key, num_envs)
-    run = _episodes(env, model, policy, act, keys, True, False)
-    return run(lambda states: states.physics.qpos[0])
+    return _episodes(
+        env, model, policy, act, keys, True, False, lambda s: s.physics.qpos[0]
+    )
 
 
 def _episodes(
@@ -74,9 +75,10 @@ def _episodes(
     keys: jax.Array,
     deterministic: bool,
     batched: bool,
-) -> Callable[[Callable[[Any], Any]], tuple[jax.Array, Any]]:
-    """``run(watch)``: returns of all episodes ``(n,)``, and what ``watch`` sees of all
-    their states together at every time, ``(T + 1, ...)``."""
+    watch: Callable[[Any], Any],
+) -> tuple[jax.Array, Any]:
+    """Returns of all episodes ``(n,)``, and what ``watch`` sees of all their states
+    together at every time, ``(T + 1, ...)``."""
     axis = 0 if batched else None
     k_reset, k_act = jax.vmap(jax.random.split, out_axes=1)(keys)
 
@@ -87,17 +89,14 @@ def _episodes(
         state = jax.tree.map(lambda a, b: jnp.where(done, a, b), state, new)
         return state, total + jnp.where(done, 0.0, gain)
 
-    def run(watch: Callable[[Any], Any]) -> tuple[jax.Array, Any]:
-        def step(carry: Any, ks: jax.Array) -> tuple[Any, Any]:
-            each = jax.vmap(one, in_axes=(axis, 0, 0, 0))
-            carry = each(models, carry[0], carry[1], ks)
-            return carry, watch(carry[0])
+    def step(carry: Any, ks: jax.Array) -> tuple[Any, Any]:
+        each = jax.vmap(one, in_axes=(axis, 0, 0, 0))
+        carry = each(models, carry[0], carry[1], ks)
+        return carry, watch(carry[0])
 
-        first = jax.vmap(env.reset, in_axes=(axis, 0))(models, k_reset)
-        split = jax.vmap(lambda k: jax.random.split(k, env.episode_length), out_axes=1)
-        start = (first, jnp.zeros(len(keys)))
-        (_, total), seen = jax.lax.scan(step, start, split(k_act))
-        join = lambda a, b: jnp.concatenate([a[None], b])  # noqa: E731
-        return total, jax.tree.map(join, watch(first), seen)
-
-    return run
+    first = jax.vmap(env.reset, in_axes=(axis, 0))(models, k_reset)
+    split = jax.vmap(lambda k: jax.random.split(k, env.episode_length), out_axes=1)
+    start = (first, jnp.zeros(len(keys)))
+    (_, total), seen = jax.lax.scan(step, start, split(k_act))
+    join = lambda a, b: jnp.concatenate([a[None], b])  # noqa: E731
+    return total, jax.tree.map(join, watch(first), seen)

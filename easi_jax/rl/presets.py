@@ -39,7 +39,7 @@ _PPO = PpoConfig(
 
 _GENERAL: dict[str, TrainingConfig] = {"sac": _SAC, "ppo": _PPO}
 PRESETS: dict[str, dict[str, TrainingConfig]] = {
-    "cartpole": {"sac": _SAC, "ppo": _PPO},
+    "cartpole": _GENERAL,
     "ant": {
         "ppo": replace(_PPO, hidden=(128, 64), env_steps=4_000_000),
         "sac": replace(_SAC, hidden=(128, 128), env_steps=400_000),

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from easi_jax import information
 from easi_jax.information import Normal, PairedFit
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
@@ -50,7 +49,7 @@ def exact(problem: Any) -> dict[bool, Normal]:
 def test_equal_forward_mode(
     problem: Any, exact: dict[bool, Normal], free: bool, monkeypatch: Any
 ) -> None:
-    monkeypatch.setattr(information, "WRITTEN_OUT", 0)
+    monkeypatch.setattr(problem[0], "wide", True)
     found, known = normal(problem, free), exact[free]
     scale = np.sqrt(np.diag(np.asarray(known.hessian)))
     np.testing.assert_allclose(
@@ -88,8 +87,8 @@ def test_a_parameter_at_its_bound_has_its_slope(problem: Any, monkeypatch: Any) 
     parameters = (*space.parameters[:k], edge, *space.parameters[k + 1 :])
     bounded = (machine, ParameterSpace(parameters), pieces)
     slopes = []
-    for limit in (information.WRITTEN_OUT, 0):
-        monkeypatch.setattr(information, "WRITTEN_OUT", limit)
+    for wide in (False, True):
+        monkeypatch.setattr(machine, "wide", wide)
         _, s, _ = bounded
         unit = s.to_unit(jnp.asarray(s.nominal)).at[k].set(s.unit_bounds[1][k])
         slopes.append(np.asarray(normal(bounded, False, unit).hessian)[k, k])
@@ -97,8 +96,8 @@ def test_a_parameter_at_its_bound_has_its_slope(problem: Any, monkeypatch: Any) 
 
 
 def test_a_piece_that_explodes_is_left_out(problem: Any, monkeypatch: Any) -> None:
-    monkeypatch.setattr(information, "WRITTEN_OUT", 0)
     machine, space, pieces = problem
+    monkeypatch.setattr(machine, "wide", True)
     broken = dataclasses.replace(pieces, next_qvel=pieces.next_qvel.at[3].set(jnp.nan))
     without = dataclasses.replace(pieces, weight=pieces.weight.at[3].set(0.0))
     found = normal((machine, space, broken), False)
@@ -108,8 +107,8 @@ def test_a_piece_that_explodes_is_left_out(problem: Any, monkeypatch: Any) -> No
 
 @pytest.mark.parametrize("free", [True, False])
 def test_refines_to_the_truth(problem: Any, free: bool, monkeypatch: Any) -> None:
-    monkeypatch.setattr(information, "WRITTEN_OUT", 0)
     machine, space, pieces = problem
+    monkeypatch.setattr(machine, "wide", True)
     off = np.where(np.arange(space.size) % 2, 0.7, 1.3)
     unit = space.to_unit(jnp.asarray(off * space.nominal))
     noise = 1e-2 * NOISE

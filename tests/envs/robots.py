@@ -74,8 +74,7 @@ def converged(env: Any) -> Machine:
     """The robot with a solver that goes to the end, as C's does below."""
     m = env.mj_model.__copy__()
     m.opt.iterations = 100
-    old = env.machine.base
-    return Machine(m, env.space, env.dt, old.sense, old.sense_size)
+    return env.machine.rebuilt(m)
 
 
 def spec_of(env: Any) -> mujoco.MjSpec:
