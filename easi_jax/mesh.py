@@ -29,7 +29,7 @@ def sharded_map(
     ``fun`` sees a slice of the leading axis and returns arrays with the same one;
     ``shared`` goes whole to every device. The axis is padded by repetition where it
     does not divide, so that no device count is a special case; each slice has a
-    multiple of ``multiple`` rows.
+    multiple of ``multiple`` rows. A device whose slice is nothing but padding idles.
     """
     n = jax.tree.leaves(sharded)[0].shape[0]
     pad = -n % (mesh.size * multiple)
@@ -37,9 +37,20 @@ def sharded_map(
     def padded(x: jax.Array) -> jax.Array:
         return jnp.concatenate([x, jnp.repeat(x[-1:], pad, axis=0)]) if pad else x
 
+    def working(local: Any, *shared: Any) -> Any:
+        rows = jax.tree.leaves(local)[0].shape[0]
+        shapes = jax.eval_shape(fun, local, *shared)
+
+        def idle(*_: Any) -> Any:
+            return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+
+        busy = jax.lax.axis_index(AXIS) * rows < n
+        return jax.lax.cond(busy, fun, idle, local, *shared)
+
     split, whole = PartitionSpec(AXIS), PartitionSpec()
+    some_idle = pad >= (n + pad) // mesh.size
     mapped = jax.shard_map(
-        fun,
+        working if some_idle else fun,
         mesh=mesh,
         in_specs=(split, *(whole for _ in shared)),
         out_specs=split,

@@ -279,7 +279,7 @@ class Pipeline:
             def one(item: Any) -> Any:
                 policy, key = item
                 n = self.config.eval_episodes
-                return play(self.env, model, policy, act, key, n)
+                return play(self.env, model, policy, act, jax.random.split(key, n))
 
             return jax.lax.map(one, items)
 

@@ -233,13 +233,21 @@ class Go2(Robot):
         before: Memory,
         touching: jax.Array,
     ) -> jax.Array:
-        """At most 1: tracking of the command, less what spoils a gait; not below 0."""
+        """At most 1: tracking of the command, less what spoils a gait; not below 0.
+
+        Half of the tracking is progress along the command, which also pays a robot that
+        does not yet move anywhere near it.
+        """
         q, v = physics.qpos, physics.qvel
         rotation = matrix(q[3:7])
         speed, rate = rotation.T @ v[:3], v[3:6]
         command = memory.command
         moving = jnp.linalg.norm(command) > 0.1
-        track = jnp.exp(-jnp.sum((command[:2] - speed[:2]) ** 2) / 0.25)
+        near = jnp.exp(-jnp.sum((command[:2] - speed[:2]) ** 2) / 0.25)
+        size2 = jnp.sum(command[:2] ** 2)
+        progress = jnp.sum(command[:2] * speed[:2]) / jnp.maximum(size2, 0.01)
+        progress = jnp.where(size2 > 0.01, jnp.clip(progress, -1.0, 1.0), near)
+        track = 0.5 * (near + progress)
         turn = jnp.exp(-((command[2] - rate[2]) ** 2) / 0.25)
         gain = model.mjx.actuator_gainprm[:, 0], model.mjx.actuator_biasprm[:, 2]
         target = self._targets(memory.last)
@@ -254,9 +262,9 @@ class Go2(Robot):
             0.5 * speed[2] ** 2
             + 0.05 * jnp.sum(rate[:2] ** 2)
             + 5.0 * jnp.sum(rotation[2, :2] ** 2)
-            + 2e-4 * jnp.sum(torque**2)
+            + 1e-4 * jnp.sum(torque**2)
             + 0.01 * jnp.sum((memory.last - before.last) ** 2)
-            + 1e-3 * jnp.sum(jnp.abs(torque * v[6:]))
+            + 2e-4 * jnp.sum(jnp.abs(torque * v[6:]))
             + 0.1 * jnp.sum(foot_speed**2 * touching)
             + 0.5 * jnp.sum(swing * ~touching)
             + jnp.where(moving, 0.0, 0.5) * jnp.sum(jnp.abs(q[7:] - self._pose))

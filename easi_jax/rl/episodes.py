@@ -6,8 +6,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 
 from easi_jax.env import Env, EnvState, Model
+from easi_jax.mesh import sharded_map
 from easi_jax.rl.evaluate import evaluate
 from easi_jax.rl.learner import Info
 from easi_jax.rl.networks import PolicyParams, act
@@ -23,6 +25,7 @@ class Episodes:
         draw: ``draw(dist, key) -> theta``, one sample of a distribution.
         num_envs: environments that step together.
         eval_envs: episodes of an evaluation.
+        mesh: devices that the environments are split over; None: where the caller is.
     """
 
     env: Env
@@ -30,6 +33,7 @@ class Episodes:
     draw: Callable[[Any, jax.Array], Any]
     num_envs: int
     eval_envs: int
+    mesh: Mesh | None = None
 
     def unborn(self, dist: Any, key: jax.Array) -> tuple[EnvState, Any]:
         """Environments that count as finished, so that the first step resets them.
@@ -56,14 +60,25 @@ class Episodes:
         """New episodes, with new parameters, where the old ones are over."""
         done = ~finite(envs) | (envs.terminated + envs.truncated > 0)
         k_draw, k_reset = jax.random.split(key)
-        drawn = jax.vmap(self.draw, (None, 0))(dist, self.each(k_draw))
-        theta = _where(done, drawn, theta)
-        fresh = jax.vmap(self.env.reset)(jax.vmap(self.bind)(theta), self.each(k_reset))
-        return _where(done, fresh, envs), theta, jnp.where(done, 0.0, returns)
+
+        def local(given: Any, dist: Any) -> Any:
+            done, envs, theta, returns, k_draw, k_reset = given
+            drawn = jax.vmap(self.draw, (None, 0))(dist, k_draw)
+            theta = _where(done, drawn, theta)
+            fresh = jax.vmap(self.env.reset)(jax.vmap(self.bind)(theta), k_reset)
+            return _where(done, fresh, envs), theta, jnp.where(done, 0.0, returns)
+
+        keys = self.each(k_draw), self.each(k_reset)
+        return self._split(local, (done, envs, theta, returns, *keys), dist)
 
     def step(self, envs: EnvState, theta: Any, action: jax.Array) -> EnvState:
         """One control step of all, ``action (num_envs, action_size)``."""
-        return jax.vmap(self.env.step)(jax.vmap(self.bind)(theta), envs, action)
+
+        def local(given: Any) -> EnvState:
+            theta, envs, action = given
+            return jax.vmap(self.env.step)(jax.vmap(self.bind)(theta), envs, action)
+
+        return self._split(local, (theta, envs, action))
 
     def evaluate(
         self, policy: PolicyParams, dist: Any, key: jax.Array, due: jax.Array
@@ -71,11 +86,14 @@ class Episodes:
         """``eval_return`` and ``eval_nonfinite`` where ``due``, NaN and 0 elsewhere."""
         n = self.eval_envs
 
+        def local(keys: Any, dist: Any, policy: PolicyParams) -> jax.Array:
+            k_draw, k_run = keys
+            models = jax.vmap(self.bind)(jax.vmap(self.draw, (None, 0))(dist, k_draw))
+            return evaluate(self.env, models, policy, act, k_run, batched=True)
+
         def run() -> Info:
-            k_draw, k_run = jax.random.split(key)
-            theta = jax.vmap(self.draw, (None, 0))(dist, jax.random.split(k_draw, n))
-            models = jax.vmap(self.bind)(theta)
-            returns = evaluate(self.env, models, policy, act, k_run, n, batched=True)
+            keys = jax.vmap(lambda k: jax.random.split(k, n))(jax.random.split(key))
+            returns = self._split(local, (keys[0], keys[1]), dist, policy)
             ok = jnp.isfinite(returns)
             return {
                 "eval_return": mean_where(ok, returns),
@@ -90,6 +108,11 @@ class Episodes:
             }
 
         return jax.lax.cond(due, run, skip)
+
+    def _split(self, fun: Callable[..., Any], split: Any, *whole: Any) -> Any:
+        if self.mesh is None:
+            return fun(split, *whole)
+        return sharded_map(fun, self.mesh, split, *whole)
 
     def each(self, key: jax.Array) -> jax.Array:
         """A key for each environment."""

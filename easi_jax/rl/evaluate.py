@@ -17,31 +17,27 @@ def evaluate(
     models: Model,
     policy: PolicyParams,
     act: Act,
-    key: jax.Array,
-    num_envs: int,
+    keys: jax.Array,
     deterministic: bool = True,
     batched: bool = False,
 ) -> jax.Array:
-    """Undiscounted return of one episode in each of ``num_envs`` environments.
+    """Undiscounted return of one episode for each of ``keys``.
 
     An environment stands still once its episode is over; nothing resets.
 
     Args:
         env: the environment.
         models: one model for all, or with ``batched`` one for each environment
-            (every leaf with a leading axis ``num_envs``).
+            (every leaf with a leading axis ``n``).
         policy: handed to ``act``.
         act: ``act(policy, obs, key, deterministic) -> action``.
-        key: for resets and stochastic actions.
-        num_envs: number of episodes.
+        keys: ``(n,)``, for resets and stochastic actions.
         deterministic: act by the policy's mode.
         batched: whether ``models`` has a leading axis.
 
     Returns:
-        ``(num_envs,)``; NaN where the simulation did not stay finite.
+        ``(n,)``; NaN where the simulation did not stay finite.
     """
-
-    keys = jax.random.split(key, num_envs)
     return _episodes(
         env, models, policy, act, keys, deterministic, batched, lambda _: None
     )[0]
@@ -52,16 +48,14 @@ def play(
     model: Model,
     policy: PolicyParams,
     act: Act,
-    key: jax.Array,
-    num_envs: int,
+    keys: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """`evaluate` in one model, deterministic, watched.
 
     Returns:
-        Returns ``(num_envs,)``; positions ``(T + 1, nq)`` of the first episode, which
+        Returns ``(n,)``; positions ``(T + 1, nq)`` of the first episode, which
         stands still at its end.
     """
-    keys = jax.random.split(key, num_envs)
     return _episodes(
         env, model, policy, act, keys, True, False, lambda s: s.physics.qpos[0]
     )

@@ -7,6 +7,7 @@ Limits in Reinforcement Learning*, 2018); a step whose simulation broke takes no
 in the losses.
 """
 
+import copy
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -20,6 +21,7 @@ from brax.training.acme import running_statistics
 from brax.training.agents.ppo import losses
 from brax.training.agents.ppo.networks import PPONetworks
 from flax import linen
+from jax.sharding import Mesh
 
 from easi_jax.env import Env, EnvState, Model
 from easi_jax.rl.config import PpoConfig
@@ -85,6 +87,12 @@ class Ppo:
             optax.clip_by_global_norm(config.max_gradient),
             optax.flatten(optax.adam(_learning_rate(config))),
         )
+
+    def over(self, mesh: Mesh) -> "Ppo":
+        """The same training with its environments split over the devices of a mesh."""
+        other = copy.copy(self)
+        other._episodes = replace(self._episodes, mesh=mesh)
+        return other
 
     def init(self, key: jax.Array, dist: Any) -> PpoState:
         """The state before the first unroll; ``key`` is a typed or raw PRNG key."""

@@ -49,7 +49,14 @@ PRESETS: dict[str, dict[str, TrainingConfig]] = {
         "ppo": replace(_PPO, env_steps=1_000_000),
     },
     "go2": {
-        "ppo": replace(_PPO, hidden=(128, 64), env_steps=6_000_000, entropy_cost=5e-3),
+        "ppo": replace(
+            _PPO,
+            hidden=(128, 128),
+            env_steps=20_000_000,
+            minibatches=8,
+            discount=0.97,
+            entropy_cost=5e-3,
+        ),
         "sac": replace(_SAC, hidden=(128, 128), env_steps=500_000),
     },
 }

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from brax.training import types
 from brax.training.acme import running_statistics
+from jax.sharding import Mesh
 
 from easi_jax.env import Env, EnvState, Model
 from easi_jax.rl.buffer import RingQueue
@@ -82,6 +83,9 @@ class Sac:
             _transition(obs, jnp.zeros(env.action_size), zero, zero, obs, zero),
             config.batch_size * config.updates_per_step,
         )
+
+    def over(self, mesh: Mesh) -> None:
+        """Nothing: a training spends its time in updates, and stays on one device."""
 
     def init(self, key: jax.Array, dist: Any) -> SacState:
         """The state before the first step; ``key`` is a typed or raw PRNG key."""

@@ -1,4 +1,7 @@
-"""Several trainings at once: the seeds are split over all devices.
+"""Several trainings at once, over all devices.
+
+With a seed or more for each device the seeds are split over the devices. With fewer,
+PPO's environments are split; SAC's updates, which take most of its time, stay together.
 
 Distributions are shared by all seeds, or with ``dist_axis=0`` (``eval_axis=0``)
 each seed has its own and every leaf has a leading axis ``seeds``. ``mesh`` is all
@@ -26,7 +29,7 @@ def init_seeds(
 ) -> Any:
     """``trainer.init`` for each of ``keys`` ``(seeds,)``; leaves ``(seeds, ...)``."""
     inputs = (keys, _per_seed(dist, dist_axis, len(keys)))
-    return _over_seeds(trainer.init, inputs, mesh)
+    return _over_seeds(lambda trainer: trainer.init, trainer, inputs, mesh)
 
 
 def run_seeds(
@@ -45,7 +48,7 @@ def run_seeds(
     """
     seeds = states.iteration.shape[0]
 
-    def local(inputs: Any) -> Any:
+    def local(trainer: Trainer, inputs: Any) -> Any:
         states, dist, eval_dist = inputs
         clock = jax.tree.map(lambda x: x[0], trainer.clock(states))
 
@@ -64,7 +67,7 @@ def run_seeds(
         _per_seed(dist, dist_axis, seeds),
         _per_seed(eval_dist, eval_axis, seeds),
     )
-    return sharded_map(local, mesh or make_mesh(), inputs)
+    return _spread(local, trainer, inputs, mesh)
 
 
 def train_seeds(
@@ -83,13 +86,30 @@ def train_seeds(
         _per_seed(dist, dist_axis, seeds),
         _per_seed(eval_dist, eval_axis, seeds),
     )
-    return _over_seeds(trainer.train, inputs, mesh)
+    return _over_seeds(lambda trainer: trainer.train, trainer, inputs, mesh)
 
 
-def _over_seeds(fun: Callable[..., Any], inputs: Any, mesh: Mesh | None) -> Any:
-    return sharded_map(
-        lambda local: _map(lambda args: fun(*args), local), mesh or make_mesh(), inputs
-    )
+def _over_seeds(
+    method: Callable[[Trainer], Callable[..., Any]],
+    trainer: Trainer,
+    inputs: Any,
+    mesh: Mesh | None,
+) -> Any:
+    def local(trainer: Trainer, inputs: Any) -> Any:
+        return _map(lambda args: method(trainer)(*args), inputs)
+
+    return _spread(local, trainer, inputs, mesh)
+
+
+def _spread(
+    fun: Callable[[Trainer, Any], Any], trainer: Trainer, inputs: Any, mesh: Mesh | None
+) -> Any:
+    mesh = mesh or make_mesh()
+    if jax.tree.leaves(inputs)[0].shape[0] < mesh.size:
+        split = trainer.over(mesh)
+        if split is not None:
+            return fun(split, inputs)
+    return sharded_map(lambda local: fun(trainer, local), mesh, inputs)
 
 
 def _map(fun: Callable[[Any], Any], inputs: Any) -> Any:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
+from jax.sharding import Mesh
 
 from easi_jax.env import Env, Model
 from easi_jax.rl.config import PpoConfig, SacConfig
@@ -20,6 +21,8 @@ class Trainer(Protocol):
 
     @property
     def config(self) -> Any: ...
+
+    def over(self, mesh: Mesh) -> "Trainer | None": ...
 
     def init(self, key: jax.Array, dist: Any) -> Any: ...
 

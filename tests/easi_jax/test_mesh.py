@@ -22,6 +22,17 @@ for size in (1, 2, 3):
     got = jax.jit(lambda v: sharded_map(f, make_mesh(size), v, jnp.float32(3.0)))(x)
     for k in want:
         np.testing.assert_array_equal(got[k], want[k])
+# A device that has nothing but padding does not compute.
+calls = []
+def count(x):
+    jax.debug.callback(lambda _: calls.append(1), x[0])
+    return x + 1
+for rows, expected in ((1, 1), (2, 2), (4, 2), (7, 3)):
+    calls.clear()
+    run = jax.jit(lambda v: sharded_map(count, make_mesh(3), v))
+    np.testing.assert_array_equal(run(jnp.arange(rows)), np.arange(rows) + 1)
+    jax.effects_barrier()
+    assert len(calls) == expected, (rows, len(calls))
 print("same")
 """
 

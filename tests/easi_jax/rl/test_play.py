@@ -19,7 +19,13 @@ def test_returns_are_those_of_evaluate_and_motion_ends_with_the_episode() -> Non
         return policy
 
     def run(key: jax.Array) -> Any:
-        args = (env, env.model(), jnp.zeros(1), act, key, 3)  # nothing holds the pole
+        args = (
+            env,
+            env.model(),
+            jnp.zeros(1),
+            act,
+            jax.random.split(key, 3),
+        )  # nothing holds the pole
         return evaluate(*args), play(*args)  # type: ignore[arg-type]
 
     counted, (returns, qpos) = jax.device_get(jax.jit(run)(jax.random.key(0)))

@@ -1,5 +1,6 @@
 """PPO on probes whose values are known, and the state that it carries."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import chex
@@ -7,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import Mesh
 
 from easi_jax.errors import UserError
 from easi_jax.mesh import make_mesh
@@ -138,6 +140,28 @@ def test_chunks_and_devices_do_not_matter(ppo: Ppo, trained: Trained) -> None:
     a, b = alone(keys, dist)[0], parts(keys, dist)[0]
     chex.assert_trees_all_close(a.params, b.params, atol=1e-4)
     np.testing.assert_array_equal(a.iteration, b.iteration)
+
+
+def test_one_seed_uses_all_devices(ppo: Ppo, trained: Trained) -> None:
+    """Its environments are split; on one device the same comes out."""
+    dist, key = jax.tree.map(lambda x: x[:1], (trained.dist, trained.keys))
+    asked = replace(ppo.config, evaluate_every=1)
+    small = Ppo(Probe(), asked, bind=lambda theta: theta, draw=lambda dist, key: dist)
+
+    def run(mesh: Mesh) -> Any:
+        @jax.jit
+        def go(key: jax.Array, dist: Any) -> Any:
+            start = init_seeds(small, key, dist, 0, mesh)
+            return run_seeds(small, start, dist, 2, dist_axis=0, mesh=mesh)
+
+        return go(key, dist)
+
+    assert len(jax.devices()) > 1, "the tests run with a device for each core"
+    (one, told), (both, also) = run(make_mesh(1)), run(make_mesh())
+    chex.assert_trees_all_close(one.params, both.params, atol=1e-4)
+    chex.assert_trees_all_close(told, also, atol=1e-4)
+    assert np.isfinite(told["eval_return"]).all()
+    assert not both.returns.sharding.is_fully_replicated
 
 
 @pytest.mark.parametrize(

@@ -97,14 +97,14 @@ def test_evaluate_returns_one_episode_per_environment(trained):
     probes = probe_models()
     names = ("constant", "discount", "time_limit")
     models = jax.tree.map(lambda *x: jnp.stack(x), *(probes[n] for n in names))
-    key = jax.random.key(0)
+    key, split = jax.random.key(0), jax.random.split
     env = LongProbe()
-    batched = evaluate(env, models, policy, act, key, 3, batched=True)
+    batched = evaluate(env, models, policy, act, split(key, 3), batched=True)
     np.testing.assert_array_equal(batched, [1.0, 1.0, 1.0])
-    one = evaluate(env, probes["observation"], policy, act, key, 16)
+    one = evaluate(env, probes["observation"], policy, act, split(key, 16))
     assert set(np.unique(one)) == {-1.0, 1.0}
     broken = probes["constant"].replace(constant=jnp.float32(jnp.nan))
-    assert jnp.isnan(evaluate(env, broken, policy, act, key, 2)).all()
+    assert jnp.isnan(evaluate(env, broken, policy, act, split(key, 2))).all()
 
 
 class LongProbe(Probe):
