@@ -13,6 +13,7 @@ from mujoco import mjx
 from easi_jax.addresses import Writer, open_gates, resolve
 from easi_jax.constants import set_const
 from easi_jax.drives import TorqueSpeed
+from easi_jax.effects import Effects
 from easi_jax.errors import UserError
 from easi_jax.quantities import length_of, long_axis, unit_inertia
 
@@ -33,6 +34,8 @@ class Model:
         sense_size: how many numbers it reads (static).
         torque_speed: what the actuators can give at which speed, within their force
             limits; None for no such curve.
+        effects: what acts in its steps beyond the model; None for nothing.
+        delay_steps: control steps that a command can be late (static).
     """
 
     mjx: mjx.Model
@@ -42,6 +45,8 @@ class Model:
     sense: Sense | None = flax.struct.field(pytree_node=False, default=None)
     sense_size: int = flax.struct.field(pytree_node=False, default=0)
     torque_speed: TorqueSpeed | None = None
+    effects: Effects | None = None
+    delay_steps: int = flax.struct.field(pytree_node=False, default=0)
 
     if TYPE_CHECKING:  # made by flax
 

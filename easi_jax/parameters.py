@@ -88,14 +88,12 @@ class ParameterSpace:
     All arrays are ``(n,)`` or ``(..., n)`` in the order of ``parameters``.
 
     Raises:
-        UserError: two parameters of one name, or none at all.
+        UserError: two parameters of one name.
     """
 
     parameters: tuple[Parameter, ...]
 
     def __post_init__(self) -> None:
-        if not self.parameters:
-            raise UserError("no parameters: name at least one")
         seen: set[str] = set()
         for p in self.parameters:
             if p.name in seen:
@@ -130,13 +128,13 @@ class ParameterSpace:
     @property
     def initial(self) -> tuple[np.ndarray, np.ndarray]:
         """Where the search starts, (low, high), each ``(n,)`` SI units."""
-        low, high = np.array([p.initial for p in self.parameters]).T
+        low, high = np.array([p.initial for p in self.parameters]).reshape(-1, 2).T
         return low, high
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """What physics allows, (low, high), each ``(n,)`` SI units."""
-        low, high = np.array([p.bounds for p in self.parameters]).T
+        low, high = np.array([p.bounds for p in self.parameters]).reshape(-1, 2).T
         return low, high
 
     @property

@@ -1,6 +1,6 @@
 """One control step of physics: the state, the substeps, and nothing else."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import flax.struct
 import jax
@@ -10,7 +10,7 @@ from mujoco.mjx._src import forward as mjx_forward
 from mujoco.mjx._src import sensor as mjx_sensor
 from mujoco.mjx._src.types import IntegratorType
 
-from easi_jax import solver
+from easi_jax import effects, solver
 from easi_jax.equality import with_velocity_products
 from easi_jax.scalarize import scalarized
 from easi_jax.small_linalg import unroll_small
@@ -28,6 +28,7 @@ class Physics:
         act: actuator activations, ``(na,)``.
         warmstart: last acceleration, where the solver starts, ``(nv,)``.
         sensed: what ``model.sense`` read in the last physics step; zeros before.
+        memory: what the way of a command remembers, where the model has effects.
     """
 
     qpos: jax.Array
@@ -35,6 +36,11 @@ class Physics:
     act: jax.Array
     warmstart: jax.Array
     sensed: Any = ()
+    memory: Any = ()
+
+    if TYPE_CHECKING:  # made by flax
+
+        def replace(self, **changes: Any) -> "Physics": ...
 
 
 def at_rest(model: Any, qpos: jax.Array, qvel: jax.Array) -> Physics:
@@ -42,7 +48,10 @@ def at_rest(model: Any, qpos: jax.Array, qvel: jax.Array) -> Physics:
     m = model.mjx
     act, warm = jnp.zeros(m.na), jnp.zeros(m.nv)
     sensed = jnp.zeros(model.sense_size) if model.sense else ()
-    return Physics(qpos, qvel, act, warm, sensed)
+    memory = ()
+    if model.effects is not None:
+        memory = effects.first_memory(model.delay_steps, m.nu)
+    return Physics(qpos, qvel, act, warm, sensed, memory)
 
 
 def data_at(model: Any, state: Physics, ctrl: jax.Array) -> mjx.Data:
@@ -120,7 +129,10 @@ def substep(model: Any, state: Physics, ctrl: jax.Array, wide: bool = False) -> 
     m = model.mjx
     if model.torque_speed is not None:
         m = _with_torque_speed(m, model.torque_speed.limits(state.qvel))
-    d = mjx_step(m, data_at(model, state, ctrl), wide)
+    d = data_at(model, state, ctrl)
+    if model.effects is not None:
+        m, d = effects.in_step(m, d, model.effects, effects.scalar_joints(m))
+    d = mjx_step(m, d, wide)
     qvel = jnp.clip(d.qvel, -model.speed_limit, model.speed_limit)
     sensed = model.sense(model.mjx, d) if model.sense else ()
     return Physics(d.qpos, qvel, d.act, d.qacc_warmstart, sensed)
@@ -139,8 +151,18 @@ _batched_substep = scalarized(substep, otherwise=_otherwise)
 
 def control_step(model: Any, state: Physics, ctrl: jax.Array, substeps: int) -> Physics:
     """Holds ``ctrl`` ``(nu,)`` for ``substeps`` physics steps."""
+    if model.effects is None:
 
-    def step(s: Physics, _: None) -> tuple[Physics, None]:
-        return _batched_substep(model, s, ctrl), None
+        def step(s: Physics, _: None) -> tuple[Physics, None]:
+            return _batched_substep(model, s, ctrl), None
 
-    return jax.lax.scan(step, state, None, length=substeps)[0]
+        return jax.lax.scan(step, state, None, length=substeps)[0]
+
+    dt = model.mjx.opt.timestep * substeps
+    arrived, memory = effects.commands(model.effects, state.memory, ctrl, dt, substeps)
+
+    def late(s: Physics, u: jax.Array) -> tuple[Physics, None]:
+        return _batched_substep(model, s, u), None
+
+    bare = state.replace(memory=())
+    return jax.lax.scan(late, bare, arrived)[0].replace(memory=memory)

@@ -3,7 +3,13 @@
 from typing import TYPE_CHECKING, Any
 
 from train._command import say, show_table
-from train._robots import load_udr, save_policies, search_config, target_of
+from train._robots import (
+    load_udr,
+    save_policies,
+    search_config,
+    target_of,
+    training_chunk,
+)
 from train._stages import (
     jit_chunks,
     run_stage,
@@ -113,7 +119,7 @@ def run(config: "Config") -> None:
                 folder,
                 name,
                 total,
-                config.chunk,
+                training_chunk(config.chunk, pipe.trainer.config),
                 first,
                 lambda s, n: step(s, dist, target, n),
                 training_rows(seeds, pipe.trainer.config.steps_per_iteration),

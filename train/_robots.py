@@ -65,12 +65,21 @@ def check_seeds(seeds: tuple[int, ...]) -> None:
         )
 
 
-def check_chunk(chunk: int) -> None:
+def check_chunk(chunk: int | None) -> None:
     """Raises UserError for a chunk below one."""
     from easi_jax.errors import UserError
 
-    if chunk < 1:
+    if chunk is not None and chunk < 1:
         raise UserError(f"--chunk is {chunk}: give at least 1")
+
+
+def training_chunk(chunk: int | None, training: Any) -> int:
+    """Iterations between two signs of life: those asked for, or about 50,000 control
+    steps, and a whole number of evaluations."""
+    if chunk is not None:
+        return chunk
+    every = training.evaluate_every or 1
+    return max(1, round(50_000 / (training.steps_per_iteration * every))) * every
 
 
 def env_of(folder: Path, made_with: Any, path: Path | None) -> Any:

@@ -70,8 +70,9 @@ class Config:
     """Seeds; not given: those of the UDR run (0 for logs)."""
     eval_episodes: int = 100
     """Episodes of the final evaluation."""
-    chunk: int = 500
-    """Training steps between checkpoints."""
+    chunk: int | None = None
+    """Training iterations between checkpoints; about 50,000 control steps where not
+    given."""
     search_chunk: int = 10
     """Generations between checkpoints."""
     resume: bool = False

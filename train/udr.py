@@ -39,9 +39,9 @@ class Config:
     """sac or ppo; the robot's own where not given."""
     eval_episodes: int = 100
     """Episodes of the final evaluation."""
-    chunk: int = 500
+    chunk: int | None = None
     """Iterations between checkpoints: steps of all environments (sac) or unrolls
-    (ppo)."""
+    (ppo); about 50,000 control steps where not given."""
     resume: bool = False
     """Go on with the run in the folder."""
     overwrite: bool = False
@@ -50,7 +50,13 @@ class Config:
 
 def run(config: Config) -> None:
     """Trains, evaluates and writes the run folder."""
-    from train._robots import check_chunk, check_seeds, save_policies, training_config
+    from train._robots import (
+        check_chunk,
+        check_seeds,
+        save_policies,
+        training_chunk,
+        training_config,
+    )
 
     check_seeds(config.seeds)
     check_chunk(config.chunk)
@@ -101,7 +107,7 @@ def run(config: Config) -> None:
             folder,
             "train",
             training.iterations,
-            config.chunk,
+            training_chunk(config.chunk, training),
             lambda: pipe.train_init(keys["udr"], wide),
             lambda s, n: step(s, wide, target, n),
             training_rows(config.seeds, training.steps_per_iteration),

@@ -1,0 +1,1 @@
+"""Finds where simulation and measurement disagree, and names the effect that lacks."""

@@ -1,0 +1,551 @@
+"""From runs and a model to named effects: the whole workflow, without files.
+
+    windows → refit of the model's own parameters → selection → rivals → figures
+
+Held-out windows take part in none but the last.
+"""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import mujoco
+import numpy as np
+
+from easi_jax.errors import UserError
+from easi_jax.gap import measure
+from easi_jax.gap.fit import Bounds, window_weights
+from easi_jax.gap.predictor import Predictor, WindowSet, join, window_set
+from easi_jax.gap.residuals import (
+    Residuals,
+    make_residuals,
+    start_sensitivity,
+    velocity_slack,
+)
+from easi_jax.gap.scales import scales_of
+from easi_jax.gap.selection import (
+    Candidate,
+    Model,
+    Selector,
+    probability,
+    shortlist,
+)
+from easi_jax.gap.table import Layout, Place, places, ripples
+from easi_jax.parameters import ParameterSpace
+from easi_jax.recording import Run, physics_steps
+
+_FITTED = (32, 96)  # windows that fits see
+_STEPS = 9_600  # physics steps in them
+_BLOCKS = 10
+_MOST = 5  # effects
+_RIPPLES = [0.75 * k for k in range(3, 27)]  # cycles over the range of a joint
+_CLOSED = 1.1  # times the floor: nothing left to explain
+_GOAL = 1.25
+_RIVALS = 8
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Found:
+    """One effect that the model lacks.
+
+    Attributes:
+        place: which, and where.
+        values: of its parameters, with their standard deviations.
+        confidence: probability of this name against its rivals.
+        indistinguishable: rivals that predict the held-out data as well.
+        gap_after: held-out gap with it and those before it.
+    """
+
+    place: Place
+    values: dict[str, tuple[float, float, str]]
+    confidence: float
+    indistinguishable: list[str]
+    gap_after: float
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Held-out gap of one model.
+
+    Attributes:
+        gap: in units of the motion.
+        interval: its 95 % interval, by bootstrap over windows.
+        si: RMS error of each degree of freedom, ``(nv,)``.
+        square: mean squares of each window, ``(W, nv)``.
+        errors: of every step, ``(W, H, nv)``.
+    """
+
+    gap: float
+    interval: tuple[float, float]
+    si: np.ndarray
+    square: np.ndarray
+    errors: np.ndarray
+
+
+@dataclass
+class Outcome:
+    """What the workflow found; see the log format's ``gap.json``."""
+
+    verdict: str
+    found: list[Found]
+    refitted: list[dict]
+    before: Figures
+    refit: Figures
+    after: Figures
+    floor: float
+    floor_si: np.ndarray
+    channels: measure.Channels
+    held: WindowSet
+    x: np.ndarray
+    steps: list[tuple[str, float]]
+    notes: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+class Analysis:
+    """One model and its data, ready to be asked.
+
+    Raises:
+        UserError: data too short, too still, or that the model does not cover.
+    """
+
+    def __init__(
+        self,
+        mj_model: mujoco.MjModel,
+        space: ParameterSpace,
+        fit: Sequence[Run],
+        held: Sequence[Run],
+        noise: np.ndarray,
+        horizon: float,
+        tell: Tell = lambda _: None,
+    ) -> None:
+        self.m, self.space, self.tell = mj_model, space, tell
+        self.runs = [*fit, *held]
+        self.noise = np.asarray(noise)[: mj_model.nv]
+        dt = fit[0].dt
+        self.scales = scales_of(mj_model, fit)
+        self.everywhere = places(mj_model, self.scales)
+        self.places = [p for p in self.everywhere if self._offered(p)]
+        self.ripples = [
+            p
+            for j in range(mj_model.njnt)
+            if mj_model.jnt_type[j] >= 2
+            for p in ripples(mj_model, j, self.scales, self._cycles(j))
+        ]
+        layout = Layout(mj_model, [*self.everywhere, *self.ripples])
+        past = math.ceil(self.scales.longest / dt) + 1
+        late = math.ceil(self.scales.longest / dt)
+        fitted = window_set(fit, horizon, past, late)
+        kept = window_set(held, horizon, past, late, len(fit))
+        if fitted is None or kept is None:
+            what = "to fit" if fitted is None else "held out"
+            raise UserError(
+                f"no run {what} is longer than a horizon of {horizon:g} s: record "
+                "more, or shorten --horizon"
+            )
+        physics = fitted.ctrl.shape[1] * physics_steps(dt, mj_model.opt.timestep)
+        most = min(max(_STEPS // physics, _FITTED[0]), _FITTED[1])
+        chosen = _spread(len(fitted), most)
+        self.fit_windows, self.held = fitted.take(chosen), kept
+        pad = -len(self.fit_windows) % 16
+        repeated = np.r_[np.arange(len(chosen)), np.full(pad, len(chosen) - 1)]
+        self.predictor = Predictor(
+            mj_model, space, layout, join([fitted.take(chosen[repeated]), kept]), dt
+        )
+        self.fit_blocks = np.arange(len(repeated) // 16)
+        self.held_blocks = np.arange(len(repeated) // 16, self.predictor.blocks)
+        machine = self.predictor.machine
+        self.channels = measure.channels(
+            mj_model,
+            [n.removeprefix("qpos.") for n in machine.state_names[: mj_model.nv]],
+            self.runs,
+            self.noise,
+            self.predictor.steps,
+        )
+        if not np.isfinite(self.channels.scale).any():
+            raise UserError(
+                "nothing moves by more than five times its noise over a horizon of "
+                f"{horizon:g} s: record larger or faster motion, or lengthen --horizon"
+            )
+        self.slack = velocity_slack(fit, self.noise, dt / machine.substeps)
+        low, high = space.bounds
+        columns = layout.columns
+        nominal = np.asarray(space.nominal, float)
+        self.bounds = Bounds(
+            np.r_[low, [c.low for c in columns]],
+            np.r_[high, [c.high for c in columns]],
+            np.r_[0.05 * np.abs(nominal), [c.size for c in columns]],
+        )
+        count = len(self.fit_windows)
+        self.group = np.arange(count) * min(_BLOCKS, count) // count
+        self.selector = Selector(
+            self.predictor,
+            Residuals(
+                np.zeros((1, 1)),
+                self.channels.scale,
+                np.zeros((1, 1, 1)),
+                np.zeros((1, 1, 1)),
+            ),
+            self.fit_blocks,
+            count,
+            self.bounds,
+            self.group,
+            range(space.size),
+            tell,
+        )
+
+    def _cycles(self, j: int) -> list[float]:
+        """Cycles per revolution that a ripple is looked for at."""
+        span = float(self.scales.span[int(self.m.jnt_dofadr[j])])
+        slow = 1 if self.m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE else 2
+        return [slow * k * 2 * math.pi / span for k in _RIPPLES]
+
+    def _offered(self, place: Place) -> bool:
+        """Whether an effect is not what the model's own refit already covers."""
+        same = {
+            "viscous_damping": "damping",
+            "coulomb_friction": "frictionloss",
+            "joint_stiffness": "stiffness",
+        }
+        quantity = same.get(place.effect)
+        own = {a for p in self.space.parameters for a in p.addresses}
+        return quantity is None or f"joint.{place.at}.{quantity}" not in own
+
+    # -- pieces ----------------------------------------------------------------
+
+    def whiten(self, x: np.ndarray) -> None:
+        """Renews the noise model of the fit at a vector."""
+        chosen = self.selector
+        slope = start_sensitivity(self.predictor, x, self.start_noise, self.fit_blocks)
+        slope = slope[:, : chosen.count]
+        errors = self.predictor.errors(x[None], self.fit_blocks)[0][: chosen.count]
+        rms = np.sqrt(np.mean(errors.astype(float) ** 2, (0, 1)))
+        chosen.residuals = make_residuals(
+            self.fit_windows,
+            self.runs,
+            slope,
+            self.noise,
+            self.slack,
+            0.05 * rms,
+            self.channels.scale,
+        )
+        self.fit_floor = measure.gap(
+            measure.floor_squares(self.fit_windows, self.runs, slope, self.noise).mean(
+                0
+            ),
+            self.channels.scale,
+        )
+        self.fit_gap = float(
+            measure.gap(measure.squares(errors).mean(0), self.channels.scale)
+        )
+
+    @property
+    def start_noise(self) -> np.ndarray:
+        """Sizes of differences in start states, ``(2 nv,)``."""
+        speed = np.maximum(0.01 * self.scales.speed, self.slack)
+        position = np.maximum(1e-3 * self.scales.position, self.noise)
+        return np.concatenate([position, speed])
+
+    def refit(self, own: Sequence[int]) -> Model:
+        """The model as given with some of its own parameters refitted."""
+        self.selector.own = tuple(own)
+        x = self.predictor.neutral.copy()
+        self.whiten(x)
+        model = self.selector.fit([], x)
+        if own:
+            self.whiten(model.fit.x)
+            self.selector.weight = window_weights(model.fit.residual)
+            model = self.selector.fit([], model.fit.x)
+        return model
+
+    def candidates(self, taken: Sequence[Place]) -> list[Candidate]:
+        """Every place that is not in the model yet, with its starts."""
+        keys = {p.key for p in taken}
+        return [
+            Candidate(p, s)
+            for p in (*self.places, *self.ripples)
+            if p.key not in keys
+            for s in p.starts[: 1 if p.effect == "torque_ripple" else None]
+        ]
+
+    def figures(self, x: np.ndarray) -> Figures:
+        """Held-out gap at a vector."""
+        errors = self.predictor.errors(x[None], self.held_blocks)[0][: len(self.held)]
+        square = measure.squares(errors)
+        scale = self.channels.scale
+        return Figures(
+            float(measure.gap(square.mean(0), scale)),
+            measure.interval(square, scale),
+            np.sqrt(square.mean(0)),
+            square,
+            errors,
+        )
+
+    def floor(self, x: np.ndarray) -> np.ndarray:
+        """Mean squares of a perfect model on the held-out windows, ``(nv,)``."""
+        slope = start_sensitivity(self.predictor, x, self.start_noise, self.held_blocks)
+        return measure.floor_squares(
+            self.held, self.runs, slope[:, : len(self.held)], self.noise
+        ).mean(0)
+
+    # -- the whole -------------------------------------------------------------
+
+    def run(self) -> Outcome:
+        """Finds, names and measures."""
+        began = time.perf_counter()
+        own = list(range(self.space.size))
+        self.tell("compiling the predictions ...")
+        self.whiten(self.predictor.neutral)
+        self.tell(
+            f"gap {self.fit_gap:.3g} on the fitting data, noise floor "
+            f"{self.fit_floor:.2g}"
+        )
+        base = self.refit(own)
+        stuck = [i for i in own if self._at_bound(base.fit.x, i)]
+        if stuck:
+            names = ", ".join(self.space.names[i] for i in stuck)
+            self.tell(f"{names}: refitted to a bound, so undone")
+            for i in stuck:
+                self._offer(self.space.parameters[i].addresses)
+            base = self.refit([i for i in own if i not in stuck])
+        model, tried = self.select(base)
+        return self.measured(base, model, tried, began)
+
+    def _at_bound(self, x: np.ndarray, i: int) -> bool:
+        low, high = self.bounds.low[i], self.bounds.high[i]
+        return bool(x[i] <= low * 1.001 or x[i] >= high * 0.999)
+
+    def _offer(self, addresses: Sequence[str]) -> None:
+        kinds = {
+            "damping": "viscous_damping",
+            "frictionloss": "coulomb_friction",
+            "stiffness": "joint_stiffness",
+        }
+        for address in addresses:
+            name, quantity = address.split(".", 1)[1].rsplit(".", 1)
+            self.places += [
+                p
+                for p in self.everywhere
+                if p.at == name and p.effect == kinds.get(quantity)
+            ]
+
+    def select(self, base: Model) -> tuple[Model, list[Model]]:
+        """Adds effects while they help; the model, and its rivals."""
+        model = base
+        chosen = self.selector
+        rivals: list[Model] = []
+        while len(model.places) < _MOST:
+            self.whiten(model.fit.x)
+            model = chosen.fit(model.places, model.fit.x)
+            if self.fit_gap <= _CLOSED * self.fit_floor:
+                break
+            best, tried = chosen.stage(model, self.candidates(model.places))
+            for m in tried[:4]:
+                self.tell(
+                    f"  {m.places[-1].key}: loss {m.loss.mean():.4g} "
+                    f"(without {model.loss.mean():.4g}), gap {m.gap.mean() ** 0.5:.4g} "
+                    f"({model.gap.mean() ** 0.5:.4g})"
+                )
+            if best is None:
+                break
+            rivals = tried
+            model = best
+            self.tell(f"+ {best.places[-1].key}")
+            chosen.weight = window_weights(model.fit.residual)
+            if len(model.places) > 1:
+                self.whiten(model.fit.x)
+                model = chosen.needed(chosen.fit(model.places, model.fit.x))
+        if model.places:
+            self.whiten(model.fit.x)
+            model = chosen.fit(model.places, model.fit.x)
+            model = chosen.richer(model, self.candidates(model.places))
+        return model, rivals
+
+    def rivals(self, model: Model, place: Place) -> list[Model]:
+        """Other names refitted in the place of one effect, best first."""
+        chosen = self.selector
+        kept = [p for p in model.places if p is not place]
+        x = chosen.without(model.fit.x, place, kept)
+        without = chosen.fit(kept, x)
+        others = [c for c in self.candidates(model.places) if c.place.key != place.key]
+        short = shortlist(chosen.screened(without, others))
+        out = chosen.fitted(kept, without.fit.x, short)
+        return sorted(out, key=lambda m: m.loss.mean())
+
+    def measured(
+        self, base: Model, model: Model, tried: list[Model], began: float
+    ) -> Outcome:
+        """Looks at the held-out data, once."""
+        scale = self.channels.scale
+        before = self.figures(self.predictor.neutral)
+        refit = self.figures(base.fit.x)
+        after = self.figures(model.fit.x) if model.places else refit
+        floor = self.floor(model.fit.x if model.places else base.fit.x)
+        steps = []
+        found = []
+        deviation = self.deviations(model)
+        for k, place in enumerate(model.places):
+            part = model.places[: k + 1]
+            if k + 1 == len(model.places):
+                figures = after
+            else:
+                x = model.fit.x
+                for other in model.places[k + 1 :]:
+                    x = self.selector.without(x, other, part)
+                figures = self.figures(self.selector.fit(part, x).fit.x)
+            rivals = self.rivals(model, place)
+            mine = replace(
+                model, places=[*[p for p in model.places if p is not place], place]
+            )
+            odds = 0.0
+            same = []
+            for rival in rivals[:_RIVALS]:
+                p = probability(mine, rival)
+                odds += (1 - p) / max(p, 1e-6)
+                theirs = self.figures(rival.fit.x)
+                if self._as_good(after, theirs):
+                    same.append(rival.places[-1].key)
+            found.append(
+                Found(
+                    place,
+                    self.values(model, place, deviation),
+                    1.0 / (1.0 + odds),
+                    same,
+                    figures.gap,
+                )
+            )
+            steps.append((place.key, figures.gap))
+        floor_gap = float(measure.gap(floor, scale))
+        goal = _GOAL * floor_gap
+        if refit.interval[1] <= goal:
+            verdict = "no_gap"
+        elif found and after.interval[1] <= goal:
+            verdict = "explained"
+        else:
+            verdict = "unexplained"
+        if verdict == "no_gap":
+            found = []
+            after = refit
+        return Outcome(
+            verdict=verdict,
+            found=found,
+            refitted=self.refitted(base, model if found else base),
+            before=before,
+            refit=refit,
+            after=after,
+            floor=floor_gap,
+            floor_si=np.sqrt(floor),
+            channels=self.channels,
+            held=self.held,
+            x=model.fit.x if found else base.fit.x,
+            steps=steps,
+            seconds=time.perf_counter() - began,
+        )
+
+    def _as_good(self, mine: Figures, theirs: Figures) -> bool:
+        """Whether the difference of two held-out gaps may be none, or is in favor."""
+        scale = self.channels.scale
+        weights = measure.resampled(len(mine.square), 1)
+        d = measure.gap(weights @ theirs.square, scale) - measure.gap(
+            weights @ mine.square, scale
+        )
+        return bool(np.quantile(d, 0.025) <= 0.0)
+
+    def deviations(self, model: Model) -> np.ndarray:
+        """Standard deviations of a fit's active entries, from its windows."""
+        f, w = model.fit, self.selector.weight
+        if not len(f.active):
+            return np.zeros(0)
+        size = self.bounds.size[f.active]
+        j = f.slope * size
+        normal = np.einsum("w,wma,wmb->ab", w, j, j, optimize=True)
+        score = np.einsum("w,wma,wm->wa", w, j, f.residual, optimize=True)
+        inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
+        # Windows as they scatter, and no better than what their noise allows.
+        scattered = inverse @ (score.T @ score) @ inverse
+        cov = np.where(np.diag(scattered) > np.diag(inverse), scattered, inverse)
+        return np.sqrt(np.maximum(np.diag(cov), 0.0)) * size
+
+    def values(
+        self, model: Model, place: Place, deviation: np.ndarray
+    ) -> dict[str, tuple[float, float, str]]:
+        """Parameters of an effect as the table names them."""
+        index = self.selector.columns(place, fitted=False)
+        active = model.fit.active.tolist()
+        got = {}
+        for i, c in zip(index, place.columns, strict=True):
+            if c.parameter:
+                std = deviation[active.index(int(i))] if int(i) in active else 0.0
+                got[c.parameter] = (float(model.fit.x[i]), float(std), c.unit)
+        return for_people(place, got)
+
+    def refitted(self, base: Model, model: Model) -> list[dict]:
+        """The model's own parameters that moved."""
+        deviation = self.deviations(model)
+        active = model.fit.active.tolist()
+        out = []
+        for i in base.own:
+            p = self.space.parameters[i]
+            out += [
+                {
+                    "address": a,
+                    "from": float(p.nominal),
+                    "to": float(model.fit.x[i]),
+                    "std": float(deviation[active.index(i)]),
+                }
+                for a in p.addresses
+            ]
+        return out
+
+
+def for_people(
+    place: Place, got: dict[str, tuple[float, float, str]]
+) -> dict[str, tuple[float, float, str]]:
+    """Parameters as the table states them, from those that are fitted."""
+    out = dict(got)
+    if place.effect == "joint_stiffness":
+        (k, dk, unit), (s, ds, _) = got["stiffness"], got["rest"]
+        rest = s / k if k > 0 else 0.0
+        relative = math.hypot(ds / s if s else 0.0, dk / k if k > 0 else 0.0)
+        length = "rad" if "rad" in unit else "m"
+        out["rest"] = (rest, abs(rest) * relative, length)
+    if place.effect == "stribeck_friction":
+        (kinetic, dk, unit), (extra, de, _) = got["kinetic"], got["static"]
+        out["static"] = (kinetic + extra, math.hypot(dk, de), unit)
+    if place.effect == "torque_ripple":
+        phase, dp, unit = got["phase"]
+        out["phase"] = (math.remainder(phase, 2 * math.pi), dp, unit)
+    return out
+
+
+def _spread(count: int, most: int) -> np.ndarray:
+    """Indices of at most ``most`` windows at even distances."""
+    if count <= most:
+        return np.arange(count)
+    return np.unique(np.linspace(0, count - 1, most).round().astype(int))
+
+
+def own_space(m: mujoco.MjModel) -> ParameterSpace:
+    """What the model states and a refit may move: damping, frictionloss and stiffness
+    of joints where they are not zero, each within a factor of 5."""
+    from easi_jax.parameters import Parameter
+
+    found = []
+    for j in range(m.njnt):
+        if m.jnt_type[j] < 2 or not m.joint(j).name:
+            continue
+        d, name = int(m.jnt_dofadr[j]), m.joint(j).name
+        for quantity, value in (
+            ("damping", m.dof_damping[d]),
+            ("frictionloss", m.dof_frictionloss[d]),
+            ("stiffness", m.jnt_stiffness[j]),
+        ):
+            value = float(np.atleast_1d(value)[0])
+            if value > 0:
+                edge = (value / 5, value * 5)
+                address = f"joint.{name}.{quantity}"
+                found.append(Parameter(address, (address,), value, edge, edge))
+    return ParameterSpace(tuple(found))

@@ -1,0 +1,148 @@
+"""The gap: open-loop prediction error in units of the motion, and its noise floor."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from easi_jax.gap.predictor import WindowSet
+from easi_jax.gap.residuals import velocity_weights
+from easi_jax.recording import Run
+
+_VISIBLE = 5.0  # times the noise
+_DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Positions that are compared.
+
+    Attributes:
+        names: of each degree of freedom, ``(nv,)``.
+        joints: the joint that each belongs to.
+        units: m or rad.
+        scale: errors are divided by it; infinite where left out, ``(nv,)``.
+        ignored: reason for each that is left out.
+    """
+
+    names: tuple[str, ...]
+    joints: tuple[str, ...]
+    units: tuple[str, ...]
+    scale: np.ndarray
+    ignored: dict[str, str]
+
+
+def channels(
+    m: mujoco.MjModel,
+    names: Sequence[str],
+    runs: Sequence[Run],
+    noise: np.ndarray,
+    steps: int,
+) -> Channels:
+    """What the gap of these runs is made of.
+
+    A channel's scale is its standard deviation over all rows, or for one without bounds
+    (a free base's x and y, a hinge that turns on) the RMS of its change over ``steps``
+    control steps.
+    """
+    nv = m.nv
+    parts, changes = [], []
+    for run in runs:
+        origin = np.broadcast_to(runs[0].qpos[0], run.qpos.shape)
+        parts.append(run.configuration.difference(origin, run.qpos))
+        if len(run) > steps:
+            changes.append(
+                run.configuration.difference(run.qpos[:-steps], run.qpos[steps:])
+            )
+    everything = np.concatenate(parts)
+    change = np.sqrt(np.mean(np.concatenate(changes) ** 2, 0))
+    spread = everything.std(0)
+    joints, units, unbounded = [], [], np.zeros(nv, bool)
+    for j in range(m.njnt):
+        kind, d = int(m.jnt_type[j]), int(m.jnt_dofadr[j])
+        name = m.joint(j).name or f"joint{j}"
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            joints += [name] * 6
+            units += ["m"] * 3 + ["rad"] * 3
+            unbounded[d : d + 2] = True
+        elif kind == mujoco.mjtJoint.mjJNT_BALL:
+            joints += [name] * 3
+            units += ["rad"] * 3
+        else:
+            hinge = kind == mujoco.mjtJoint.mjJNT_HINGE
+            joints.append(name)
+            units.append("rad" if hinge else "m")
+            turns = np.ptp(everything[:, d]) > 2 * np.pi
+            unbounded[d] = hinge and not m.jnt_limited[j] and turns
+    scale = np.where(unbounded, change, spread)
+    quiet = change < _VISIBLE * noise
+    ignored = {
+        names[d]: (
+            f"moves by {change[d]:.2g} {units[d]} over a horizon, less than "
+            f"{_VISIBLE:g} times its noise of {noise[d]:.2g} {units[d]}"
+        )
+        for d in np.flatnonzero(quiet).tolist()
+    }
+    scale = np.where(quiet | (scale <= 0), np.inf, scale)
+    return Channels(tuple(names), tuple(joints), tuple(units), scale, ignored)
+
+
+def gap(square: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """The gap from mean squares ``(..., nv)`` of each channel."""
+    used = np.isfinite(scale)
+    return np.sqrt(np.mean(square[..., used] / scale[used] ** 2, -1))
+
+
+def squares(errors: np.ndarray) -> np.ndarray:
+    """Mean squares of each window and channel, ``(W, nv)``, of ``(W, H, nv)``."""
+    return np.mean(errors.astype(np.float64) ** 2, 1)
+
+
+def resampled(count: int, seed: int) -> np.ndarray:
+    """Bootstrap weights of windows, ``(draws, W)``; neighbors overlap, so in pairs."""
+    rng = np.random.default_rng(seed)
+    pairs = -(-count // 2)
+    picks = rng.integers(0, pairs, (_DRAWS, pairs))
+    out = np.zeros((_DRAWS, 2 * pairs))
+    for k in range(2):
+        np.add.at(out, (np.arange(_DRAWS)[:, None], 2 * picks + k), 1.0)
+    return out[:, :count] / np.maximum(out[:, :count].sum(1, keepdims=True), 1.0)
+
+
+def interval(
+    square: np.ndarray, scale: np.ndarray, seed: int = 0
+) -> tuple[float, float]:
+    """95 % interval of the gap of windows with mean squares ``(W, nv)``."""
+    drawn = gap(resampled(len(square), seed) @ square, scale)
+    low, high = np.quantile(drawn, (0.025, 0.975))
+    return float(low), float(high)
+
+
+def floor_squares(
+    windows: WindowSet, runs: Sequence[Run], slope: np.ndarray, noise: np.ndarray
+) -> np.ndarray:
+    """Expected mean squares of a perfect model, ``(W, nv)``.
+
+    The noise of the start state, through the fit of its velocity and the prediction,
+    and that of the target; the exact expectation of drawing both.
+
+    Args:
+        slope: of errors with the start state, ``(2 nv, W, H, nv)``.
+        noise: of measured positions, ``(nv,)``.
+    """
+    nv, steps = len(noise), slope.shape[2]
+    out = np.zeros((len(windows), nv))
+    for w in range(len(windows)):
+        run, row = runs[windows.run[w]], int(windows.row[w])
+        first, weights = velocity_weights(len(run), row, run.dt)
+        for c in range(nv):
+            span = np.arange(min(first, 0), max(steps, first + len(weights) - 1) + 1)
+            weight = np.zeros(len(span))
+            weight[first - span[0] : first - span[0] + len(weights)] = weights
+            # (H, nv, rows)
+            a = slope[nv + c, w][:, :, None] * weight
+            a[:, :, -span[0]] += slope[c, w]
+            a[np.arange(steps), c, np.arange(1, steps + 1) - span[0]] -= 1.0
+            out[w] += noise[c] ** 2 * (a**2).sum(-1).mean(0)
+    return out

@@ -1,0 +1,69 @@
+"""How large positions, torques and commands are in recorded data."""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from easi_jax.gap.table import Scales
+from easi_jax.recording import Run
+from easi_jax.windows import fitted_velocity
+
+_ROWS = 400
+_LONGEST = 0.1  # s
+
+
+def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
+    """Scales of the motion in ``runs`` under the model as given."""
+    d = mujoco.MjData(m)
+    total = sum(len(r) for r in runs)
+    stride = max(1, total // _ROWS)
+    rows: dict[str, list[np.ndarray]] = {
+        k: [] for k in ("v", "a", "torque", "force", "inertia", "ctrl", "q")
+    }
+    full = np.zeros((m.nv, m.nv))
+    for run in runs:
+        v = fitted_velocity(run.qpos, run.dt, run.configuration)
+        span = max(1, round(0.02 / run.dt))
+        start = np.broadcast_to(m.qpos0, run.qpos.shape)
+        moved = run.configuration.difference(start, run.qpos)
+        for i in range(0, len(run) - span, stride):
+            d.qpos[:], d.qvel[:] = run.qpos[i], v[i]
+            d.qacc[:] = (v[i + span] - v[i]) / (span * run.dt)
+            d.ctrl[:] = run.ctrl[i]
+            acceleration = d.qacc.copy()
+            mujoco.mj_forward(m, d)
+            driven = d.qfrc_actuator.copy()
+            force = d.actuator_force.copy()
+            d.qacc[:] = acceleration
+            mujoco.mj_inverse(m, d)
+            mujoco.mj_fullM(m, d, full)
+            rows["torque"].append(np.hypot(d.qfrc_inverse, driven))
+            rows["force"].append(force)
+            rows["inertia"].append(np.diag(full).copy())
+            rows["v"].append(v[i])
+            rows["a"].append(acceleration)
+            rows["ctrl"].append(run.ctrl[i])
+            rows["q"].append(moved[i])
+    got = {k: np.array(x) for k, x in rows.items()}
+
+    def rms(x: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.mean(np.minimum(x**2, 1e12), 0))
+
+    inertia = got["inertia"].mean(0)
+    speed = rms(got["v"])
+    torque = np.median(np.abs(got["torque"]), 0)
+    torque = np.maximum(torque, inertia * np.median(np.abs(got["a"]), 0))
+    position = got["q"].std(0)
+    return Scales(
+        position=np.maximum(position, 1e-9),
+        speed=np.maximum(speed, 1e-9),
+        acceleration=rms(got["a"]),
+        torque=np.maximum(torque, 1e-9),
+        inertia=inertia,
+        command=np.maximum(rms(got["ctrl"]), 1e-9) if m.nu else np.zeros(0),
+        force=np.maximum(rms(got["force"]), 1e-9) if m.nu else np.zeros(0),
+        span=np.maximum(np.ptp(got["q"], 0), 1e-9),
+        dt=runs[0].dt,
+        longest=max(_LONGEST, 3 * runs[0].dt),
+    )

@@ -1,0 +1,379 @@
+"""Which effects a model lacks: forward selection, backward elimination, rivals.
+
+Every candidate is fitted together with the model's own parameters and the effects found
+so far. Candidates are judged by what they predict of blocks of windows left out of the
+fit (by the fit's own derivatives, which for least squares needs no fit anew), never by
+the fitting error, and never by the held-out data.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from math import erf, sqrt
+
+import numpy as np
+
+from easi_jax.gap.fit import (
+    Bounds,
+    Fitted,
+    difference,
+    least_squares,
+    lockstep,
+    window_weights,
+)
+from easi_jax.gap.predictor import Predictor
+from easi_jax.gap.residuals import Residuals
+from easi_jax.gap.table import Place
+
+_SHORTLIST = 7  # names that are fitted in full at each stage
+_STARTS = 2  # of each
+_HOPELESS = 4.0  # times the best promise; beyond, only the first few are fitted
+_BLOCKS = 10  # of windows, for cross-validation
+_SURE = 2.5  # standard errors by which an effect has to help
+_HELPS = 0.05  # share of the squared gap by which each of its numbers has to help
+_ALIKE = 0.02  # relative difference of losses that says nothing
+_AS_GOOD = 1.5  # standard errors within which the simpler of two candidates wins
+_NEARLY = 0.7  # share of what the best explains
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A place with the values that its fit starts from.
+
+    Attributes:
+        ends: the whole vector one Gauss-Newton step later; empty where not known.
+    """
+
+    place: Place
+    start: tuple[float, ...]
+    ends: tuple[float, ...] = ()
+
+
+@dataclass
+class Model:
+    """A set of effects with its fit.
+
+    Attributes:
+        places: effects, in the order of selection.
+        fit: parameters and derivatives.
+        loss: cross-validated squared error of each block, per window, ``(blocks,)``.
+        gap: the same in units of the gap; squared, ``(blocks,)``.
+        own: indices of the model's own fitted parameters.
+    """
+
+    places: list[Place]
+    fit: Fitted
+    loss: np.ndarray
+    gap: np.ndarray
+    own: tuple[int, ...] = field(default=())
+
+
+class Selector:
+    """Fits sets of effects to some windows.
+
+    Args:
+        predictor: predictions.
+        residuals: of the chosen windows.
+        blocks: blocks of windows that are fitted.
+        count: windows in them that count.
+        bounds: of the whole vector.
+        group: block of cross-validation that each window is in, ``(count,)``.
+        own: indices of the model's own parameters that may be refitted.
+        tell: called with a line of progress.
+    """
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        residuals: Residuals,
+        blocks: np.ndarray,
+        count: int,
+        bounds: Bounds,
+        group: np.ndarray,
+        own: Sequence[int],
+        tell: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.predictor, self.residuals = predictor, residuals
+        self.blocks, self.count, self.bounds = blocks, count, bounds
+        self.group, self.own, self.tell = group, tuple(own), tell
+        self.weight = np.ones(count)
+        self.simulated = 0
+
+    def simulate(self, x: np.ndarray) -> np.ndarray:
+        """Whitened errors ``(B, W, m)`` of vectors ``(B, n)``."""
+        self.simulated += len(x)
+        errors = self.predictor.errors(x, self.blocks)[:, : self.count]
+        return self.residuals.whitened(self.residuals.grouped(errors))
+
+    def columns(self, place: Place, fitted: bool = True) -> np.ndarray:
+        """Entries of the whole vector that belong to a place."""
+        index = self.predictor.layout.where(place) + self.predictor.own
+        return index[np.array(place.fitted)] if fitted else index
+
+    def active(self, places: Sequence[Place]) -> list[int]:
+        """Entries that a fit of these effects moves."""
+        found = [int(i) for p in places for i in self.columns(p)]
+        return sorted({*self.own, *found})
+
+    def started(self, x: np.ndarray, candidate: Candidate) -> np.ndarray:
+        """A vector with a candidate at its starting values."""
+        out = x.copy()
+        out[self.columns(candidate.place, fitted=False)] = candidate.start
+        return out
+
+    def without(self, x: np.ndarray, place: Place, kept: Sequence[Place]) -> np.ndarray:
+        """A vector with an effect taken out, shared columns of ``kept`` left."""
+        mine = set(self.columns(place, fitted=False).tolist())
+        for other in kept:
+            mine -= set(self.columns(other, fitted=False).tolist())
+        out = x.copy()
+        index = sorted(mine)
+        out[index] = self.predictor.neutral[index]
+        return out
+
+    def model(self, places: list[Place], fit: Fitted) -> Model:
+        """A fit with its cross-validated loss."""
+        return Model(places, fit, *self.cross_validated(fit), self.own)
+
+    def fit(self, places: list[Place], x: np.ndarray) -> Model:
+        """The best fit of some effects from ``x``."""
+        problem = least_squares(x[None], self.active(places), self.bounds, self.weight)
+        return self.model(places, lockstep([problem], self.simulate)[0])
+
+    def cross_validated(self, fit: Fitted) -> tuple[np.ndarray, np.ndarray]:
+        """Squared error per window of each block by a fit without it, ``(blocks,)``:
+        of whitened errors, and in units of the gap.
+
+        One Gauss-Newton step from the whole fit, exact where errors are linear.
+        """
+        w, r, j = self.weight, fit.residual, fit.slope
+        blocks = int(self.group.max()) + 1
+        a = j.shape[-1]
+        out, plain = np.zeros((2, blocks))
+        size = self.bounds.size[fit.active]
+        j = j * size
+        normal = np.einsum("w,wma,wmb->ab", w, j, j, optimize=True)
+        gradient = np.einsum("w,wma,wm->a", w, j, r, optimize=True)
+        ridge = 1e-9 * np.diag(np.diag(normal) + 1e-30)
+        x = fit.x[fit.active]
+        stuck = (x <= self.bounds.low[fit.active]) | (x >= self.bounds.high[fit.active])
+        free = ~stuck
+        for b in range(blocks):
+            at = self.group == b
+            jb, rb, wb = j[at], r[at], w[at]
+            if a and free.any():
+                left = normal - np.einsum("w,wma,wmb->ab", wb, jb, jb, optimize=True)
+                pull = gradient - np.einsum("w,wma,wm->a", wb, jb, rb, optimize=True)
+                inner = (left + ridge)[np.ix_(free, free)]
+                move = np.zeros(a)
+                move[free] = -np.linalg.lstsq(inner, pull[free], rcond=1e-10)[0]
+                rb = rb + jb @ move
+            total = max(wb.sum(), 1e-30)
+            out[b] = float((wb * (rb**2).mean(1)).sum() / total)
+            raw = np.einsum("wij,wj->wi", self.residuals.plain[at], rb)
+            plain[b] = float((wb * (raw**2).mean(1)).sum() / total)
+        return out, plain
+
+    # -- stages ----------------------------------------------------------------
+
+    def screened(
+        self, base: Model, candidates: Sequence[Candidate]
+    ) -> list[tuple[float, Candidate]]:
+        """Candidates with the cost that one Gauss-Newton step promises, best first."""
+        x, w = base.fit.x, self.weight
+        asks, spans = [], []
+        for c in candidates:
+            y = self.started(x, c)
+            cols = self.columns(c.place)
+            if c.place.effect == "torque_ripple":
+                cols = cols[[0, 2]]  # amplitude and phase; cycles come from the grid
+            moved, step = difference(y, cols, self.bounds)
+            asks.append(np.concatenate([y[None], moved]))
+            spans.append((cols, step))
+        got, at = self._many(np.concatenate(asks)), 0
+        known = base.fit.slope * self.bounds.size[base.fit.active]
+        out = []
+        for c, ask, (cols, step) in zip(candidates, asks, spans, strict=True):
+            part = got[at : at + len(ask)]
+            at += len(ask)
+            r = part[0]
+            if not np.isfinite(part).all():
+                continue
+            new = np.moveaxis((part[1:] - r) / step[:, None, None], 0, -1)
+            j = np.concatenate([known, new * np.abs(step)], -1)
+            cost, move = _promised(r, j, w)
+            index = np.concatenate([base.fit.active, cols])
+            size = np.concatenate([self.bounds.size[base.fit.active], np.abs(step)])
+            end = ask[0].copy()
+            end[index] += move * size
+            # Not the others: a force limit that is off lies outside its bounds.
+            end[index] = np.clip(
+                end[index], self.bounds.low[index], self.bounds.high[index]
+            )
+            out.append((cost, replace(c, ends=tuple(end))))
+        return sorted(out, key=lambda item: item[0])
+
+    def _many(self, x: np.ndarray, most: int = 512) -> np.ndarray:
+        return np.concatenate(
+            [self.simulate(x[i : i + most]) for i in range(0, len(x), most)]
+        )
+
+    def fitted(
+        self, places: list[Place], x: np.ndarray, chosen: Sequence[Candidate]
+    ) -> list[Model]:
+        """Each candidate beside ``places``, the best of its starts, by name."""
+        problems = [
+            least_squares(
+                np.array([self.started(x, c), *([c.ends] if c.ends else [])]),
+                self.active([*places, c.place]),
+                self.bounds,
+                self.weight,
+            )
+            for c in chosen
+        ]
+        best: dict[str, tuple[float, Place, Fitted]] = {}
+        for c, f in zip(chosen, lockstep(problems, self.simulate), strict=True):
+            key = c.place.key
+            if key not in best or f.cost < best[key][0]:
+                best[key] = (f.cost, c.place, f)
+        return [self.model([*places, p], f) for _, p, f in best.values()]
+
+    def stage(
+        self, base: Model, candidates: Sequence[Candidate]
+    ) -> tuple[Model | None, list[Model]]:
+        """The next effect, None where none helps; and all that were fitted."""
+        short = shortlist(self.screened(base, candidates))
+        models = self.fitted(base.places, base.fit.x, short)
+        models.sort(key=lambda m: m.loss.mean())
+        if not models:
+            return None, []
+        good = [m for m in models if better(m, base)]
+        return (simplest(good, base) if good else None), models
+
+    def richer(self, model: Model, candidates: Sequence[Candidate]) -> Model:
+        """The model with effects replaced by ones that contain them and do better."""
+        for place in list(model.places):
+            more = [c for c in candidates if contains(c.place, place)]
+            if not more:
+                continue
+            kept = [p for p in model.places if p is not place]
+            found = self.fitted(kept, model.fit.x, more)
+            best = min(found, key=lambda m: m.loss.mean())
+            if better(best, model):
+                order = [best.places[-1] if p is place else p for p in model.places]
+                model = replace(best, places=order)
+        return model
+
+    def needed(self, model: Model) -> Model:
+        """The model less the effects that it predicts as well without."""
+        while len(model.places) > 1:
+            shorter = []
+            for place in model.places:
+                kept = [p for p in model.places if p is not place]
+                shorter.append(self.fit(kept, self.without(model.fit.x, place, kept)))
+            best = min(shorter, key=lambda m: m.loss.mean())
+            if better(model, best):
+                break
+            model = best
+        return model
+
+
+def shortlist(screened: Sequence[tuple[float, Candidate]]) -> list[Candidate]:
+    """The most promising names, the best starts of each."""
+    chosen: dict[str, list[Candidate]] = {}
+    first = screened[0][0] if screened else 0.0
+    for cost, c in screened:
+        mine = chosen.get(c.place.key)
+        if mine is None:
+            hopeless = cost > _HOPELESS * first and len(chosen) >= _SHORTLIST // 2
+            if len(chosen) == _SHORTLIST or hopeless:
+                continue
+            mine = chosen.setdefault(c.place.key, [])
+        if len(mine) < _STARTS:
+            mine.append(c)
+    return [c for mine in chosen.values() for c in mine]
+
+
+def _promised(
+    residual: np.ndarray, slope: np.ndarray, weight: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Cost after a Gauss-Newton step, and the step."""
+    root = np.sqrt(weight)[:, None]
+    r = (root * residual).reshape(-1)
+    j = (root[..., None] * slope).reshape(-1, slope.shape[-1])
+    normal, gradient = j.T @ j, j.T @ r
+    ridge = 1e-6 * np.diag(np.diag(normal) + 1e-30)
+    step = -np.linalg.solve(normal + ridge, gradient)
+    return float(0.5 * r @ r + 0.5 * gradient @ step), step
+
+
+def advantage(a: np.ndarray, b: np.ndarray) -> float:
+    """By how many standard errors losses ``a`` are below ``b``, block by block."""
+    d = b - a
+    error = d.std(ddof=1) / sqrt(len(d)) if len(d) > 1 else np.inf
+    return float(d.mean() / max(error, 1e-12 * max(abs(b.mean()), 1e-30)))
+
+
+def better(model: Model, base: Model) -> bool:
+    """Whether a model predicts better than a smaller one by more than chance, both in
+    units of the noise and in units of the gap."""
+    helps = _HELPS * max(1, len(model.fit.active) - len(base.fit.active))
+    return all(
+        advantage(a, b) > _SURE and b.mean() - a.mean() > helps * b.mean()
+        for a, b in ((model.loss, base.loss), (model.gap, base.gap))
+    )
+
+
+def size_of(model: Model) -> int:
+    """Fitted numbers of its last effect."""
+    return sum(model.places[-1].fitted)
+
+
+# An effect that contains another as a special case.
+_CONTAINS = {
+    "stribeck_friction": "coulomb_friction",
+    "joint_stiffness": "constant_force",
+}
+
+
+def contains(a: Place, b: Place) -> bool:
+    """Whether effect ``a`` is ``b`` and more, at the same place."""
+    return a.at == b.at and a.kind == b.kind and _CONTAINS.get(a.effect) == b.effect
+
+
+def simplest(models: Sequence[Model], base: Model) -> Model:
+    """The best of models sorted by loss, or a simpler one that is as good.
+
+    One that the best contains as a special case comes first also where it is only
+    nearly as good: the rest is asked for once other effects are in (`Selector.richer`).
+    """
+    best = models[0]
+    for m in models[1:]:
+        if contains(best.places[-1], m.places[-1]):
+            whole = base.loss.mean() - best.loss.mean()
+            if base.loss.mean() - m.loss.mean() > _NEARLY * whole:
+                best = m
+        elif size_of(m) < size_of(best):
+            close = m.loss.mean() < (1 + _HELPS) * best.loss.mean()
+            if close and advantage(best.loss, m.loss) < _AS_GOOD:
+                best = m
+    return best
+
+
+def probability(model: Model, rival: Model) -> float:
+    """That a model is better than a rival, by their cross-validated losses.
+
+    What fits as well with more numbers is less likely by a half standard error for
+    each; what only adds to the model hardly counts.
+    """
+    extra = size_of(rival) - size_of(model)
+    d = rival.loss - model.loss
+    error = max(d.std(ddof=1) / sqrt(len(d)), _ALIKE * model.loss.mean())
+    t = float(d.mean()) / error + 0.5 * extra
+    if contains(rival.places[-1], model.places[-1]):
+        t = max(t, 0.0) + 1.0
+    return 0.5 * (1 + erf(t / sqrt(2)))
+
+
+def weights_of(model: Model) -> np.ndarray:
+    """Weights of windows that keep outliers from deciding."""
+    return window_weights(model.fit.residual)

@@ -1,0 +1,325 @@
+"""Files of ``train.gap``: gap.json, model.xml, effects.yaml, report.html."""
+
+from pathlib import Path
+from typing import Any
+
+_WORDS = {
+    "coulomb_friction": 'joint "{at}" has about {torque} of dry friction',
+    "stribeck_friction": 'joint "{at}" has dry friction of {static} at rest that falls '
+    "to {kinetic} in motion",
+    "viscous_damping": 'joint "{at}" has {damping} of viscous damping',
+    "quadratic_drag": 'joint "{at}" has a drag of {coefficient} on the squared speed',
+    "joint_stiffness": 'joint "{at}" is pulled by a spring of {stiffness}',
+    "constant_force": 'a constant force acts at {kind} "{at}"',
+    "torque_ripple": 'joint "{at}" has a torque ripple of {amplitude}, '
+    "{cycles_per_rev} cycles per revolution",
+    "armature": 'joint "{at}" carries {armature} of inertia',
+    "backlash": 'joint "{at}" has {width} of free play',
+    "actuator_gain": 'actuator "{at}" gives {gain} times what it is told',
+    "actuator_delay": 'commands arrive at actuator "{at}" {delay} late',
+    "actuator_lag": 'actuator "{at}" responds with a time constant of {time_constant}',
+    "actuator_saturation": 'actuator "{at}" gives no more than {limit}',
+    "actuator_deadband": 'actuator "{at}" ignores commands below {width}',
+    "payload_mass": 'body "{at}" is {mass} heavier',
+    "com_offset": 'the mass of body "{at}" sits elsewhere',
+    "gravity_tilt": "the base is not level (roll {roll}, pitch {pitch})",
+    "sensor_bias": 'the reading of joint "{at}" is off by {bias}',
+    "sensor_delay": 'the reading of "{at}" comes {delay} late',
+    "contact_friction": "contacts have {friction} times the model's sliding friction",
+    "contact_softness": "contacts have {stiffness} times the model's stiffness",
+}
+
+
+def sentence(found: Any) -> str:
+    """What a roboticist would say of an effect."""
+    shown = {k: f"{v:.3g} {u}".strip() for k, (v, _, u) in found.values.items()}
+    shown = {k: v.removesuffix(" 1") for k, v in shown.items()}
+    place = found.place
+    return _WORDS[place.effect].format(at=place.at, kind=place.kind, **shown)
+
+
+def gap_json(problem: Any, analysis: Any, outcome: Any) -> dict[str, Any]:
+    """The content of ``gap.json``, as the log format describes it."""
+    from easi_jax import effects
+    from easi_jax.gap.where import where
+
+    c = outcome.channels
+    scalar = effects.scalar_joints(problem.mj_model)
+    last = outcome.after if outcome.found else outcome.refit
+    places = where(last.errors, outcome.held, analysis.runs, c, scalar)
+    listed = [
+        {
+            "effect": f.place.effect,
+            "at": f.place.at,
+            "kind": f.place.kind,
+            "parameters": {
+                k: {"value": v, "std": s, "unit": u}
+                for k, (v, s, u) in f.values.items()
+            },
+            "confidence": f.confidence,
+            "indistinguishable": f.indistinguishable,
+            "gap_after": f.gap_after,
+        }
+        for f in outcome.found
+    ]
+    for joint, lag in problem.late.items():
+        listed.append(
+            {
+                "effect": "sensor_delay",
+                "at": f"qvel.{joint}",
+                "kind": "sensor",
+                "parameters": {"delay": {"value": lag, "std": 0.0, "unit": "s"}},
+                "confidence": 0.95,
+                "indistinguishable": [],
+                "gap_after": last.gap,
+            }
+        )
+    return {
+        "schema": 1,
+        "verdict": outcome.verdict,
+        "effects": listed,
+        "refitted": outcome.refitted,
+        "gap": {
+            "before": outcome.before.gap,
+            "refit": outcome.refit.gap,
+            "after": outcome.after.gap,
+            "after_95": list(outcome.after.interval),
+            "floor": outcome.floor,
+        },
+        "gap_si": {
+            name: {
+                "unit": c.units[d],
+                "before": outcome.before.si[d],
+                "refit": outcome.refit.si[d],
+                "after": outcome.after.si[d],
+                "floor": outcome.floor_si[d],
+            }
+            for d, name in enumerate(c.names)
+        },
+        "ignored": [{"at": k, "reason": v} for k, v in c.ignored.items()],
+        "held_out": problem.held_names,
+        "where": [
+            {"at": w.at, "share": w.share, "when": w.when}
+            for w in places
+            if w.share > 0
+        ],
+        "notes": outcome.notes,
+        "seconds": outcome.seconds,
+    }
+
+
+def write_results(
+    folder: Any, config: Any, problem: Any, analysis: Any, outcome: Any
+) -> Path:
+    """Writes all files; returns the report's path."""
+    from easi_jax.io.effects_file import EffectEntry, write_effects
+    from easi_jax.io.repaired_model import repaired_xml
+
+    entries = []
+    for f in outcome.found:
+        index = analysis.selector.columns(f.place, fitted=False)
+        entries.append(
+            EffectEntry(
+                f.place.effect,
+                f.place.at,
+                f.place.kind,
+                {
+                    column_name(c): float(outcome.x[i])
+                    for c, i in zip(f.place.columns, index, strict=True)
+                },
+                {},
+            )
+        )
+    shown = [{k: v for k, (v, _, _) in f.values.items()} for f in outcome.found]
+    write_effects(
+        folder.path / "effects.yaml",
+        str(problem.path or problem.name),
+        entries,
+        shown,
+        outcome.refitted,
+    )
+    own = {r["address"]: r["to"] for r in outcome.refitted}
+    left: list[str] = []
+    if problem.path is not None:
+        xml, left = repaired_xml(problem.path, entries, own)
+        folder.write("model.xml", xml)
+    content = gap_json(problem, analysis, outcome)
+    content["not_in_model_xml"] = left
+    folder.write_json("gap.json", content)
+    return _report(folder, config, problem, analysis, outcome, content)
+
+
+def column_name(column: Any) -> str:
+    """A column's name in an effects file: ``com.0`` for one entry of a vector."""
+    vector = {"com", "force"}
+    if column.field in vector:
+        return f"{column.field}.{column.index[1]}"
+    if column.field in ("tilt", "softness"):
+        return f"{column.field}.{column.index[0]}"
+    return column.field
+
+
+def _report(
+    folder: Any, config: Any, problem: Any, analysis: Any, o: Any, content: Any
+) -> Path:
+    import numpy as np
+
+    from easi_jax.io.gap_figures import gap_steps, traces
+    from easi_jax.io.report import Picture, Report, Table, write_report
+    from easi_jax.io.versions import versions
+
+    c = o.channels
+    lines = []
+    if o.verdict == "no_gap":
+        lines.append(
+            "No gap: with its own parameters refitted the model predicts held-out "
+            f"data as well as their noise allows (gap {o.refit.gap:.3g}, floor "
+            f"{o.floor:.3g})."
+        )
+    gap = o.refit.gap
+    for f in o.found:
+        lines.append(
+            f"{sentence(f).capitalize()} that the model lacks (confidence "
+            f"{f.confidence:.2f}); with it the {config.horizon:g} s prediction error "
+            f"falls from {gap / o.floor:.3g} to {f.gap_after / o.floor:.3g} times the "
+            "sensor noise."
+        )
+        if f.indistinguishable:
+            lines.append(
+                f"These data cannot tell it from {', '.join(f.indistinguishable)}."
+            )
+        gap = f.gap_after
+    if o.verdict == "unexplained":
+        rest = content["where"][0]
+        lines.append(
+            f"A gap of {o.after.gap:.3g} remains ({o.after.gap / o.floor:.3g} times "
+            "the noise) that no known effect closes; "
+            f"{100 * rest['share']:.0f} % of it sits "
+            f'at "{rest["at"]}", {rest["when"]}.'
+        )
+    for joint, lag in problem.late.items():
+        lines.append(
+            f'The measured velocity of "{joint}" lags its position by '
+            f"{1000 * lag:.0f} ms: a filter in the drive, not the plant. It is not "
+            "used."
+        )
+    pictures = []
+    labels = ["as given", "refitted", *[f"+ {f.place.key}" for f in o.found]]
+    gaps = [o.before.gap, o.refit.gap, *[f.gap_after for f in o.found]]
+    low, high = o.after.interval
+    pictures.append(
+        Picture(
+            "The gap, step by step",
+            gap_steps(labels, gaps, low, high, o.floor),
+            "Bars of the held-out gap as given, refitted and after each effect, with "
+            "the noise floor as a line",
+            "Root mean square error of open-loop predictions of data that no fit has "
+            "seen, as a share of the motion; the line on the last bar is its 95 % "
+            "interval.",
+        )
+    )
+    used = np.flatnonzero(np.isfinite(c.scale))[:6]
+    w = _telling(o)
+    measured, before, after = _traces(problem, o, w)
+    time = np.arange(measured.shape[1]) * problem.fit[0].dt
+    pictures.append(
+        Picture(
+            "Measured and predicted",
+            traces(
+                time,
+                measured[..., used],
+                before[..., used],
+                after[..., used],
+                [c.names[d] for d in used],
+                [c.units[d] for d in used],
+            ),
+            "Measured motion in three held-out windows with predictions of the model "
+            "as given and of the repaired one",
+            "Held-out windows whose error under the model as given is large, median "
+            "and small.",
+        )
+    )
+    tables = [
+        Table(
+            "Effects",
+            ["effect", "at", "parameters", "confidence", "as good on these data"],
+            [
+                (
+                    f.place.effect,
+                    f.place.at or "whole model",
+                    "; ".join(
+                        f"{k} {v:.4g} ± {s:.2g} {u}"
+                        for k, (v, s, u) in f.values.items()
+                    ),
+                    f.confidence,
+                    ", ".join(f.indistinguishable) or "none",
+                )
+                for f in o.found
+            ],
+        ),
+        Table(
+            "Error by channel",
+            ["channel", "unit", "as given", "refitted", "after", "noise floor"],
+            [
+                (
+                    n,
+                    c.units[d],
+                    *(
+                        float(x[d])
+                        for x in (o.before.si, o.refit.si, o.after.si, o.floor_si)
+                    ),
+                )
+                for d, n in enumerate(c.names)
+            ],
+            f"RMS over windows of {config.horizon:g} s, held out: {problem.held_name}.",
+        ),
+        Table(
+            "Where the rest sits",
+            ["joint", "share", "when"],
+            [(r["at"], r["share"], r["when"]) for r in content["where"]],
+        ),
+        Table(
+            "The model's own parameters",
+            ["address", "from", "to", "std"],
+            [(r["address"], r["from"], r["to"], r["std"]) for r in o.refitted],
+        ),
+    ]
+    path = folder.path / "report.html"
+    write_report(
+        path,
+        Report(
+            title=f"The gap of {problem.name}",
+            headline=lines,
+            command="train.gap",
+            tables=[t for t in tables if t.rows],
+            pictures=pictures,
+            notes=[*o.notes, *(f"{k}: left out, {v}" for k, v in c.ignored.items())],
+            config=config,
+            versions=versions(),
+        ),
+    )
+    return path
+
+
+def _telling(o: Any) -> Any:
+    """Windows with a large, a median and a small error under the model as given."""
+    import numpy as np
+
+    used = np.isfinite(o.channels.scale)
+    size = (o.before.square[:, used] / o.channels.scale[used] ** 2).mean(1)
+    order = np.argsort(size)
+    return order[[int(0.95 * (len(order) - 1)), len(order) // 2, len(order) // 10]]
+
+
+def _traces(problem: Any, o: Any, w: Any) -> tuple[Any, Any, Any]:
+    import numpy as np
+
+    run = problem.held[0]
+    held = o.held.take(w)
+    measured = np.concatenate([held.start_qpos[:, :1], held.target], 1)
+    origin = np.broadcast_to(problem.mj_model.qpos0, measured.shape)
+    seen = run.configuration.difference(origin, measured)
+    pad = [(0, 0), (1, 0), (0, 0)]
+    before = seen + np.pad(o.before.errors[w], pad)
+    after = seen + np.pad((o.after if o.found else o.refit).errors[w], pad)
+    return seen, before, after
