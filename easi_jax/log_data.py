@@ -1,7 +1,7 @@
 """Measured runs as data of a search: noise, splits, segments, open-loop error."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -37,33 +37,42 @@ def estimate_noise(run: Run) -> np.ndarray:
 
     Positions: differences of order 2 to 6, in which smooth motion vanishes and white
     noise grows by ``sqrt(binomial(2k, k))``; the median absolute value keeps jerks
-    out, and the order with the least motion left in it counts. Never below what the
-    resolution of the readings makes, ``step / sqrt(12)``. Velocities: the same where
-    they were measured, else the positions' noise through the quadratic fit.
+    out, and the order with the least motion left in it counts; where readings are
+    coarser than that, their few levels make a median jump, and the mean absolute value
+    counts. Never below what the resolution makes, ``step / sqrt(12)``. Velocities: the
+    same where they were measured, else the positions' noise through the quadratic fit.
     """
     steps = run.configuration.difference(run.qpos[:-1], run.qpos[1:])
-    sigma = _difference_noise(steps, 1)
+    sigma = _difference_noise(steps, 1, np.median, _MAD)
+    mean = _difference_noise(steps, 1, np.mean, math.sqrt(math.pi / 2))
     scalar = list(run.configuration.scalar_qvel)
     readings = run.qpos[:, list(run.configuration.scalar_qpos)]
-    sigma[scalar] = np.maximum(sigma[scalar], _resolution(readings) / math.sqrt(12.0))
+    resolution = _resolution(readings)
+    coarse = resolution > sigma[scalar]
+    sigma[scalar] = np.where(coarse, mean[scalar], sigma[scalar])
+    sigma[scalar] = np.maximum(sigma[scalar], resolution / math.sqrt(12.0))
     if run.qvel_measured:
         speed = np.maximum(
-            _difference_noise(run.qvel, 0), _resolution(run.qvel) / math.sqrt(12.0)
+            _difference_noise(run.qvel, 0, np.median, _MAD),
+            _resolution(run.qvel) / math.sqrt(12.0),
         )
     else:
         speed = sigma * _fit_gain(len(run), run.dt)
     return np.concatenate([sigma, speed])
 
 
-def _difference_noise(x: np.ndarray, done: int) -> np.ndarray:
-    """Noise of ``x (T, n)``, which was differenced ``done`` times already."""
+def _difference_noise(
+    x: np.ndarray, done: int, middle: Callable[..., np.ndarray], factor: float
+) -> np.ndarray:
+    """Noise of ``x (T, n)``, which was differenced ``done`` times already, from a
+    ``middle`` of absolute values and the ``factor`` that makes it a deviation."""
     found = []
     for order in _ORDERS:
         if len(x) - (order - done) < 3:
             break
         d = np.diff(x, order - done, axis=0)
         found.append(
-            _MAD * np.median(np.abs(d), 0) / math.sqrt(math.comb(2 * order, order))
+            factor * middle(np.abs(d), 0) / math.sqrt(math.comb(2 * order, order))
         )
     return np.min(found, axis=0) if found else np.zeros(x.shape[1])
 

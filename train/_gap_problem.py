@@ -42,7 +42,7 @@ def read_gap_problem(config: Any) -> GapProblem:
         UserError: whatever is wrong with the files or the options.
     """
     from easi_jax.errors import UserError
-    from easi_jax.gap.analysis import own_space
+    from easi_jax.gap.own import own_space
     from easi_jax.gap.velocities import velocity_lags
     from easi_jax.io.logs import read_logs
     from easi_jax.io.parameter_file import read_parameter_file

@@ -50,22 +50,22 @@ def run(config: Config) -> None:
     if not config.model or not config.data:
         raise UserError("give --model M.xml (or a robot's name) and --data LOG...")
     problem = read_gap_problem(config)
+    from easi_jax.gap.analysis import Analysis
+
+    analysis = Analysis(
+        problem.mj_model,
+        problem.space,
+        problem.fit,
+        problem.held,
+        problem.noise,
+        config.horizon,
+        tell=say,
+    )
     with RunFolder.open(
         config.out, config, command="train.gap", overwrite=config.overwrite
     ) as folder:
-        from easi_jax.gap.analysis import Analysis
-
         for note in problem.notes:
             say(f"note: {note}")
-        analysis = Analysis(
-            problem.mj_model,
-            problem.space,
-            problem.fit,
-            problem.held,
-            problem.noise,
-            config.horizon,
-            tell=say,
-        )
         outcome = analysis.run()
         outcome.notes = problem.notes
         report = write_results(folder, config, problem, analysis, outcome)

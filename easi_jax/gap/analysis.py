@@ -8,7 +8,7 @@ Held-out windows take part in none but the last.
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -16,7 +16,8 @@ import numpy as np
 from easi_jax.errors import UserError
 from easi_jax.gap import measure
 from easi_jax.gap.fit import Bounds, window_weights
-from easi_jax.gap.predictor import Predictor, WindowSet, join, window_set
+from easi_jax.gap.outcome import Figures, Found, Outcome, for_people
+from easi_jax.gap.predictor import Predictor, join, window_set
 from easi_jax.gap.residuals import (
     Residuals,
     make_residuals,
@@ -43,66 +44,9 @@ _RIPPLES = [0.75 * k for k in range(3, 27)]  # cycles over the range of a joint
 _CLOSED = 1.1  # times the floor: nothing left to explain
 _GOAL = 1.25
 _RIVALS = 8
+_DRAWS = 8  # of the noise of each held-out window
 
 Tell = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Found:
-    """One effect that the model lacks.
-
-    Attributes:
-        place: which, and where.
-        values: of its parameters, with their standard deviations.
-        confidence: probability of this name against its rivals.
-        indistinguishable: rivals that predict the held-out data as well.
-        gap_after: held-out gap with it and those before it.
-    """
-
-    place: Place
-    values: dict[str, tuple[float, float, str]]
-    confidence: float
-    indistinguishable: list[str]
-    gap_after: float
-
-
-@dataclass(frozen=True)
-class Figures:
-    """Held-out gap of one model.
-
-    Attributes:
-        gap: in units of the motion.
-        interval: its 95 % interval, by bootstrap over windows.
-        si: RMS error of each degree of freedom, ``(nv,)``.
-        square: mean squares of each window, ``(W, nv)``.
-        errors: of every step, ``(W, H, nv)``.
-    """
-
-    gap: float
-    interval: tuple[float, float]
-    si: np.ndarray
-    square: np.ndarray
-    errors: np.ndarray
-
-
-@dataclass
-class Outcome:
-    """What the workflow found; see the log format's ``gap.json``."""
-
-    verdict: str
-    found: list[Found]
-    refitted: list[dict]
-    before: Figures
-    refit: Figures
-    after: Figures
-    floor: float
-    floor_si: np.ndarray
-    channels: measure.Channels
-    held: WindowSet
-    x: np.ndarray
-    steps: list[tuple[str, float]]
-    notes: list[str] = field(default_factory=list)
-    seconds: float = 0.0
 
 
 class Analysis:
@@ -285,11 +229,21 @@ class Analysis:
         )
 
     def floor(self, x: np.ndarray) -> np.ndarray:
-        """Mean squares of a perfect model on the held-out windows, ``(nv,)``."""
-        slope = start_sensitivity(self.predictor, x, self.start_noise, self.held_blocks)
-        return measure.floor_squares(
-            self.held, self.runs, slope[:, : len(self.held)], self.noise
-        ).mean(0)
+        """Mean squares of a perfect model on the held-out windows, ``(nv,)``.
+
+        Noise is drawn for starts and targets and pushed through the model.
+        """
+        rng = np.random.default_rng(0)
+        offsets, targets = measure.drawn_noise(
+            self.held, self.runs, self.noise, self.predictor.steps, _DRAWS, rng
+        )
+        still = self.predictor.errors(x[None], self.held_blocks)
+        moved = self.predictor.errors(
+            np.repeat(x[None], _DRAWS, 0), self.held_blocks, offsets
+        )
+        count = len(self.held)
+        error = moved[:, :count] - still[:, :count] - targets
+        return np.mean(error.astype(float) ** 2, (0, 1, 2))
 
     # -- the whole -------------------------------------------------------------
 
@@ -420,7 +374,7 @@ class Analysis:
             steps.append((place.key, figures.gap))
         floor_gap = float(measure.gap(floor, scale))
         goal = _GOAL * floor_gap
-        if refit.interval[1] <= goal:
+        if refit.gap <= goal:
             verdict = "no_gap"
         elif found and after.interval[1] <= goal:
             verdict = "explained"
@@ -501,51 +455,8 @@ class Analysis:
         return out
 
 
-def for_people(
-    place: Place, got: dict[str, tuple[float, float, str]]
-) -> dict[str, tuple[float, float, str]]:
-    """Parameters as the table states them, from those that are fitted."""
-    out = dict(got)
-    if place.effect == "joint_stiffness":
-        (k, dk, unit), (s, ds, _) = got["stiffness"], got["rest"]
-        rest = s / k if k > 0 else 0.0
-        relative = math.hypot(ds / s if s else 0.0, dk / k if k > 0 else 0.0)
-        length = "rad" if "rad" in unit else "m"
-        out["rest"] = (rest, abs(rest) * relative, length)
-    if place.effect == "stribeck_friction":
-        (kinetic, dk, unit), (extra, de, _) = got["kinetic"], got["static"]
-        out["static"] = (kinetic + extra, math.hypot(dk, de), unit)
-    if place.effect == "torque_ripple":
-        phase, dp, unit = got["phase"]
-        out["phase"] = (math.remainder(phase, 2 * math.pi), dp, unit)
-    return out
-
-
 def _spread(count: int, most: int) -> np.ndarray:
     """Indices of at most ``most`` windows at even distances."""
     if count <= most:
         return np.arange(count)
     return np.unique(np.linspace(0, count - 1, most).round().astype(int))
-
-
-def own_space(m: mujoco.MjModel) -> ParameterSpace:
-    """What the model states and a refit may move: damping, frictionloss and stiffness
-    of joints where they are not zero, each within a factor of 5."""
-    from easi_jax.parameters import Parameter
-
-    found = []
-    for j in range(m.njnt):
-        if m.jnt_type[j] < 2 or not m.joint(j).name:
-            continue
-        d, name = int(m.jnt_dofadr[j]), m.joint(j).name
-        for quantity, value in (
-            ("damping", m.dof_damping[d]),
-            ("frictionloss", m.dof_frictionloss[d]),
-            ("stiffness", m.jnt_stiffness[j]),
-        ):
-            value = float(np.atleast_1d(value)[0])
-            if value > 0:
-                edge = (value / 5, value * 5)
-                address = f"joint.{name}.{quantity}"
-                found.append(Parameter(address, (address,), value, edge, edge))
-    return ParameterSpace(tuple(found))

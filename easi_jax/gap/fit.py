@@ -72,7 +72,11 @@ def difference(
 
 
 def least_squares(
-    starts: np.ndarray, chosen: Sequence[int], bounds: Bounds, weight: np.ndarray
+    starts: np.ndarray,
+    chosen: Sequence[int],
+    bounds: Bounds,
+    weight: np.ndarray,
+    rounds: int = _ROUNDS,
 ) -> Asks:
     """Levenberg-Marquardt with projection onto the bounds, as a generator.
 
@@ -83,6 +87,7 @@ def least_squares(
     Args:
         starts: vectors to start from, ``(S, n)``; the best is taken.
         chosen: entries to fit.
+        rounds: at most.
     """
     active = np.asarray(chosen, int)
     found = yield np.asarray(starts, np.float64)
@@ -92,7 +97,7 @@ def least_squares(
     size = bounds.size[active]
     slope = np.zeros((*residual.shape, len(active)))
     damping, fresh, measured = 1e-2, False, False
-    for _ in range(_ROUNDS if len(active) and np.isfinite(cost) else 0):
+    for _ in range(rounds if len(active) and np.isfinite(cost) else 0):
         if not fresh:
             moved, step = difference(x, active, bounds)
             got = yield moved

@@ -146,3 +146,31 @@ def floor_squares(
             a[np.arange(steps), c, np.arange(1, steps + 1) - span[0]] -= 1.0
             out[w] += noise[c] ** 2 * (a**2).sum(-1).mean(0)
     return out
+
+
+def drawn_noise(
+    windows: WindowSet,
+    runs: Sequence[Run],
+    noise: np.ndarray,
+    steps: int,
+    draws: int,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Noise of start states ``(draws, W, 2 nv)`` and of targets ``(draws, W, H, nv)``.
+
+    Both come from the same noisy rows: the velocity is fitted to some of the targets.
+    """
+    nv = len(noise)
+    offsets = np.zeros((draws, len(windows), 2 * nv))
+    targets = np.zeros((draws, len(windows), steps, nv))
+    for w in range(len(windows)):
+        run, row = runs[windows.run[w]], int(windows.row[w])
+        first, weights = velocity_weights(len(run), row, run.dt)
+        low = min(first, 0)
+        high = max(steps, first + len(weights) - 1)
+        rows = noise * rng.normal(size=(draws, high - low + 1, nv))
+        fitted = rows[:, first - low : first - low + len(weights)]
+        offsets[:, w, :nv] = rows[:, -low]
+        offsets[:, w, nv:] = np.einsum("k,dkc->dc", weights, fitted)
+        targets[:, w] = rows[:, 1 - low : 1 - low + steps]
+    return offsets, targets

@@ -1,0 +1,88 @@
+"""What the gap workflow found, as values."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from easi_jax.gap.measure import Channels
+from easi_jax.gap.predictor import WindowSet
+from easi_jax.gap.table import Place
+
+
+@dataclass(frozen=True)
+class Found:
+    """One effect that the model lacks.
+
+    Attributes:
+        place: which, and where.
+        values: of its parameters, with their standard deviations.
+        confidence: probability of this name against its rivals.
+        indistinguishable: rivals that predict the held-out data as well.
+        gap_after: held-out gap with it and those before it.
+    """
+
+    place: Place
+    values: dict[str, tuple[float, float, str]]
+    confidence: float
+    indistinguishable: list[str]
+    gap_after: float
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Held-out gap of one model.
+
+    Attributes:
+        gap: in units of the motion.
+        interval: its 95 % interval, by bootstrap over windows.
+        si: RMS error of each degree of freedom, ``(nv,)``.
+        square: mean squares of each window, ``(W, nv)``.
+        errors: of every step, ``(W, H, nv)``.
+    """
+
+    gap: float
+    interval: tuple[float, float]
+    si: np.ndarray
+    square: np.ndarray
+    errors: np.ndarray
+
+
+@dataclass
+class Outcome:
+    """What the workflow found; see the log format's ``gap.json``."""
+
+    verdict: str
+    found: list[Found]
+    refitted: list[dict]
+    before: Figures
+    refit: Figures
+    after: Figures
+    floor: float
+    floor_si: np.ndarray
+    channels: Channels
+    held: WindowSet
+    x: np.ndarray
+    steps: list[tuple[str, float]]
+    notes: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+def for_people(
+    place: Place, got: dict[str, tuple[float, float, str]]
+) -> dict[str, tuple[float, float, str]]:
+    """Parameters as the table states them, from those that are fitted."""
+    out = dict(got)
+    if place.effect == "joint_stiffness":
+        (k, dk, unit), (s, ds, _) = got["stiffness"], got["rest"]
+        rest = s / k if k > 0 else 0.0
+        relative = math.hypot(ds / s if s else 0.0, dk / k if k > 0 else 0.0)
+        length = "rad" if "rad" in unit else "m"
+        out["rest"] = (rest, abs(rest) * relative, length)
+    if place.effect == "stribeck_friction":
+        (kinetic, dk, unit), (extra, de, _) = got["kinetic"], got["static"]
+        out["static"] = (kinetic + extra, math.hypot(dk, de), unit)
+    if place.effect == "torque_ripple":
+        phase, dp, unit = got["phase"]
+        out["phase"] = (math.remainder(phase, 2 * math.pi), dp, unit)
+    return out

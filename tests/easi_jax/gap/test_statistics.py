@@ -1,0 +1,243 @@
+"""Fits, noise floors and whitening on problems whose answers are known."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from easi_jax.configuration import Configuration
+from easi_jax.gap import measure
+from easi_jax.gap.fit import Bounds, least_squares, lockstep, window_weights
+from easi_jax.gap.outcome import for_people
+from easi_jax.gap.predictor import Predictor, window_set
+from easi_jax.gap.residuals import make_residuals, start_sensitivity, step_groups
+from easi_jax.gap.scales import scales_of
+from easi_jax.gap.selection import advantage
+from easi_jax.gap.table import EFFECTS, Layout, places, ripples
+from easi_jax.gap.velocities import velocity_lags
+from easi_jax.parameters import ParameterSpace
+from easi_jax.recording import Run
+from easi_jax.windows import fitted_velocity
+
+PENDULUM = """
+<mujoco>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody>
+    <body name="rod">
+      <joint name="hinge" axis="0 -1 0" damping="0.05"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.6"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge"/></actuator>
+</mujoco>
+"""
+NOISE, DT = 2e-3, 0.01
+
+
+@pytest.fixture(scope="module")
+def model() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(PENDULUM)
+
+
+def recording(model: mujoco.MjModel, seed: int, noise: float = NOISE) -> Run:
+    rng = np.random.default_rng(seed)
+    d = mujoco.MjData(model)
+    t = DT * np.arange(800)
+    ctrl = 0.8 * np.sin(2.1 * t + seed) + 0.6 * np.sin(4.7 * t)
+    q = []
+    for u in ctrl:
+        q.append(d.qpos.copy())
+        d.ctrl[:] = u
+        for _ in range(5):
+            mujoco.mj_step(model, d)
+    qpos = np.array(q) + noise * rng.normal(size=(len(t), 1))
+    c = Configuration.of(model)
+    return Run(
+        f"run{seed}",
+        "made",
+        DT,
+        t,
+        qpos,
+        fitted_velocity(qpos, DT, c),
+        False,
+        ctrl[:, None],
+        c,
+    )
+
+
+@pytest.fixture(scope="module")
+def runs(model: mujoco.MjModel) -> list[Run]:
+    return [recording(model, seed) for seed in (1, 2)]
+
+
+@pytest.fixture(scope="module")
+def predictor(model: mujoco.MjModel, runs: list[Run]) -> Predictor:
+    windows = window_set(runs, 0.2, 10, 10)
+    assert windows is not None
+    layout = Layout(model, places(model, scales_of(model, runs)))
+    return Predictor(model, ParameterSpace(()), layout, windows, DT)
+
+
+def drawn_floor(predictor: Predictor, runs: list[Run], noise: np.ndarray) -> np.ndarray:
+    """The floor by drawing noise and pushing it through the model."""
+    x, draws = predictor.neutral, 8
+    offsets, targets = measure.drawn_noise(
+        predictor.windows, runs, noise, predictor.steps, draws, np.random.default_rng(0)
+    )
+    still = predictor.errors(x[None])
+    error = predictor.errors(np.repeat(x[None], draws, 0), None, offsets) - still
+    return np.mean((error - targets) ** 2, (0, 1, 2))
+
+
+def test_floor_and_whitening_of_a_perfect_model(
+    predictor: Predictor, runs: list[Run]
+) -> None:
+    noise = np.array([NOISE, 0.0])
+    x = predictor.neutral
+    slope = start_sensitivity(predictor, x, np.array([NOISE, 0.05]), None)
+    slope = slope[:, : len(predictor.windows)]
+    floor = measure.floor_squares(predictor.windows, runs, slope, noise[:1]).mean(0)
+    errors = predictor.errors(x[None])[0]
+    got = measure.squares(errors).mean(0)
+    np.testing.assert_allclose(np.sqrt(got), np.sqrt(floor), rtol=0.08)
+    drawn = drawn_floor(predictor, runs, noise[:1])
+    np.testing.assert_allclose(np.sqrt(drawn), np.sqrt(floor), rtol=0.03)
+    residuals = make_residuals(
+        predictor.windows, runs, slope, noise[:1], np.zeros(1), np.zeros(1), np.ones(1)
+    )
+    white = residuals.whitened(residuals.grouped(errors[None]))[0]
+    assert np.mean(white**2) == pytest.approx(1.0, rel=0.15)
+    off = np.cov(white.T) - np.eye(white.shape[1])
+    assert np.abs(off).max() < 0.5
+
+
+def test_plain_errors_come_back_from_whitened_ones(
+    predictor: Predictor, runs: list[Run]
+) -> None:
+    errors = predictor.errors(predictor.neutral[None])
+    slope = start_sensitivity(
+        predictor, predictor.neutral, np.array([NOISE, 0.05]), None
+    )
+    slope = slope[:, : len(predictor.windows)]
+    r = make_residuals(
+        predictor.windows,
+        runs,
+        slope,
+        np.array([NOISE]),
+        np.zeros(1),
+        np.zeros(1),
+        np.array([0.5]),
+    )
+    grouped = r.grouped(errors)[0]
+    back = np.einsum("wij,wj->wi", r.plain, r.whitened(grouped[None])[0])
+    np.testing.assert_allclose(back, grouped[..., 0] / 0.5, atol=1e-5)
+
+
+def test_every_effect_of_the_table_moves_the_prediction(
+    model: mujoco.MjModel, predictor: Predictor, runs: list[Run]
+) -> None:
+    base = predictor.errors(predictor.neutral[None])[0]
+    found = places(model, scales_of(model, runs))
+    vectors = []
+    for place in found:
+        x = predictor.neutral.copy()
+        start = np.array(place.starts[-1])
+        index = predictor.layout.where(place)
+        size = np.array([c.size for c in place.columns])
+        x[index] = start + 5 * size * np.array(place.fitted)
+        vectors.append(x)
+    moved = predictor.errors(np.array(vectors))
+    for place, errors in zip(found, moved, strict=True):
+        assert np.abs(errors - base).max() > 1e-5, place.key
+    names = {p.effect for p in found} | {"torque_ripple"}
+    contacts = {"contact_friction", "contact_softness", "backlash"}
+    assert names | contacts == set(EFFECTS)
+
+
+def test_ripples_are_at_the_joint(model: mujoco.MjModel, runs: list[Run]) -> None:
+    (place,) = ripples(model, 0, scales_of(model, runs), [7.0])
+    assert place.key == "torque_ripple@hinge" and place.starts[0][1] == 7.0
+
+
+def test_least_squares_finds_a_bent_valley() -> None:
+    """Rosenbrock's function, and a bound that cuts its minimum off."""
+
+    def simulate(x: np.ndarray) -> np.ndarray:
+        a = 10 * (x[:, 1] - x[:, 0] ** 2)
+        return np.stack([a, 1 - x[:, 0]], -1)[:, None, :]
+
+    size = np.full(2, 1e-4)
+    free = Bounds(np.full(2, -5.0), np.full(2, 5.0), size)
+    tight = Bounds(np.full(2, -5.0), np.array([0.5, 5.0]), size)
+    start = np.array([[-1.2, 1.0], [-0.5, 0.4]])
+    one = np.ones(1)
+    best, cut, fixed = lockstep(
+        [
+            least_squares(start, [0, 1], free, one, 60),
+            least_squares(start, [0, 1], tight, one, 60),
+            least_squares(start, [], free, one),
+        ],
+        simulate,
+    )
+    assert best.cost < 1e-3
+    np.testing.assert_allclose(cut.x, [0.5, 0.25], atol=0.02)
+    np.testing.assert_array_equal(fixed.x, start[1])
+
+
+def test_outliers_weigh_less() -> None:
+    residual = np.ones((20, 5))
+    residual[3] = 50.0
+    weight = window_weights(residual)
+    assert weight[3] < 0.1 and (np.delete(weight, 3) == 1).all()
+
+
+def test_advantage_is_in_standard_errors() -> None:
+    a = np.array([1.0, 2.0, 3.0, 4.0])
+    assert advantage(a, a + np.array([0.9, 1.0, 1.1, 1.0])) > 10
+    assert advantage(a, a) == 0
+    assert advantage(a + 0.5, a) < -10
+
+
+def test_groups_average_all_steps() -> None:
+    for steps in (10, 12, 37, 200):
+        g = step_groups(steps)
+        assert len(g) <= 12
+        np.testing.assert_allclose(g.sum(1), 1.0)
+        assert ((g > 0).sum(0) == 1).all()
+
+
+def test_intervals_hold_the_gap() -> None:
+    rng = np.random.default_rng(0)
+    square = rng.chisquare(3, (60, 2))
+    scale = np.array([2.0, np.inf])
+    low, high = measure.interval(square, scale)
+    gap = float(measure.gap(square.mean(0), scale))
+    assert low < gap < high
+    assert gap == pytest.approx(np.sqrt(square[:, 0].mean()) / 2)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.024])
+def test_late_velocities_are_noticed(lag: float, model: mujoco.MjModel) -> None:
+    run = recording(model, 3, noise=1e-4)
+    true = fitted_velocity(run.qpos, DT, run.configuration)[:, 0]
+    late = np.interp(run.time - lag, run.time, true)
+    from dataclasses import replace
+
+    found = velocity_lags([replace(run, qvel=late[:, None], qvel_measured=True)])
+    if lag:
+        assert found[0] == pytest.approx(lag, abs=0.003)
+    else:
+        assert found == {}
+
+
+def test_stiffness_is_told_with_its_rest(
+    model: mujoco.MjModel, runs: list[Run]
+) -> None:
+    place = next(
+        p
+        for p in places(model, scales_of(model, runs))
+        if p.effect == "joint_stiffness"
+    )
+    told = for_people(
+        place, {"stiffness": (2.0, 0.1, "N m/rad"), "rest": (0.5, 0.0, "N m")}
+    )
+    assert told["rest"][0] == pytest.approx(0.25) and told["rest"][2] == "rad"

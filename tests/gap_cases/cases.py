@@ -1,0 +1,186 @@
+"""Makes a case: an owner's model, recordings of a machine that differs, the answer."""
+
+import json
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tests.gap_cases import strengths
+from tests.gap_cases.effects import CaseError, Effect
+from tests.gap_cases.gap import Gap
+from tests.gap_cases.logs import Log, Noise, write_csv
+from tests.gap_cases.mechanisms import Mechanism, Stated
+from tests.gap_cases.places import twins
+from tests.gap_cases.robots import build
+from tests.gap_cases.search import (
+    LEAST,
+    MOST,
+    Trial,
+    given,
+    own_numbers,
+    stronger,
+    wrong_numbers,
+)
+from tests.gap_cases.settings import Setting, settle
+
+PERFECT = 1.1
+"""Most that the owner's model may be off in a machine without effects, in floors."""
+REACHABLE = 1.15
+"""Above this share of the floor a perfect model may not count as one."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What was written, and the truth behind it."""
+
+    seed: int
+    mechanism: Mechanism
+    effects: tuple[Effect, ...]
+    own: dict[str, float]
+    noise: Noise
+    gap: Gap
+    directory: Path
+    runs: tuple[str, ...]
+
+
+def _streams(seed: int, mechanism: str) -> list[np.random.Generator]:
+    return np.random.default_rng([seed, zlib.crc32(mechanism.encode())]).spawn(4)
+
+
+def build_machine(seed: int, mechanism: str, stated: Stated) -> Mechanism:
+    """The mechanism that `make_case` begins from."""
+    return build(mechanism, _streams(seed, mechanism)[0], stated)
+
+
+def make_case(
+    seed: int,
+    mechanism: str,
+    effects: Sequence[Effect],
+    out_dir: Path,
+    *,
+    stated: Stated | None = None,
+    wrong_own: bool = False,
+    kind: str = "",
+) -> Case:
+    """Write a case into `out_dir`.
+
+    Effects that come with their main parameter keep it; the others are sized until the
+    gap is between `LEAST` and `MOST` times the floor. With `wrong_own` the model's own
+    numbers are wrong instead. Raises CaseError where this cannot be had.
+    """
+    for effect in effects:
+        if effect.name not in strengths.SIZERS:
+            raise ValueError(f"unknown effect {effect.name!r}")
+    machine = build_machine(seed, mechanism, stated or Stated())
+    rngs = _streams(seed, mechanism)
+    setting = settle(machine, rngs[1])
+    trial = Trial(setting, seed)
+    context = setting.context
+    perfect = trial.gap(trial.logs(setting.plans, [], {}), quick=True).ratio
+    if perfect > PERFECT:
+        raise CaseError(f"a perfect model is at {perfect:.2f} floors")
+    chosen = [strengths.filled(effect, rngs[2], context) for effect in effects]
+    own: dict[str, float] = {}
+    target = rngs[3].uniform(np.log(3.4), np.log(12.0 if len(chosen) < 2 else 7.0))
+    sizing = [i for i, e in enumerate(effects) if not given(e, chosen[i], context)]
+    for index in sizing:
+        alternative = stronger(chosen, index, context)
+        strength = trial.search(alternative, float(np.exp(target)))
+        chosen[index] = alternative(strength)[0][0]
+    if wrong_own:
+        alternative = wrong_numbers(setting.mechanism, rngs[2])
+        own = alternative(trial.search(alternative, float(np.exp(target))))[1]
+    logs = trial.logs(setting.plans, chosen, own)
+    gap = trial.gap(logs, chosen, own)
+    if not chosen and not wrong_own and gap.ratio > PERFECT:
+        raise CaseError(f"a perfect model is at {gap.ratio:.2f} floors")
+    if (sizing or wrong_own) and not LEAST <= gap.ratio <= MOST:
+        raise CaseError(f"over all runs the gap is {gap.ratio:.2f} floors")
+    velocities = bool(rngs[3].random() < 1 / 3)
+    runs = _write(out_dir, setting, logs, velocities)
+    case = Case(
+        seed, setting.mechanism, tuple(chosen), own, setting.noise, gap, out_dir, runs
+    )
+    answer = describe(case, kind, setting, perfect)
+    (out_dir / "answer.json").write_text(json.dumps(answer, indent=2) + "\n")
+    return case
+
+
+def _write(
+    out_dir: Path, setting: Setting, logs: Sequence[Log], velocities: bool
+) -> tuple[str, ...]:
+    out_dir.mkdir(parents=True, exist_ok=True)
+    mechanism = setting.mechanism
+    (out_dir / "model.xml").write_text(mechanism.xml())
+    joints = [joint.name for joint in mechanism.joints]
+    actuators = [mechanism.joints[i].actuator for i in mechanism.driven]
+    names = tuple(f"run{i + 1}.csv" for i in range(len(logs)))
+    for name, log in zip(names, logs, strict=True):
+        write_csv(out_dir / name, log, joints, actuators, velocities)
+    return names
+
+
+def describe(
+    case: Case, kind: str, setting: Setting, perfect: float
+) -> dict[str, object]:
+    """The sealed answer, ready for JSON."""
+    mechanism, gap = case.mechanism, case.gap
+    verdicts = ["explained"] if case.effects else ["no_gap"]
+    if any(effect.kind == "outside" for effect in case.effects):
+        verdicts = ["unexplained"]
+    elif gap.best > REACHABLE * gap.floor:
+        # Shocks between two rows: even the true model would start with a wrong speed.
+        verdicts.append("unexplained")
+    stated = own_numbers(mechanism)
+    return {
+        "seed": case.seed,
+        "kind": kind,
+        "mechanism": mechanism.name,
+        "verdicts": verdicts,
+        "effects": [
+            {
+                "effect": effect.name,
+                "at": effect.at,
+                "kind": effect.kind,
+                "parameters": strengths.reported(effect),
+                "twins": twins(mechanism, effect),
+            }
+            for effect in case.effects
+        ],
+        "own": {
+            address: {"model": stated[address], "truth": value}
+            for address, value in case.own.items()
+        },
+        "gap": {
+            "before": gap.gap,
+            "floor": gap.floor,
+            "best": gap.best,
+            "ratio": gap.ratio,
+            "perfect": perfect,
+            "windows": gap.windows,
+        },
+        "gap_si": {
+            joint.name: {
+                "unit": joint.unit,
+                "before": float(gap.rms[i]),
+                "floor": float(gap.rms_floor[i]),
+                "noise": float(case.noise.std[i]),
+                "quantum": float(case.noise.quantum[i]),
+            }
+            for i, joint in enumerate(mechanism.joints)
+        },
+        "setting": {
+            "timestep": mechanism.timestep,
+            "control_step": mechanism.control_step,
+            "truth_step": setting.fine,
+            "open_loop": mechanism.open_loop,
+            **setting.notes,
+        },
+        "runs": {
+            name: {"excitation": plan.shape, "duration": plan.duration}
+            for name, plan in zip(case.runs, setting.plans, strict=True)
+        },
+    }

@@ -1,0 +1,170 @@
+"""train.gap on a machine whose friction the model lacks, and its messages."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from easi_jax.errors import UserError
+from easi_jax.io.effects_file import effects_of, read_effects
+from tests.gap_cases import Effect, make_case
+from train import gap
+from train._command import main
+
+
+def run(*args: object) -> None:
+    main(gap.Config, gap.run, name="train.gap", args=[str(a) for a in args])
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    folder = tmp_path_factory.mktemp("case")
+    return make_case(
+        22, "pendulum", [Effect("coulomb_friction", "hinge")], folder / "data"
+    )
+
+
+@pytest.fixture(scope="module")
+def results(case: Any) -> Path:
+    data = sorted(case.directory.glob("run*.csv"))
+    out = case.directory.parent / "gap"
+    run("--model", case.directory / "model.xml", "--data", *data, "--out", out)
+    return out
+
+
+def test_friction_is_named_and_the_gap_closed(case: Any, results: Path) -> None:
+    told = json.loads((results / "gap.json").read_text())
+    assert told["schema"] == 1 and told["verdict"] == "explained"
+    (effect,) = told["effects"]
+    assert (effect["effect"], effect["at"], effect["kind"]) == (
+        "coulomb_friction",
+        "hinge",
+        "joint",
+    )
+    truth = case.effects[0].number("torque")
+    torque = effect["parameters"]["torque"]
+    assert torque["unit"] == "N m"
+    assert torque["value"] == pytest.approx(truth, rel=0.1)
+    assert 0 < torque["std"] < 0.1 * truth
+    assert effect["confidence"] > 0.5
+    figures = told["gap"]
+    assert figures["before"] > 3 * figures["floor"] > 0
+    assert figures["floor"] == pytest.approx(case.gap.floor, rel=0.3)
+    assert figures["after"] < 1.2 * figures["floor"]
+    low, high = figures["after_95"]
+    assert low < figures["after"] < high
+    assert effect["gap_after"] == pytest.approx(figures["after"])
+    si = told["gap_si"]["hinge"]
+    assert si["unit"] == "rad" and si["before"] > si["after"]
+    assert told["held_out"] and told["ignored"] == []
+    (place,) = told["where"]
+    assert place["at"] == "hinge" and place["share"] == pytest.approx(1.0)
+
+
+def test_the_repaired_model_loads_and_has_it(case: Any, results: Path) -> None:
+    told = json.loads((results / "gap.json").read_text())
+    torque = told["effects"][0]["parameters"]["torque"]["value"]
+    m = mujoco.MjModel.from_xml_path(str(results / "model.xml"))
+    old = mujoco.MjModel.from_xml_path(str(case.directory / "model.xml"))
+    added = m.dof_frictionloss[0] - old.dof_frictionloss[0]
+    assert added == pytest.approx(torque, rel=1e-3)
+    entries, own = read_effects(results / "effects.yaml")
+    np.testing.assert_allclose(effects_of(old, entries).coulomb, [torque], rtol=1e-5)
+    assert set(own) == {r["address"] for r in told["refitted"]}
+
+
+def test_the_report_says_it_in_a_sentence(results: Path) -> None:
+    text = (results / "report.html").read_text()
+    assert "dry friction that the model lacks" in text
+    assert "times the sensor noise" in text
+    assert "http://" not in text.replace("http://www.w3.org", "")
+
+
+def test_results_are_not_overwritten(
+    case: Any, results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        run(
+            *("--model", case.directory / "model.xml", "--out", results),
+            *("--data", case.directory / "run1.csv"),
+        )
+    assert stop.value.code == 2
+    assert "--overwrite" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"--model": "no.xml"}, "no such model"),
+        ({"--data": "no.csv"}, "no.csv"),
+        ({"--horizon": "-1"}, "--horizon"),
+        ({"--model": None}, "--model"),
+        ({"--held-out": "{run}"}, "leave a log to fit"),
+    ],
+)
+def test_mistakes_end_with_one_line(
+    change: dict[str, str | None],
+    text: str,
+    case: Any,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    log = str(case.directory / "run1.csv")
+    options: dict[str, str | None] = {
+        "--model": str(case.directory / "model.xml"),
+        "--data": log,
+        "--out": str(tmp_path / "out"),
+        **change,
+    }
+    args = [
+        part.replace("{run}", log)
+        for name, value in options.items()
+        if value is not None
+        for part in (name, value)
+    ]
+    with pytest.raises(SystemExit) as stop:
+        run(*args)
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert text in error and "Traceback" not in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_log_that_stands_still(
+    case: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = (case.directory / "run1.csv").read_text().splitlines()
+    head, first = lines[0], lines[1].split(",")
+    column = head.split(",").index("time")
+    still = []
+    for i in range(400):
+        row = list(first)
+        row[column] = str(0.01 * i)
+        still.append(",".join(row))
+    log = tmp_path / "still.csv"
+    log.write_text("\n".join([head, *still]) + "\n")
+    with pytest.raises(SystemExit) as stop:
+        run(
+            *("--model", case.directory / "model.xml", "--data", log),
+            *("--out", tmp_path / "out"),
+        )
+    assert stop.value.code == 2
+    assert "record larger or faster motion" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_effects_files_are_checked(tmp_path: Path) -> None:
+    path = tmp_path / "effects.yaml"
+    for text, reason in (
+        ("effects: 3", "with a list"),
+        ("effects:\n- {effect: frictoin, columns: {coulomb: 1}}", "unknown effect"),
+        ("effects:\n- {effect: coulomb_friction, columns: {culomb: 1}}", "coulomb"),
+        ("effects:\n- {effect: armature, columns: {armature: big}}", "not a number"),
+        ("effects: []\nrefitted:\n- {to: 1}", "refitted 1"),
+    ):
+        path.write_text(text)
+        with pytest.raises(UserError, match=reason):
+            read_effects(path)
