@@ -15,6 +15,8 @@ _DAMPING = (1.0, 30.0, 1000.0)
 _PAYS = 0.05  # relative gain of a round that lets slopes be followed further
 _SETTLED = 5e-3  # relative gain of a round below which a fit is done
 _HUBER = 3.0
+_DIM = 1e-2  # least curvature that damping assumes, of the largest
+_UNSEEN = 1e-7  # curvature along an entry that counts as none, of the largest
 
 Simulate = Callable[[np.ndarray], np.ndarray]
 Asks = Generator[np.ndarray, np.ndarray, "Fitted"]
@@ -146,15 +148,17 @@ def _step(
 ) -> np.ndarray:
     """A damped step; entries that would leave the bounds stop there, one by one."""
     n = len(gradient)
-    diagonal = np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-30))
-    matrix = normal + damping * np.diag(diagonal)
+    # What the data do not see stays where it is.
+    unseen = max(_UNSEEN * np.diag(normal).max(), 1e-30)
+    # Damped as if seen a little, or differences of no slope make steps of any length.
+    diagonal = np.maximum(np.diag(normal), _DIM * np.diag(normal).max())
+    matrix = normal + damping * np.diag(diagonal) + unseen * np.eye(n)
     out, free = np.zeros(n), np.ones(n, bool)
     for _ in range(n):
         if not free.any():
             break
         right = -gradient[free] - matrix[np.ix_(free, ~free)] @ out[~free]
-        inner = matrix[np.ix_(free, free)] + 1e-12 * np.diag(diagonal[free])
-        out[free] = np.linalg.solve(inner, right)
+        out[free] = np.linalg.solve(matrix[np.ix_(free, free)], right)
         over = free & ((out < low) | (out > high))
         if not over.any():
             break

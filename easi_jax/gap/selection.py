@@ -22,14 +22,15 @@ from easi_jax.gap.fit import (
 )
 from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.residuals import Residuals
-from easi_jax.gap.table import Place
+from easi_jax.gap.table import RARE, Place
 
 _SHORTLIST = 7  # names that are fitted in full at each stage
 _STARTS = 2  # of each
 _HOPELESS = 4.0  # times the best promise; beyond, only the first few are fitted
 _BLOCKS = 10  # of windows, for cross-validation
-_SURE = 2.5  # standard errors by which an effect has to help
+_SURE = 1.7  # standard errors by which an effect has to help
 _HELPS = 0.05  # share of the squared gap by which each of its numbers has to help
+_RARE = 0.1  # relative loss by which a rare effect has to be better than others
 _ALIKE = 0.02  # relative difference of losses that says nothing
 _AS_GOOD = 1.5  # standard errors within which the simpler of two candidates wins
 _NEARLY = 0.7  # share of what the best explains
@@ -237,17 +238,11 @@ class Selector:
                 best[key] = (f.cost, c.place, f)
         return [self.model([*places, p], f) for _, p, f in best.values()]
 
-    def stage(
-        self, base: Model, candidates: Sequence[Candidate]
-    ) -> tuple[Model | None, list[Model]]:
-        """The next effect, None where none helps; and all that were fitted."""
+    def expanded(self, base: Model, candidates: Sequence[Candidate]) -> list[Model]:
+        """A model with one effect more, the most promising ones, best first."""
         short = shortlist(self.screened(base, candidates))
         models = self.fitted(base.places, base.fit.x, short)
-        models.sort(key=lambda m: m.loss.mean())
-        if not models:
-            return None, []
-        good = [m for m in models if better(m, base)]
-        return (simplest(good, base) if good else None), models
+        return sorted(models, key=rank)
 
     def richer(self, model: Model, candidates: Sequence[Candidate]) -> Model:
         """The model with effects replaced by ones that contain them and do better."""
@@ -301,7 +296,8 @@ def _promised(
     r = (root * residual).reshape(-1)
     j = (root[..., None] * slope).reshape(-1, slope.shape[-1])
     normal, gradient = j.T @ j, j.T @ r
-    ridge = 1e-6 * np.diag(np.diag(normal) + 1e-30)
+    curvature = np.diag(normal)
+    ridge = 1e-6 * np.diag(curvature + curvature.max() + 1e-30)
     step = -np.linalg.solve(normal + ridge, gradient)
     return float(0.5 * r @ r + 0.5 * gradient @ step), step
 
@@ -313,14 +309,23 @@ def advantage(a: np.ndarray, b: np.ndarray) -> float:
     return float(d.mean() / max(error, 1e-12 * max(abs(b.mean()), 1e-30)))
 
 
+def rank(model: Model) -> float:
+    """Cross-validated loss, with a handicap for effects that machines rarely have."""
+    rare = sum(p.effect in RARE for p in model.places)
+    return float(model.loss.mean()) * (1.0 + _RARE * rare)
+
+
 def better(model: Model, base: Model) -> bool:
-    """Whether a model predicts better than a smaller one by more than chance, both in
-    units of the noise and in units of the gap."""
+    """Whether a model predicts better than a smaller one by more than chance.
+
+    Both in units of the noise and of the gap, and in one of them by a share that each
+    of its numbers has to earn.
+    """
     helps = _HELPS * max(1, len(model.fit.active) - len(base.fit.active))
-    return all(
-        advantage(a, b) > _SURE and b.mean() - a.mean() > helps * b.mean()
-        for a, b in ((model.loss, base.loss), (model.gap, base.gap))
-    )
+    both = ((model.loss, base.loss), (model.gap, base.gap))
+    sure = [advantage(a, b) for a, b in both]
+    gain = [1 - a.mean() / max(b.mean(), 1e-300) for a, b in both]
+    return min(sure) > _SURE and min(gain) > 0 and max(gain) > helps
 
 
 def size_of(model: Model) -> int:
@@ -348,11 +353,12 @@ def simplest(models: Sequence[Model], base: Model) -> Model:
     """
     best = models[0]
     for m in models[1:]:
-        if contains(best.places[-1], m.places[-1]):
+        kept = [p.key for p in m.places[:-1]] == [p.key for p in best.places[:-1]]
+        if kept and contains(best.places[-1], m.places[-1]):
             whole = base.loss.mean() - best.loss.mean()
             if base.loss.mean() - m.loss.mean() > _NEARLY * whole:
                 best = m
-        elif size_of(m) < size_of(best):
+        elif len(m.fit.active) < len(best.fit.active):
             close = m.loss.mean() < (1 + _HELPS) * best.loss.mean()
             if close and advantage(best.loss, m.loss) < _AS_GOOD:
                 best = m

@@ -42,6 +42,19 @@ EFFECTS = (
 )
 
 
+# Named only where they do clearly better than what most machines have.
+RARE = (
+    "stribeck_friction",
+    "quadratic_drag",
+    "joint_stiffness",
+    "torque_ripple",
+    "actuator_saturation",
+    "actuator_deadband",
+    "com_offset",
+    "gravity_tilt",
+)
+
+
 @dataclass(frozen=True)
 class Column:
     """One number of an effect.

@@ -183,6 +183,16 @@ def test_least_squares_finds_a_bent_valley() -> None:
     np.testing.assert_array_equal(fixed.x, start[1])
 
 
+def test_what_the_data_do_not_see_stays() -> None:
+    def simulate(x: np.ndarray) -> np.ndarray:
+        return (x[:, :1] - 2.0)[:, None, :] * np.ones((1, 3, 4))
+
+    bounds = Bounds(np.full(2, -5.0), np.full(2, 5.0), np.full(2, 0.1))
+    ask = least_squares(np.zeros((1, 2)), [0, 1], bounds, np.ones(3))
+    (fit,) = lockstep([ask], simulate)
+    np.testing.assert_allclose(fit.x, [2.0, 0.0], atol=1e-3)
+
+
 def test_outliers_weigh_less() -> None:
     residual = np.ones((20, 5))
     residual[3] = 50.0
