@@ -106,4 +106,7 @@ def _model(text: str) -> tuple[str, Path | None, Any]:
         env = make(text)
         return text, None, env.mj_model
     path = Path(text)
-    return path.stem, path, load_model(path)
+    mj_model = load_model(path)
+    # The first of the model's names is its own.
+    name = mj_model.names.split(b"\0", 1)[0].decode()
+    return name or path.stem, path, mj_model

@@ -20,9 +20,9 @@ _WORDS = {
     "actuator_lag": 'actuator "{at}" responds with a time constant of {time_constant}',
     "actuator_saturation": 'actuator "{at}" gives no more than {limit}',
     "actuator_deadband": 'actuator "{at}" ignores commands below {width}',
-    "payload_mass": 'body "{at}" is {mass} heavier',
+    "payload_mass": 'body "{at}" carries {mass} more',
     "com_offset": 'the mass of body "{at}" sits elsewhere',
-    "gravity_tilt": "the base is not level (roll {roll}, pitch {pitch})",
+    "gravity_tilt": "the base is tilted (roll {roll}, pitch {pitch})",
     "sensor_bias": 'the reading of joint "{at}" is off by {bias}',
     "sensor_delay": 'the reading of "{at}" comes {delay} late',
     "contact_friction": "contacts have {friction} times the model's sliding friction",
@@ -178,9 +178,10 @@ def _report(
         )
     gap = o.refit.gap
     for f in o.found:
+        said = sentence(f)
         lines.append(
-            f"{sentence(f).capitalize()} that the model lacks (confidence "
-            f"{f.confidence:.2f}); with it the {config.horizon:g} s prediction error "
+            f"{said[0].upper()}{said[1:]}, which the model lacks (confidence "
+            f"{f.confidence:.2f}). With it the {config.horizon:g} s prediction error "
             f"falls from {gap / o.floor:.3g} to {f.gap_after / o.floor:.3g} times the "
             "sensor noise."
         )
@@ -251,7 +252,7 @@ def _report(
                         f"{k} {v:.4g} ± {s:.2g} {u}"
                         for k, (v, s, u) in f.values.items()
                     ),
-                    f.confidence,
+                    f"{f.confidence:.2f}",
                     ", ".join(f.indistinguishable) or "none",
                 )
                 for f in o.found

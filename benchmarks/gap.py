@@ -1,0 +1,135 @@
+"""Whether the gap workflow names hidden effects: many cases, made by separate physics.
+
+    python -m benchmarks.gap --kind single --seeds 0 60 --cheap
+
+Cases come from ``tests/gap_cases``; the workflow sees ``model.xml`` and the runs, the
+grader below alone sees the answer. One line a case is added to ``gap_cases.jsonl``;
+cases that are there already are left out, so a run that was stopped goes on.
+"""
+
+import dataclasses
+import json
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from train._command import main, say
+
+RESULTS = Path(__file__).parent / "results"
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Runs train.gap on generated cases and grades its names."""
+
+    kind: str = "single"
+    """single, pair, none, wrong_own or outside."""
+    seeds: tuple[int, int] = (0, 10)
+    """First seed, and the one after the last."""
+    cheap: bool = False
+    """Mechanisms of one or two joints only."""
+    out: Path = RESULTS / "gap_cases.jsonl"
+    """Where a line for each case is added."""
+
+
+def run(config: Config) -> None:
+    """Makes, runs and grades each case."""
+    from benchmarks._common import command_of
+    from easi_jax.io.versions import versions
+    from tests.gap_cases import CaseError, draw_case
+
+    done = set()
+    if config.out.exists():
+        rows = [json.loads(line) for line in config.out.read_text().splitlines()]
+        done = {(r["kind"], r["seed"], r["cheap"]) for r in rows}
+    commit = versions()["commit"]
+    for seed in range(*config.seeds):
+        if (config.kind, seed, config.cheap) in done:
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            data = Path(folder) / "case"
+            try:
+                draw_case(seed, config.kind, data, cheap=config.cheap)
+            except CaseError as error:
+                say(f"{config.kind} {seed}: no case ({error})")
+                continue
+            row = _solved(data, Path(folder) / "gap")
+        row = {
+            "kind": config.kind,
+            "seed": seed,
+            "cheap": config.cheap,
+            **row,
+            "commit": commit,
+            "command": command_of("benchmarks.gap", config),
+        }
+        with config.out.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        truth, named = (", ".join(row[k]) or "-" for k in ("truth", "named"))
+        say(
+            f"{config.kind} {seed}: {row['mechanism']}, {truth} -> {named} "
+            f"({row['verdict']}), {'right' if row['right'] else 'WRONG'}, "
+            f"{row['seconds']:.0f} s"
+        )
+
+
+def _solved(data: Path, out: Path) -> dict[str, Any]:
+    from train import gap
+
+    began = time.perf_counter()
+    gap.run(
+        gap.Config(
+            model=str(data / "model.xml"),
+            data=tuple(sorted(data.glob("run*.csv"))),
+            out=out,
+        )
+    )
+    seconds = time.perf_counter() - began
+    told = json.loads((out / "gap.json").read_text())
+    answer = json.loads((data / "answer.json").read_text())
+    return {**graded(told, answer), "seconds": seconds}
+
+
+def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
+    """What is right in a ``gap.json``, by the answer of the case.
+
+    A name is right where it is the truth's, or an exact twin of it by physics; the
+    first names have to be the truth's, in any order.
+    """
+    truth = {f"{e['effect']}@{e['at']}": set(e["twins"]) for e in answer["effects"]}
+    outside = answer["kind"] == "outside"
+    named = [f"{e['effect']}@{e['at']}" for e in told["effects"]]
+    first = named[: max(1, len(truth))]
+    found = {
+        key: any(n == key or n in twins for n in first) for key, twins in truth.items()
+    }
+    listed = {
+        key: any(key in e["indistinguishable"] for e in told["effects"])
+        for key in truth
+    }
+    if outside:
+        right = told["verdict"] == "unexplained"
+    elif truth:
+        right = all(found.values())
+    else:
+        right = not named
+    return {
+        "mechanism": answer["mechanism"],
+        "truth": list(truth),
+        "named": named,
+        "confidence": [e["confidence"] for e in told["effects"]],
+        "listed": listed,
+        "verdict": told["verdict"],
+        "verdicts": answer["verdicts"],
+        "right": right,
+        "parameters": [
+            {k: v["value"] for k, v in e["parameters"].items()} for e in told["effects"]
+        ],
+        "true_parameters": [e["parameters"] for e in answer["effects"]],
+        "gap": told["gap"],
+        "true_floor": answer["gap"]["floor"],
+    }
+
+
+if __name__ == "__main__":
+    main(Config, run, name="benchmarks.gap")
