@@ -17,6 +17,7 @@ from jax.sharding import Mesh
 from easi_jax import discriminator as critic
 from easi_jax import replay
 from easi_jax.distribution import gaussian
+from easi_jax.errors import UserError
 from easi_jax.machine import Machine
 from easi_jax.mesh import make_mesh, sharded_map
 from easi_jax.rollout import policy_rollout
@@ -111,6 +112,8 @@ class Search:
         trainer: Callable[..., Any] | None = None,
         mesh: Mesh | None = None,
     ) -> None:
+        if not machine.space.size:
+            raise UserError("no parameters to search for: name at least one")
         if config.source == "policy" and (env is None or act is None):
             raise ValueError('source="policy" needs env and act')
         if config.policy_updates_per_generation and trainer is None:

@@ -25,8 +25,8 @@ _WORDS = {
     "gravity_tilt": "the base is tilted (roll {roll}, pitch {pitch})",
     "sensor_bias": 'the reading of joint "{at}" is off by {bias}',
     "sensor_delay": 'the reading of "{at}" comes {delay} late',
-    "contact_friction": "contacts have {friction} times the model's sliding friction",
-    "contact_softness": "contacts have {stiffness} times the model's stiffness",
+    "contact_friction": "contacts have a sliding friction of {friction}",
+    "contact_softness": "contacts have a stiffness of {stiffness}",
 }
 
 

@@ -447,7 +447,11 @@ class Analysis:
         for i, c in zip(index, place.columns, strict=True):
             if c.parameter:
                 std = deviation[active.index(int(i))] if int(i) in active else 0.0
-                got[c.parameter] = (float(model.fit.x[i]), float(std), c.unit)
+                got[c.parameter] = (
+                    c.of * float(model.fit.x[i]),
+                    c.of * float(std),
+                    c.unit,
+                )
         return for_people(place, got)
 
     def refitted(self, base: Model, model: Model) -> list[dict]:

@@ -16,6 +16,7 @@ import numpy as np
 from easi_jax import effects
 from easi_jax.effects import Effects
 from easi_jax.errors import UserError
+from easi_jax.quantities import direct_solref
 
 EFFECTS = (
     "coulomb_friction",
@@ -67,6 +68,7 @@ class Column:
         neutral: its value in a model without the effect.
         low, high: bounds.
         size: a small but visible change, for finite differences.
+        of: what people are told is the value times this.
     """
 
     field: str
@@ -77,6 +79,7 @@ class Column:
     low: float
     high: float
     size: float
+    of: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -186,12 +189,17 @@ def places(m: mujoco.MjModel, s: Scales) -> list[Place]:
             )
         )
     if _contacts(m):
+        slides, stiff, damped = _contact(m)
         out.append(
             Place(
                 "contact_friction",
                 "",
                 "model",
-                (Column("friction", (), "friction", "1", 1.0, 0.05, 10.0, 0.05),),
+                (
+                    Column(
+                        "friction", (), "friction", "1", 1.0, 0.05, 10.0, 0.05, slides
+                    ),
+                ),
                 ((0.6,), (1.6,)),
             )
         )
@@ -201,8 +209,14 @@ def places(m: mujoco.MjModel, s: Scales) -> list[Place]:
                 "",
                 "model",
                 (
-                    Column("softness", (0,), "stiffness", "1", 1.0, 1e-3, 50.0, 0.05),
-                    Column("softness", (1,), "damping", "1", 1.0, 1e-2, 50.0, 0.05),
+                    Column(
+                        *("softness", (0,), "stiffness", "1/s2"),
+                        *(1.0, 1e-3, 50.0, 0.05, stiff),
+                    ),
+                    Column(
+                        *("softness", (1,), "damping", "1/s"),
+                        *(1.0, 1e-2, 50.0, 0.05, damped),
+                    ),
                 ),
                 ((0.3, 0.5), (0.1, 0.3)),
             )
@@ -216,6 +230,17 @@ def _moves(m: mujoco.MjModel, b: int) -> bool:
             return True
         b = int(m.body_parentid[b])
     return False
+
+
+def _contact(m: mujoco.MjModel) -> tuple[float, float, float]:
+    """Sliding friction, stiffness [1/s^2] and damping [1/s] of the model's contacts."""
+    if m.npair:
+        friction, solref = m.pair_friction[:, 0], m.pair_solref
+    else:
+        solid = (m.geom_contype > 0) | (m.geom_conaffinity > 0)
+        friction, solref = m.geom_friction[solid, 0], m.geom_solref[solid]
+    stiffness, damping = np.mean([direct_solref(m, s) for s in solref], axis=0)
+    return float(friction.max()), float(stiffness), float(damping)
 
 
 def _contacts(m: mujoco.MjModel) -> bool:

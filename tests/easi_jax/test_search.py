@@ -369,3 +369,9 @@ def test_cartpole_is_found_from_a_start_that_excludes_it() -> None:
     found = np.asarray(search.space.to_si(state.mean))
     assert int(info.non_finite.sum()) == 0
     assert found[0] == pytest.approx(20.0, rel=0.05)
+
+
+def test_a_search_needs_parameters() -> None:
+    machine = Cartpole().machine.rebuilt(space=ParameterSpace(()))
+    with pytest.raises(UserError, match="name at least one"):
+        Search(machine, SearchConfig())
