@@ -52,7 +52,7 @@ PRESETS: dict[str, dict[str, TrainingConfig]] = {
         "ppo": replace(
             _PPO,
             hidden=(128, 128),
-            env_steps=20_000_000,
+            env_steps=8_000_000,
             minibatches=8,
             discount=0.97,
             entropy_cost=5e-3,
