@@ -2,10 +2,24 @@
 
 import dataclasses
 import time
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 RESULTS = Path(__file__).parent / "results"
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A Markdown table; rows that are too short are filled up."""
+    lines = [
+        "| " + " | ".join(head) + " |",
+        "| " + " | ".join("---" for _ in head) + " |",
+    ]
+    lines += [
+        "| " + " | ".join(str(c) for c in (*row, *[""] * (len(head) - len(row)))) + " |"
+        for row in rows
+    ]
+    return "\n".join(lines)
 
 
 def command_of(module: str, config: Any) -> str:

@@ -8,11 +8,11 @@ A result that was not run is named as not run.
 
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks._common import RESULTS
+from benchmarks import gap_summary
+from benchmarks._common import RESULTS, markdown_table
 from benchmarks.physics import GOALS
 from benchmarks.recovery import CASES
 from benchmarks.robots import STARTS
@@ -35,7 +35,10 @@ def run(config: Config) -> None:
     from easi_jax.io.files import atomic_write
 
     parts = ["# Results", "Made by `python -m benchmarks.summary` from the files here."]
-    for section in (_speed, _physics, _robots, _policies, _recovery, _transfer, _real):
+    for section in (
+        *(_speed, _physics, _robots, _policies, _recovery, _transfer, _real),
+        *(gap_summary.generated, gap_summary.real),
+    ):
         parts += section(config.results)
     path = config.results / "README.md"
     atomic_write(path, "\n\n".join(parts) + "\n")
@@ -47,18 +50,6 @@ def _read(folder: Path, name: str) -> Any:
 
     path = folder / f"{name}.json"
     return read_json(path) if path.is_file() else None
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    lines = [
-        "| " + " | ".join(head) + " |",
-        "| " + " | ".join("---" for _ in head) + " |",
-    ]
-    lines += [
-        "| " + " | ".join(str(c) for c in (*row, *[""] * (len(head) - len(row)))) + " |"
-        for row in rows
-    ]
-    return "\n".join(lines)
 
 
 def _percent(log_ratio: float) -> str:
@@ -107,7 +98,7 @@ def _speed(folder: Path) -> list[str]:
     return [
         "## Speed",
         f"`{r['command']}`",
-        _table(("figure", "measured", "goal", ""), rows),
+        markdown_table(("figure", "measured", "goal", ""), rows),
     ]
 
 
@@ -146,11 +137,11 @@ def _physics(folder: Path) -> list[str]:
         "`python -m benchmarks.physics`: a population of 300, each a model of its own, "
         "against `mujoco.rollout` on the same cores; medians, all timings in the "
         "files.",
-        _table(
+        markdown_table(
             ("robot", "steps/s", "native", "ratio", "goal", "trace and compile"), rows
         ),
         "Other ways to run a step that were tried (ratio to native):",
-        _table(("robot", "step", "ratio", "trace and compile"), tried),
+        markdown_table(("robot", "step", "ratio", "trace and compile"), tried),
     ]
 
 
@@ -184,7 +175,7 @@ def _robots(folder: Path) -> list[str]:
             *("robot", "generations x individuals x control steps", "search", "goal"),
             *("trace and compile", "peak GiB"),
         )
-        out.append(_table(head, rows))
+        out.append(markdown_table(head, rows))
     rows = []
     for path in sorted(folder.glob("memory_*.json")):
         r = _read(folder, path.stem)
@@ -193,7 +184,7 @@ def _robots(folder: Path) -> list[str]:
         rows.append((label, r["what"], f"{r['peak_gib']:.1f}", ok))
     if rows:
         out.append("`python -m benchmarks.robots --udr RUN --part memory`")
-        out.append(_table(("robot", "run", "peak GiB", "goal 8"), rows))
+        out.append(markdown_table(("robot", "run", "peak GiB", "goal 8"), rows))
     rows, said, missing = [], [], []
     for name in ROBOTS:
         for start in STARTS:
@@ -241,7 +232,7 @@ def _robots(folder: Path) -> list[str]:
             "`low` start at 2 to 4 and 0.05 to 0.5 times the truth. What the data can "
             "know to 2 % is read from their Fisher information."
         )
-        out += [_table(head, rows), "\n".join(said)]
+        out += [markdown_table(head, rows), "\n".join(said)]
     if missing:
         out.append(f"Not run: {', '.join(missing)}.")
     return out
@@ -286,9 +277,9 @@ def _policies(folder: Path) -> list[str]:
         "robot. The curves are in the files."
     )
     columns = ("robot", "trained", "algorithm, steps", "minutes", "allowed", "returns")
-    out.append(_table(columns, rows))
+    out.append(markdown_table(columns, rows))
     if speeds:
-        out += ["Speed of Go2 at forward commands:", _table(head, speeds)]
+        out += ["Speed of Go2 at forward commands:", markdown_table(head, speeds)]
     return out
 
 
@@ -347,14 +338,14 @@ def _recovery(folder: Path) -> list[str]:
             "the motion:"
         )
         head = ("case", "method", "seeds", "one step", "open loop 0.2 s")
-        out.append(_table(head, errors))
+        out.append(markdown_table(head, errors))
     if found:
         out.append(
             "Parameters whose Cramer-Rao standard deviation is below 2 %: error in %, "
             "median (worst) over seeds. Goal: 5 (15), from starts that exclude the "
             "truth 10 in the median."
         )
-        out.append(_table(("case", "method", "parameters", ""), found))
+        out.append(markdown_table(("case", "method", "parameters", ""), found))
     return out
 
 
@@ -394,7 +385,7 @@ def _transfer(folder: Path) -> list[str]:
             "share closed",
             "goal 0.9",
         )
-        out.append(_table(head, rows))
+        out.append(markdown_table(head, rows))
     if any("_joint" in str(row[0]) for row in rows):
         out.append(
             "`_jointN`: the policy goes on training inside the search, N steps of all "
@@ -425,7 +416,7 @@ def _real(folder: Path) -> list[str]:
         f"`{r['command']}`: {r['measure']} (m, rad), median over seeds.",
     ]
     out.append(
-        _table(
+        markdown_table(
             (
                 "measure",
                 "recordings",

@@ -1,23 +1,30 @@
 """The address language: text that names a quantity at one or more places of a model.
 
     joint.NAME.damping     actuator.leg_*.kp     body.torso.mass     option.gravity
+    effect.coulomb.NAME    effect.com.torso.0    effect.tilt.0
 
 ``*`` matches any run of characters, so that one parameter can be tied to many places.
-Names may contain dots. `resolve` checks addresses against a model and returns what
-`easi_jax.model` writes; `open_gates` prepares an `MjModel` so that MJX obeys.
+Names may contain dots. What ``effect.`` names lies beyond the model
+(`easi_jax.effects`): its FIELD, its place, and the entry of a vector. `resolve` checks
+addresses against a model and returns what `easi_jax.model` writes; `open_gates`
+prepares an `MjModel` so that MJX obeys.
 """
 
 import copy
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
 from mujoco.mjx._src.collision_driver import geom_pairs
 
+from easi_jax.effect_quantities import EFFECT_TABLE, VECTORS
 from easi_jax.errors import UserError, nearest
-from easi_jax.quantities import TABLE, Entry, Inert, Quantity, direct_solref, value_of
+from easi_jax.quantities import TABLE as MODEL_TABLE
+from easi_jax.quantities import Entry, Inert, Quantity, direct_solref, value_of
+
+TABLE: Mapping[str, Mapping[str, Quantity]] = {**MODEL_TABLE, "effect": EFFECT_TABLE}
 
 _OBJECTS = {
     "joint": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
@@ -33,8 +40,8 @@ class Writer:
 
     Attributes:
         parameter: index into theta.
-        kind, quantity: the row of `quantities.TABLE`.
-        id: joint, actuator, body or geom; 0 for options.
+        kind, quantity: the row of `TABLE`.
+        id: joint, actuator, body or geom; 0 for options and whole models.
         entries: the numbers to set.
     """
 
@@ -62,7 +69,8 @@ def names(m: mujoco.MjModel, kind: str) -> dict[str, int]:
 
 
 def split(address: str) -> tuple[str, str, str]:
-    """Returns (kind, name, quantity); the name of an option is empty.
+    """Returns (kind, name, quantity); the name of an option is empty, the quantity of
+    an effect is its field, with the entry of a vector (``com.0``).
 
     Raises:
         UserError: not of the form ``kind.NAME.quantity``, unknown kind or quantity.
@@ -75,6 +83,11 @@ def split(address: str) -> tuple[str, str, str]:
         )
     if kind == "option":
         name, quantity = "", rest
+    elif kind == "effect":
+        quantity, _, name = rest.partition(".")
+        if quantity in VECTORS:
+            name, _, part = name.rpartition(".")
+            quantity = f"{quantity}.{part}"
     else:
         name, dot, quantity = rest.rpartition(".")
         if not dot or not name:
@@ -102,10 +115,13 @@ def places(m: mujoco.MjModel, address: str) -> tuple[tuple[str, str, int], ...]:
     """
     kind, name, quantity = split(address)
     row = TABLE[kind][quantity]
-    if kind == "option":
+    at = EFFECT_TABLE[quantity].on if kind == "effect" else kind
+    if at in ("option", "model"):
+        if name:
+            raise UserError(f'address "{address}": it is of the whole model, no name')
         _may_vary(address, "the model", row.refuse(m, 0))
         return ((kind, quantity, 0),)
-    known = names(m, kind)
+    known = names(m, at)
     if name in known:
         ids, pattern = [known[name]], False
     else:
@@ -115,7 +131,7 @@ def places(m: mujoco.MjModel, address: str) -> tuple[tuple[str, str, int], ...]:
     if not ids:
         what = "matches no" if pattern else "names no"
         raise UserError(
-            f'address "{address}" {what} {kind} of the model (known: '
+            f'address "{address}" {what} {at} of the model (known: '
             f"{', '.join(known) or 'none has a name'}){nearest(name, known)}"
         )
     found = []
@@ -125,7 +141,7 @@ def places(m: mujoco.MjModel, address: str) -> tuple[tuple[str, str, int], ...]:
         if reason is None:
             found.append((kind, quantity, i))
         elif not (pattern and isinstance(reason, Inert)):
-            _may_vary(address, f'{kind} "{_name(m, kind, i)}"', reason)
+            _may_vary(address, f'{at} "{_name(m, at, i)}"', reason)
     if not found:
         raise UserError(f'address "{address}" has no effect at any place: {reason}')
     return tuple(found)
@@ -206,7 +222,7 @@ def _check_dominated(m: mujoco.MjModel, writers: Sequence[Writer]) -> None:
 
 
 def _check_springs(m: mujoco.MjModel, writers: Sequence[Writer]) -> None:
-    stiff = {w.id for w in writers if w.quantity == "stiffness"}
+    stiff = {w.id for w in writers if (w.kind, w.quantity) == ("joint", "stiffness")}
     for w in writers:
         if (
             w.quantity == "springref"
@@ -288,7 +304,10 @@ def nominal(m: mujoco.MjModel, addresses: Iterable[str]) -> float:
     values = []
     for w in resolve(m, (addresses,)):
         read = w.row.read
-        values += [read(m, w.id)] if read else [value_of(m, e) for e in w.entries]
+        if w.kind == "effect":
+            values.append(EFFECT_TABLE[w.quantity].neutral)
+        else:
+            values += [read(m, w.id)] if read else [value_of(m, e) for e in w.entries]
     shown = ", ".join(addresses)
     if any(math.isnan(v) for v in values):
         raise UserError(f"{shown}: the model's force range is not symmetric")

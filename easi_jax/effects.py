@@ -7,7 +7,7 @@ each physics step (`in_step`) and on the way of a command to its actuator (`comm
 Names and meanings: `easi_jax.gap.table`.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import flax.struct
 import jax
@@ -16,6 +16,8 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from easi_jax import backlash
+from easi_jax.backlash import Rotor
 from easi_jax.constants import set_const
 
 _NO_LIMIT = 1e9
@@ -50,11 +52,17 @@ class Effects:
             like the body's own, ``(nbody,)``.
         com: shift of the center of mass in the body's frame, ``(nbody, 3)``.
         force: on the body's center of mass, world frame, ``(nbody, 3)``.
+        resistance: force on the body's center of mass per squared speed, against it,
+            ``(nbody,)``.
         tilt: roll and pitch of the base, ``(2,)`` [rad].
         friction: factor on every contact's sliding friction, ``()``.
         softness: factors on stiffness and damping of every contact, ``(2,)``.
         bias: reading less truth, ``(nv,)``.
         late: how late a reading is, ``(nv,)`` [s].
+        width: total play between a drive and its joint, ``(nv,)``.
+        rotor: inertia of the drive's side, part of the joint's, ``(nv,)``.
+        felt: inertia that a torque at the joint alone meets, ``(nv,)``; no effect, but
+            what `backlash` goes by.
     """
 
     coulomb: jax.Array
@@ -79,11 +87,19 @@ class Effects:
     spread: jax.Array
     com: jax.Array
     force: jax.Array
+    resistance: jax.Array
     tilt: jax.Array
     friction: jax.Array
     softness: jax.Array
     bias: jax.Array
     late: jax.Array
+    width: jax.Array
+    rotor: jax.Array
+    felt: jax.Array
+
+    if TYPE_CHECKING:  # made by flax
+
+        def replace(self, **changes: Any) -> "Effects": ...
 
 
 @flax.struct.dataclass
@@ -128,50 +144,95 @@ def none(m: mujoco.MjModel) -> Effects:
         spread=body,
         com=jnp.zeros((m.nbody, 3)),
         force=jnp.zeros((m.nbody, 3)),
+        resistance=body,
         tilt=jnp.zeros(2),
         friction=ones(()),
         softness=ones(2),
         bias=dof,
         late=dof,
+        width=dof,
+        rotor=dof,
+        felt=jnp.asarray(backlash.felt_inertia(m), jnp.float32),
     )
 
 
-def with_effects(m: mjx.Model, e: Effects) -> mjx.Model:
+_STATIC = (
+    *("mass", "spread", "com", "armature", "limit", "gain", "tilt", "friction"),
+    "softness",
+)
+_ON_COMMANDS = ("delay", "lag", "deadband", "jump")
+
+
+def acts(present: tuple[str, ...] | None) -> bool:
+    """Whether some of these fields (None: all) act in the steps themselves."""
+    return present is None or any(name not in _STATIC for name in present)
+
+
+def remembers(present: tuple[str, ...] | None) -> bool:
+    """Whether some of these fields (None: all) lie on the way of a command."""
+    return present is None or any(name in _ON_COMMANDS for name in present)
+
+
+def turns(present: tuple[str, ...] | None) -> bool:
+    """Whether drives may have play."""
+    return present is None or "width" in present
+
+
+def resists(present: tuple[str, ...] | None) -> bool:
+    """Whether bodies may have drag."""
+    return present is None or "resistance" in present
+
+
+def with_effects(
+    m: mjx.Model, e: Effects, present: tuple[str, ...] | None = None
+) -> mjx.Model:
     """The model with all static effects; pure.
 
-    The model must have been put with force limits on, and contacts in direct form
-    where ``softness`` varies.
+    The model must have been put with force limits on where ``limit`` varies, and
+    contacts in direct form where ``softness`` does.
+
+    Args:
+        present: fields that may differ from none; None: any of them.
     """
-    mass = m.body_mass + e.mass
-    share = jnp.where(
-        m.body_mass > 0, e.mass / jnp.where(m.body_mass > 0, m.body_mass, 1.0), 0.0
-    )
-    inertia = m.body_inertia * (1.0 + e.spread * share)[:, None]
-    limit = e.limit
-    edge = m.actuator_forcerange
-    m = m.tree_replace(
-        {
-            "body_mass": mass,
-            "body_inertia": inertia,
-            "body_ipos": m.body_ipos + e.com,
-            "dof_armature": m.dof_armature + e.armature,
-            "actuator_forcerange": jnp.stack(
-                [jnp.maximum(edge[:, 0], -limit), jnp.minimum(edge[:, 1], limit)], 1
-            ),
-            # Not on the command itself, which MuJoCo clips to its range.
-            "actuator_gainprm": m.actuator_gainprm.at[:, :3].multiply(e.gain[:, None]),
-            "opt.gravity": tilted(m.opt.gravity, e.tilt),
-        }
-    )
-    friction = m.geom_friction.at[:, 0].multiply(e.friction)
-    m = m.replace(geom_friction=friction)
-    if m.npair:
-        m = m.replace(
-            pair_friction=m.pair_friction.at[:, :2].multiply(e.friction),
-            pair_solref=_softened(m.pair_solref, e.softness),
-        )
-    m = m.replace(geom_solref=_softened(m.geom_solref, e.softness))
-    return set_const(m)
+
+    def on(*names: str) -> bool:
+        return present is None or any(name in present for name in names)
+
+    new: dict[str, Any] = {}
+    if on("mass", "spread"):
+        mass = m.body_mass
+        share = jnp.where(mass > 0, e.mass / jnp.where(mass > 0, mass, 1.0), 0.0)
+        new["body_mass"] = mass + e.mass
+        new["body_inertia"] = m.body_inertia * (1.0 + e.spread * share)[:, None]
+    if on("com"):
+        new["body_ipos"] = m.body_ipos + e.com
+    if on("armature", "width"):
+        new["dof_armature"] = m.dof_armature + e.armature - _apart(e)
+    if on("limit"):
+        low, high = m.actuator_forcerange[:, 0], m.actuator_forcerange[:, 1]
+        edge = jnp.maximum(low, -e.limit), jnp.minimum(high, e.limit)
+        new["actuator_forcerange"] = jnp.stack(edge, 1)
+    if on("gain"):
+        # Not on the command itself, which MuJoCo clips to its range.
+        scaled = m.actuator_gainprm.at[:, :3].multiply(e.gain[:, None])
+        new["actuator_gainprm"] = scaled
+    if on("tilt"):
+        new["opt.gravity"] = tilted(m.opt.gravity, e.tilt)
+    if on("friction"):
+        new["geom_friction"] = m.geom_friction.at[:, 0].multiply(e.friction)
+        if m.npair:
+            new["pair_friction"] = m.pair_friction.at[:, :2].multiply(e.friction)
+    if on("softness"):
+        new["geom_solref"] = _softened(m.geom_solref, e.softness)
+        if m.npair:
+            new["pair_solref"] = _softened(m.pair_solref, e.softness)
+    m = m.tree_replace(new)
+    return set_const(m) if on("mass", "com", "armature", "width") else m
+
+
+def _apart(e: Effects) -> jax.Array:
+    """Inertia of drives with play, ``(nv,)``."""
+    return jnp.where(e.width > 0, e.rotor, 0.0)
 
 
 def _softened(solref: jax.Array, factors: jax.Array) -> jax.Array:
@@ -190,14 +251,20 @@ def tilted(gravity: jax.Array, tilt: jax.Array) -> jax.Array:
 
 
 def in_step(
-    m: mjx.Model, d: mjx.Data, e: Effects, scalar: tuple[tuple[int, int], ...]
-) -> tuple[mjx.Model, mjx.Data]:
-    """Model and data of one physics step.
+    m: mjx.Model,
+    d: mjx.Data,
+    e: Effects,
+    scalar: tuple[tuple[int, int], ...],
+    rotor: Any,
+) -> tuple[mjx.Model, mjx.Data, Any]:
+    """Model, data and drives with play of one physics step.
 
     Args:
+        d: before `forward`.
         scalar: places in ``qpos`` and ``qvel`` of the hinges and slides.
+        rotor: drives before the step (`backlash.Rotor`); empty where none has play.
     """
-    at, dof = (np.array(x, int) for x in zip(*scalar, strict=True))
+    at, dof = np.array(scalar, int).reshape(-1, 2).T
     v = d.qvel
     fall = jnp.exp(-jnp.square(v / e.stribeck))
     m = m.replace(
@@ -209,9 +276,38 @@ def in_step(
     torque = e.constant + e.spring - e.stiffness * q
     torque += e.ripple * jnp.sin(e.cycles * q + e.phase)
     force = jnp.concatenate([e.force, jnp.zeros_like(e.force)], 1)
-    return m, d.replace(
+    drives = backlash.geared(m)
+    if drives and isinstance(rotor, Rotor):
+        load = jnp.maximum(e.felt + e.armature - e.rotor, 0.05 * e.felt)
+        u = backlash.sent(m, d.ctrl, d.act)
+        rotor = backlash.pushes(
+            *(m, drives, rotor, e.width, e.rotor, load, (q, v), u, m.opt.timestep)
+        )
+        m, torque = _driven(m, e, drives), torque + rotor.push
+    d = d.replace(
         qfrc_applied=d.qfrc_applied + torque, xfrc_applied=d.xfrc_applied + force
     )
+    return m, d, rotor
+
+
+def _driven(m: mjx.Model, e: Effects, drives: dict[int, list[int]]) -> mjx.Model:
+    """The model without the actuators that push on rotors."""
+    left = jnp.ones(m.nu)
+    for dof, acts in drives.items():
+        left = left.at[np.array(acts)].set(jnp.where(e.width[dof] > 0, 0.0, 1.0))
+    return m.replace(
+        actuator_gainprm=m.actuator_gainprm * left[:, None],
+        actuator_biasprm=m.actuator_biasprm * left[:, None],
+    )
+
+
+def body_resistance(m: mjx.Model, d: mjx.Data, e: Effects) -> mjx.Data:
+    """Data with the quadratic drag of bodies, after `fwd_velocity`."""
+    arm = d.xipos - d.subtree_com[np.asarray(m.body_rootid)]
+    v = d.cvel[:, 3:] + jnp.cross(d.cvel[:, :3], arm)
+    speed = jnp.sqrt(jnp.sum(v * v, 1) + 1e-12)
+    force = -(e.resistance * speed)[:, None] * v
+    return d.replace(xfrc_applied=d.xfrc_applied.at[:, :3].add(force))
 
 
 def first_memory(steps: int, nu: int) -> CommandMemory:
@@ -239,27 +335,83 @@ def commands(
     n, nu = memory.past.shape
     past = jnp.where(memory.known, memory.past, ctrl)
     line = jnp.concatenate([past, ctrl[None]])  # row n is now
-    h = dt / substeps
-    start = np.arange(substeps)[:, None] / substeps - e.delay / dt  # (substeps, nu)
-    start = jnp.clip(start, -float(n) + 1, 1.0)
-    whole = jnp.floor(start)
-    old = jnp.clip((whole + 1 - start) * substeps, 0.0, 1.0)
-    row = whole.astype(jnp.int32) + n
+    whole, old = _late(e, n, dt, substeps)
     column = jnp.arange(nu)
-    u = old * line[row, column]
-    u += (1 - old) * line[jnp.minimum(row + 1, n), column]
-    size = jnp.maximum(jnp.abs(u) - e.deadband, 0.0)
-    size = jnp.where(size > 0, size + e.jump * e.deadband, 0.0)
-    u = jnp.where(e.deadband > 0, jnp.sign(u) * size, u)
-    tau = jnp.maximum(e.lag, _TINY)
-    left = jnp.exp(-h / tau)
-    mean = tau / h * (1 - left)
+    u = old * line[whole + n, column]
+    u += (1 - old) * line[jnp.minimum(whole + 1 + n, n), column]
+    u = _beyond_deadband(e, u)
     response = jnp.where(memory.known, memory.response, u[0])
     out = []
     for i in range(substeps):
-        out.append(u[i] + (response - u[i]) * mean)
-        response = u[i] + (response - u[i]) * left
+        arrived, response = _lagging(e, response, u[i], dt / substeps)
+        out.append(arrived)
     return jnp.stack(out), CommandMemory(line[1:], response, jnp.ones((), bool))
+
+
+def command_sequence(
+    e: Effects, ctrl: jax.Array, steps: int, dt: float, substeps: int
+) -> jax.Array:
+    """What arrives in each physics step of many control steps, ``(T, substeps, nu)``.
+
+    As `commands` step by step, with all commands known.
+
+    Args:
+        ctrl: sent at the start of each step, ``(T, nu)``.
+        steps: control steps that a command can be late.
+    """
+    t, nu = ctrl.shape
+    whole, old = _late(e, steps, dt, substeps)
+    row = jnp.arange(t)[:, None, None] + whole
+    column = jnp.arange(nu)
+    before = ctrl[jnp.maximum(row, 0), column]
+    after = ctrl[jnp.clip(row + 1, 0, jnp.arange(t)[:, None, None]), column]
+    u = _beyond_deadband(e, old * before + (1 - old) * after)
+    flat = u.reshape(t * substeps, nu)
+
+    def step(response: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+        arrived, response = _lagging(e, response, u, dt / substeps)
+        return response, arrived
+
+    return jax.lax.scan(step, flat[0], flat)[1].reshape(u.shape)
+
+
+def _late(
+    e: Effects, steps: int, dt: float, substeps: int
+) -> tuple[jax.Array, jax.Array]:
+    """Which command a physics step gets, relative to the present one, and the share of
+    the step in which it does; the rest has the one after, ``(substeps, nu)`` both."""
+    start = np.arange(substeps)[:, None] / substeps - e.delay / dt
+    start = jnp.clip(start, -float(steps) + 1, 1.0)
+    whole = jnp.floor(start)
+    old = jnp.clip((whole + 1 - start) * substeps, 0.0, 1.0)
+    return whole.astype(jnp.int32), old
+
+
+def _beyond_deadband(e: Effects, u: jax.Array) -> jax.Array:
+    size = jnp.maximum(jnp.abs(u) - e.deadband, 0.0)
+    size = jnp.where(size > 0, size + e.jump * e.deadband, 0.0)
+    return jnp.where(e.deadband > 0, jnp.sign(u) * size, u)
+
+
+def _lagging(
+    e: Effects, response: jax.Array, u: jax.Array, h: float
+) -> tuple[jax.Array, jax.Array]:
+    """Mean response in a step to a held command, and the response at its end."""
+    tau = jnp.maximum(e.lag, _TINY)
+    left = jnp.exp(-h / tau)
+    mean = tau / h * (1 - left)
+    return u + (response - u) * mean, u + (response - u) * left
+
+
+def warmed(
+    e: Effects, memory: CommandMemory, past: jax.Array, dt: float, substeps: int
+) -> CommandMemory:
+    """The memory after commands ``past (D, nu)``, oldest first; see `commands`."""
+
+    def one(memory: CommandMemory, u: jax.Array) -> tuple[CommandMemory, None]:
+        return commands(e, memory, u, dt, substeps)[1], None
+
+    return jax.lax.scan(one, memory, past)[0]
 
 
 def reading(

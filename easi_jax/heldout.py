@@ -48,19 +48,20 @@ def shares(
         Errors after the first step and at the end of pieces of 0.2 s, one after the
         other along each trajectory; ``(S, 2 nv)`` each.
     """
-    env = pipe.env
-    truth = env.model(target)
+    env, real = pipe.env, pipe.real
+    truth = real.model(target)
     steps = min(max(1, round(OPEN_LOOP / env.dt)), env.episode_length)
 
     def one(item: Any) -> tuple[jax.Array, jax.Array]:
         policy, t, key = item
         trajectories = collect(
-            env,
+            real,
             truth,
             lambda obs, k: act(policy, obs, k),
             key,
             TRAJECTORIES,
             env.episode_length,
+            env.machine.past_steps,
         )
         pieces = windows(trajectories, steps, steps)
         limit = truth.speed_limit

@@ -299,7 +299,7 @@ def segments_from_runs(
             if fitted
             else trusted_velocity(run)
         )
-        parts.append(cut(run.qpos, qvel, run.ctrl, horizon, every))
+        parts.append(cut(run.qpos, qvel, run.ctrl, horizon, every, machine.past_steps))
     whole = [p for p in parts if p is not None]
     if not whole:
         longest = max(runs, key=len)

@@ -1,5 +1,7 @@
 """A robot as it is simulated: MuJoCo model, what may vary, control step."""
 
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 
 import jax
@@ -8,6 +10,8 @@ import mujoco
 import numpy as np
 from mujoco.mjx._src import math
 
+from easi_jax import effects
+from easi_jax.addresses import describe
 from easi_jax.drives import TorqueSpeed
 from easi_jax.errors import UserError
 from easi_jax.model import Model, Sense, put_model, with_parameters
@@ -17,6 +21,7 @@ from easi_jax.recording import physics_steps
 
 _BATCH = 2048  # benchmarks/speed.py
 _WIDE_BATCH = 160  # benchmarks/physics.py
+_SETTLED = 4.0  # time constants after which a lag has forgotten
 
 
 class Machine:
@@ -32,6 +37,9 @@ class Machine:
             timestep or below.
         wide: whether it is too large to be written out entry by entry.
         batch: simulations at once on a device; more would leave a CPU core's cache.
+        fixed: values by address that are not those of ``mj_model``, effects among them.
+        past_steps: commands before a measured start that its simulation has use for;
+            0 where no effect lies on the way of a command.
 
     Raises:
         UserError: what MJX cannot simulate, or an address that the model lacks.
@@ -45,6 +53,7 @@ class Machine:
         sense: Sense | None = None,
         sense_size: int = 0,
         torque_speed: TorqueSpeed | None = None,
+        fixed: Mapping[str, float] | None = None,
     ) -> None:
         step = float(mj_model.opt.timestep)
         self.dt = float(dt) if dt is not None else step
@@ -53,16 +62,34 @@ class Machine:
         self.substeps = physics_steps(self.dt, step)
         self.mj_model = mj_model
         self.space = space
+        self.fixed = dict(fixed or {})
         self.wide = mj_model.nv > WRITTEN_OUT
         self.batch = _WIDE_BATCH if self.wide else _BATCH
         self.base = self._put().replace(
-            sense=sense, sense_size=sense_size, torque_speed=torque_speed
+            sense=sense,
+            sense_size=sense_size,
+            torque_speed=torque_speed,
+            delay_steps=_steps(self._longest("effect.delay.") / self.dt),
         )
+        self.past_steps = 0
+        if self.base.effects is not None and effects.remembers(self.base.present):
+            settled = _SETTLED * self._longest("effect.lag.") / self.dt
+            self.past_steps = self.base.delay_steps + 1 + _steps(settled)
+
+    def _longest(self, kind: str) -> float:
+        """The largest value that effects of a kind may have [s]; 0 without any."""
+        fixed = [v for a, v in self.fixed.items() if a.startswith(kind)]
+        free = [
+            min(p.bounds[1], describe(self.mj_model, p.addresses)[1][1])
+            for p in self.space.parameters
+            if p.addresses[0].startswith(kind)
+        ]
+        return max([0.0, *fixed, *free])
 
     def _put(self) -> Model:
         # Eagerly, also where a machine is made while something is traced.
         with jax.ensure_compile_time_eval():
-            model = put_model(self.mj_model, self.space.addresses)
+            model = put_model(self.mj_model, self.space.addresses, self.fixed)
             step = jnp.asarray(self.dt / self.substeps, model.mjx.opt.timestep.dtype)
             return model.replace(mjx=model.mjx.tree_replace({"opt.timestep": step}))
 
@@ -70,9 +97,10 @@ class Machine:
         self,
         mj_model: mujoco.MjModel | None = None,
         space: ParameterSpace | None = None,
+        fixed: Mapping[str, float] | None = None,
     ) -> "Machine":
         """The same machine, what it senses and its drives included, of another model
-        or with other parameters."""
+        or with other parameters or fixed values."""
         base = self.base
         return Machine(
             self.mj_model if mj_model is None else mj_model,
@@ -81,15 +109,29 @@ class Machine:
             base.sense,
             base.sense_size,
             base.torque_speed,
+            self.fixed if fixed is None else fixed,
         )
 
     def model(self, theta: jax.Array) -> Model:
         """The model at parameters ``theta`` ``(n,)`` in SI units."""
         return with_parameters(self.base, theta)
 
-    def start(self, qpos: jax.Array, qvel: jax.Array) -> Physics:
-        """A measured state, nothing known of what came before it."""
-        return at_rest(self.base, qpos, qvel)
+    def start(
+        self, qpos: jax.Array, qvel: jax.Array, model: Model | None = None
+    ) -> Physics:
+        """A measured state, nothing known of what came before it.
+
+        ``model`` is given where it has effects, which remember.
+        """
+        return at_rest(self.base if model is None else model, qpos, qvel)
+
+    def after(self, model: Model, state: Physics, past: jax.Array) -> Physics:
+        """A state with commands ``past (D, nu)`` sent before it, oldest first."""
+        e = model.effects
+        if e is None or not self.past_steps:
+            return state
+        memory = effects.warmed(e, state.memory, past, self.dt, self.substeps)
+        return replace(state, memory=memory)
 
     def without_sense(self, model: Model) -> Model:
         """The model with nothing read but the state."""
@@ -159,6 +201,11 @@ class Machine:
             else:
                 out += [qb[a : a + 1] - qa[a : a + 1]]
         return jnp.concatenate(out)
+
+
+def _steps(x: float) -> int:
+    """Whole steps that cover ``x`` of them, up to rounding."""
+    return int(np.ceil(x - 1e-6))
 
 
 def _turned(quat: jax.Array, vector: jax.Array) -> jax.Array:

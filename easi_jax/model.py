@@ -1,6 +1,7 @@
 """An MJX model whose physical parameters are an argument."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import flax.struct
@@ -10,6 +11,7 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from easi_jax import effects as physical
 from easi_jax.addresses import Writer, open_gates, resolve
 from easi_jax.constants import set_const
 from easi_jax.drives import TorqueSpeed
@@ -34,7 +36,8 @@ class Model:
         sense_size: how many numbers it reads (static).
         torque_speed: what the actuators can give at which speed, within their force
             limits; None for no such curve.
-        effects: what acts in its steps beyond the model; None for nothing.
+        effects: what acts beyond the model; None for nothing.
+        present: fields of the effects that may differ from none; None: any (static).
         delay_steps: control steps that a command can be late (static).
     """
 
@@ -46,6 +49,7 @@ class Model:
     sense_size: int = flax.struct.field(pytree_node=False, default=0)
     torque_speed: TorqueSpeed | None = None
     effects: Effects | None = None
+    present: tuple[str, ...] | None = flax.struct.field(pytree_node=False, default=None)
     delay_steps: int = flax.struct.field(pytree_node=False, default=0)
 
     if TYPE_CHECKING:  # made by flax
@@ -74,13 +78,16 @@ def _unsupported(m: mujoco.MjModel) -> str | None:
 
 
 def put_model(
-    mj_model: mujoco.MjModel, addresses_per_parameter: Iterable[Iterable[str]] = ()
+    mj_model: mujoco.MjModel,
+    addresses_per_parameter: Iterable[Iterable[str]] = (),
+    fixed: Mapping[str, float] | None = None,
 ) -> Model:
     """Puts a MuJoCo model on the device, ready to have parameters written into it.
 
     Args:
         mj_model: nominal model; it is not changed.
         addresses_per_parameter: for each parameter its addresses.
+        fixed: values by address that stay, effects among them.
 
     Raises:
         UserError: an address that does not fit the model; or the model uses what MJX
@@ -94,24 +101,39 @@ def put_model(
         ignored = "dcmotor actuators"
     if ignored is not None:
         raise UserError(f"the model uses {ignored}, which MJX does not simulate")
-    writers = resolve(mj_model, per_parameter)
-    opened = open_gates(mj_model, [a for p in per_parameter for a in p])
+    fixed = dict(fixed or {})
+    every = (*per_parameter, *((a,) for a in fixed))
+    writers = resolve(mj_model, every)
+    opened = open_gates(mj_model, [a for p in every for a in p])
     try:
         put = mjx.put_model(opened, impl="jax")
     except NotImplementedError as error:
         reason = " ".join(str(error).split())
         raise UserError(f"MJX cannot simulate this model: {reason}") from error
-    if any(w.quantity in ("com_x", "com_y", "com_z", "length") for w in writers):
-        put = _full_structure(put)
-    return Model(
+    if any(w.quantity in _MOVES_CENTERS for w in writers):
+        put = full_structure(put)
+    n = len(per_parameter)
+    lasting = [replace(w, parameter=w.parameter - n) for w in writers]
+    lasting = tuple(w for w in lasting if w.parameter >= 0)
+    present = {w.quantity.split(".")[0] for w in writers if w.kind == "effect"}
+    model = Model(
         mjx=put,
         speed_limit=jnp.full(mj_model.nv, jnp.inf),
-        writers=writers,
+        writers=lasting,
         long_axes=tuple(long_axis(mj_model, g) for g in range(mj_model.ngeom)),
+        effects=physical.none(mj_model) if present else None,
+        present=tuple(sorted(present)) if present else None,
+    )
+    values = jnp.array(list(fixed.values()), jnp.result_type(float))
+    return _written(model, values).replace(
+        writers=tuple(w for w in writers if w.parameter < n)
     )
 
 
-def _full_structure(m: mjx.Model) -> mjx.Model:
+_MOVES_CENTERS = ("com_x", "com_y", "com_z", "length", "com.0", "com.1", "com.2")
+
+
+def full_structure(m: mjx.Model) -> mjx.Model:
     """Lets every degree of freedom couple with all its ancestors.
 
     MuJoCo drops the off-diagonals of a body whose center of mass is at its joints;
@@ -136,19 +158,37 @@ def with_parameters(model: Model, theta: jax.Array) -> Model:
     touches are passed through, so that under vmap only the others get a batch axis.
     A body's inertia scales with its mass; derived constants are computed again where
     some address asks for it. The result does not depend on the order of writing.
+    Static effects are in its ``mjx``; ``effects`` holds all, or None where no other
+    is present.
     """
+    model = _written(model, theta)
+    e = model.effects
+    if e is None:
+        return model
+    return model.replace(
+        mjx=physical.with_effects(model.mjx, e, model.present),
+        effects=e if physical.acts(model.present) else None,
+    )
+
+
+def _written(model: Model, theta: jax.Array) -> Model:
     if not model.writers:
         return model
     old = model.mjx
-    m, speed = old, model.speed_limit
+    m, speed, acting = old, model.speed_limit, model.effects
     numbers: dict[str, list[tuple[tuple[int, ...], int, int]]] = {}
     for w in model.writers:
-        if w.quantity not in ("gravity", "length"):
+        if w.quantity not in ("gravity", "length") or w.kind == "effect":
             for e in w.entries:
                 numbers.setdefault(e.field, []).append((e.index, w.parameter, e.sign))
     for field, items in numbers.items():
         if field == "speed_limit":
             speed = _write(speed, items, theta)
+        elif field.startswith("effects."):
+            name = field.partition(".")[2]
+            assert acting is not None
+            value = _write(getattr(acting, name), items, theta)
+            acting = acting.replace(**{name: value})
         else:
             m = m.tree_replace({field: _write(_leaf(m, field), items, theta)})
     m = _scale_inertia(model.writers, old, m)
@@ -161,7 +201,7 @@ def with_parameters(model: Model, theta: jax.Array) -> Model:
             m = m.tree_replace({"opt.gravity": g / jnp.linalg.norm(g) * value})
     if any(w.row.derived for w in model.writers):
         m = set_const(m)
-    return model.replace(mjx=m, speed_limit=speed)
+    return model.replace(mjx=m, speed_limit=speed, effects=acting)
 
 
 def _leaf(m: mjx.Model, field: str) -> jax.Array:
@@ -181,7 +221,8 @@ def _write(leaf: jax.Array, items: list[Any], theta: jax.Array) -> jax.Array:
 
 
 def _scale_inertia(writers: Iterable[Writer], old: mjx.Model, m: Any) -> Any:
-    bodies = np.array(sorted({w.id for w in writers if w.quantity == "mass"}), int)
+    heavy = {w.id for w in writers if (w.kind, w.quantity) == ("body", "mass")}
+    bodies = np.array(sorted(heavy), int)
     if not bodies.size:
         return m
     ratio = m.body_mass[bodies] / old.body_mass[bodies]

@@ -8,9 +8,12 @@ import jax.numpy as jnp
 from mujoco import mjx
 from mujoco.mjx._src import forward as mjx_forward
 from mujoco.mjx._src import sensor as mjx_sensor
+from mujoco.mjx._src import solver as mjx_solver
 from mujoco.mjx._src.types import IntegratorType
 
 from easi_jax import effects, solver
+from easi_jax.backlash import first_rotor
+from easi_jax.effects import Effects
 from easi_jax.equality import with_velocity_products
 from easi_jax.scalarize import scalarized
 from easi_jax.small_linalg import unroll_small
@@ -28,7 +31,8 @@ class Physics:
         act: actuator activations, ``(na,)``.
         warmstart: last acceleration, where the solver starts, ``(nv,)``.
         sensed: what ``model.sense`` read in the last physics step; zeros before.
-        memory: what the way of a command remembers, where the model has effects.
+        memory: what the way of a command remembers, where effects lie on it.
+        rotor: drives with play, where there are any.
     """
 
     qpos: jax.Array
@@ -37,6 +41,7 @@ class Physics:
     warmstart: jax.Array
     sensed: Any = ()
     memory: Any = ()
+    rotor: Any = ()
 
     if TYPE_CHECKING:  # made by flax
 
@@ -48,10 +53,12 @@ def at_rest(model: Any, qpos: jax.Array, qvel: jax.Array) -> Physics:
     m = model.mjx
     act, warm = jnp.zeros(m.na), jnp.zeros(m.nv)
     sensed = jnp.zeros(model.sense_size) if model.sense else ()
-    memory = ()
-    if model.effects is not None:
+    memory, rotor, e = (), (), model.effects
+    if e is not None and effects.turns(model.present):
+        rotor = first_rotor(effects.scalar_joints(m), qpos, qvel)
+    if e is not None and effects.remembers(model.present):
         memory = effects.first_memory(model.delay_steps, m.nu)
-    return Physics(qpos, qvel, act, warm, sensed, memory)
+    return Physics(qpos, qvel, act, warm, sensed, memory, rotor)
 
 
 def data_at(model: Any, state: Physics, ctrl: jax.Array) -> mjx.Data:
@@ -65,31 +72,46 @@ def data_at(model: Any, state: Physics, ctrl: jax.Array) -> mjx.Data:
     )
 
 
-def forward(m: mjx.Model, d: mjx.Data, wide: bool = False) -> mjx.Data:
+def forward(
+    m: mjx.Model, d: mjx.Data, wide: bool = False, e: Effects | None = None
+) -> mjx.Data:
     """`mjx.forward` with this package's constraint solver where it applies.
 
-    ``wide`` is the solver for batches of larger robots (`easi_jax.wide_solver`).
+    ``wide`` is the solver for batches of larger robots (`easi_jax.wide_solver`);
+    ``e`` holds the drag of bodies, which needs their velocities.
     """
-    if not solver.supported(m):
+    own = solver.supported(m)
+    if not own and e is None:
         return mjx.forward(m, d)
     d = mjx_forward.fwd_position(m, d)
     d = mjx_sensor.sensor_pos(m, d)
-    d = with_velocity_products(m, mjx_forward.fwd_velocity(m, d))
+    d = mjx_forward.fwd_velocity(m, d)
+    if own:
+        d = with_velocity_products(m, d)
     d = mjx_sensor.sensor_vel(m, d)
+    if e is not None:
+        d = effects.body_resistance(m, d, e)
     d = mjx_forward.fwd_actuation(m, d)
     d = mjx_forward.fwd_acceleration(m, d)
     if d._impl.efc_J.size == 0:
         d = d.replace(qacc=d.qacc_smooth)
-    else:
+    elif own:
         d = solver.solve(m, d, int(m.opt.iterations), wide)
+    else:
+        d = mjx_solver.solve(m, d)
     return mjx_sensor.sensor_acc(m, d)
 
 
-def mjx_step(m: mjx.Model, d: mjx.Data, wide: bool = False) -> mjx.Data:
-    """`mjx.step`, its constraint solve and small matrices batched well."""
+def mjx_step(
+    m: mjx.Model, d: mjx.Data, wide: bool = False, e: Effects | None = None
+) -> mjx.Data:
+    """`mjx.step`, its constraint solve and small matrices batched well; see `forward`.
+
+    RK4 leaves the drag of bodies out.
+    """
     if m.opt.integrator == IntegratorType.RK4:
         return mjx.step(m, d)  # RK4 solves inside its stages
-    d = forward(m, d, wide)
+    d = forward(m, d, wide, e)
     if m.opt.integrator == IntegratorType.EULER:
         return mjx_forward.euler(m, d)
     return mjx_forward.implicit(_without_clamped(m, d), d)
@@ -130,12 +152,13 @@ def substep(model: Any, state: Physics, ctrl: jax.Array, wide: bool = False) -> 
     if model.torque_speed is not None:
         m = _with_torque_speed(m, model.torque_speed.limits(state.qvel))
     d = data_at(model, state, ctrl)
-    if model.effects is not None:
-        m, d = effects.in_step(m, d, model.effects, effects.scalar_joints(m))
-    d = mjx_step(m, d, wide)
+    e, rotor = model.effects, state.rotor
+    if e is not None:
+        m, d, rotor = effects.in_step(m, d, e, effects.scalar_joints(m), rotor)
+    d = mjx_step(m, d, wide, e if effects.resists(model.present) else None)
     qvel = jnp.clip(d.qvel, -model.speed_limit, model.speed_limit)
     sensed = model.sense(model.mjx, d) if model.sense else ()
-    return Physics(d.qpos, qvel, d.act, d.qacc_warmstart, sensed)
+    return Physics(d.qpos, qvel, d.act, d.qacc_warmstart, sensed, (), rotor)
 
 
 def _otherwise(model: Any, state: Physics, ctrl: jax.Array) -> Physics:
@@ -151,7 +174,7 @@ _batched_substep = scalarized(substep, otherwise=_otherwise)
 
 def control_step(model: Any, state: Physics, ctrl: jax.Array, substeps: int) -> Physics:
     """Holds ``ctrl`` ``(nu,)`` for ``substeps`` physics steps."""
-    if model.effects is None:
+    if model.effects is None or not effects.remembers(model.present):
 
         def step(s: Physics, _: None) -> tuple[Physics, None]:
             return _batched_substep(model, s, ctrl), None
@@ -161,8 +184,14 @@ def control_step(model: Any, state: Physics, ctrl: jax.Array, substeps: int) -> 
     dt = model.mjx.opt.timestep * substeps
     arrived, memory = effects.commands(model.effects, state.memory, ctrl, dt, substeps)
 
-    def late(s: Physics, u: jax.Array) -> tuple[Physics, None]:
+    bare = state.replace(memory=())
+    return arrived_step(model, bare, arrived).replace(memory=memory)
+
+
+def arrived_step(model: Any, state: Physics, arrived: jax.Array) -> Physics:
+    """One control step in which ``arrived (substeps, nu)`` reaches the actuators."""
+
+    def step(s: Physics, u: jax.Array) -> tuple[Physics, None]:
         return _batched_substep(model, s, u), None
 
-    bare = state.replace(memory=())
-    return jax.lax.scan(late, bare, arrived)[0].replace(memory=memory)
+    return jax.lax.scan(step, state, arrived)[0]

@@ -20,6 +20,7 @@ from easi_jax.identify import Estimate, estimate
 from easi_jax.mesh import make_mesh, sharded_map
 from easi_jax.parameters import ParameterSpace
 from easi_jax.rl.config import SacConfig
+from easi_jax.rl.episodes import Tested
 from easi_jax.rl.evaluate import play
 from easi_jax.rl.networks import PolicyParams, act
 from easi_jax.rl.seeds import init_seeds, run_seeds
@@ -109,6 +110,9 @@ class Pipeline:
         start: where the search starts, as factors on the nominal value; None for
             the range that UDR has.
         mesh: devices (default: all).
+        real: the robot that stands for the real one, where it is another than ``env``:
+            its physics may hold what ``env`` lacks. ``target`` is always one of its
+            parameters.
     """
 
     def __init__(
@@ -117,6 +121,7 @@ class Pipeline:
         config: PipelineConfig,
         start: tuple[float, float] | None = None,
         mesh: Mesh | None = None,
+        real: Any = None,
     ) -> None:
         nv = env.mj_model.nv
         if config.noise and len(config.noise) != 2 * nv:
@@ -125,9 +130,13 @@ class Pipeline:
                 f"for {', '.join(env.machine.state_names)}"
             )
         self.env, self.config, self.mesh = env, config, mesh or make_mesh()
+        self.real = env if real is None else real
         space = env.space if start is None else env.space.scaled(*start)
         self.machine = env.machine.rebuilt(space=space)
-        self.trainer = make_trainer(env, config.training, env.model, self._draw)
+        tested = None
+        if real is not None:
+            tested = Tested(real, real.model, self._draw_real)
+        self.trainer = make_trainer(env, config.training, env.model, self._draw, tested)
         self.search = Search(
             self.machine,
             config.search,
@@ -142,6 +151,9 @@ class Pipeline:
     def _draw(self, dist: Distribution, key: jax.Array) -> jax.Array:
         return distribution.draw(self.space, dist, key)
 
+    def _draw_real(self, dist: Distribution, key: jax.Array) -> jax.Array:
+        return distribution.draw(self.real.space, dist, key)
+
     # -- distributions -------------------------------------------------------
 
     def udr(self) -> Distribution:
@@ -152,6 +164,11 @@ class Pipeline:
     def point(self, theta: Any) -> Distribution:
         """All mass at ``theta (n,)``: what the Oracle trains under."""
         return distribution.point(self.space, theta)
+
+    def real_point(self, theta: Any) -> Distribution:
+        """All mass at ``theta`` of the robot that stands for the real one."""
+        space = self.space if self.real is self.env else self.real.space
+        return distribution.point(space, theta)
 
     def spread(self, dist: Distribution, seeds: int) -> Distribution:
         """The same distribution for each of ``seeds``."""
@@ -172,7 +189,7 @@ class Pipeline:
         compiled program.
         """
         return run_seeds(
-            self.trainer, states, dist, n, self.point(target), 0, None, self.mesh
+            self.trainer, states, dist, n, self.real_point(target), 0, None, self.mesh
         )
 
     def policies(self, states: Any) -> PolicyParams:
@@ -186,7 +203,7 @@ class Pipeline:
 
         The controller acts stochastically, as in the paper.
         """
-        c, env = self.config, self.env
+        c, env = self.config, self.real
 
         def one(item: Any) -> Segments:
             policy, key = item
@@ -198,6 +215,7 @@ class Pipeline:
                 k_run,
                 c.trajectories,
                 env.episode_length,
+                self.machine.past_steps,
             )
             return measured(trajectories, self.noise, k_noise)
 
@@ -273,13 +291,13 @@ class Pipeline:
     ) -> tuple[jax.Array, jax.Array]:
         """Deterministic policies in the target: returns ``(S, episodes)``, and
         positions of the first episodes ``(S, T + 1, nq)``."""
-        model = self.env.model(target)
+        model = self.real.model(target)
 
         def local(items: Any) -> Any:
             def one(item: Any) -> Any:
                 policy, key = item
                 n = self.config.eval_episodes
-                return play(self.env, model, policy, act, jax.random.split(key, n))
+                return play(self.real, model, policy, act, jax.random.split(key, n))
 
             return jax.lax.map(one, items)
 

@@ -110,11 +110,14 @@ def _dof_entries(field: str) -> Callable[[Any, int], tuple[Entry, ...]]:
     return lambda m, j: tuple(Entry(field, (d,)) for d in dofs(m, j))
 
 
-def _is_scalar(m: Any, j: int) -> bool:
+def is_scalar(m: Any, j: int) -> bool:
+    """Whether joint ``j`` is a hinge or a slide."""
     return int(m.jnt_type[j]) in (int(_Joint.mjJNT_HINGE), int(_Joint.mjJNT_SLIDE))
 
 
-def _joint_unit(linear: str, angular: str) -> Callable[[Any, int], str]:
+def joint_unit(linear: str, angular: str) -> Callable[[Any, int], str]:
+    """The unit of a quantity of slides and of other joints."""
+
     def unit(m: Any, j: int) -> str:
         return linear if m.jnt_type[j] == _Joint.mjJNT_SLIDE else angular
 
@@ -122,7 +125,7 @@ def _joint_unit(linear: str, angular: str) -> Callable[[Any, int], str]:
 
 
 def _scalar_only(m: Any, j: int) -> str | None:
-    return None if _is_scalar(m, j) else "only hinge and slide joints have one"
+    return None if is_scalar(m, j) else "only hinge and slide joints have one"
 
 
 def _passive(m: Any, j: int) -> str | None:
@@ -171,21 +174,22 @@ def is_velocity_servo(m: Any, a: int) -> bool:
     return bool(servo and bias[1] == 0 and bias[2] == -kv)
 
 
-def _actuation(m: Any, a: int) -> str | None:
+def actuation(m: Any, a: int) -> str | None:
+    """Why nothing of an actuator may vary, or None."""
     return _disabled(m, (_Disable.mjDSBL_ACTUATION, "actuation"))
 
 
 def _refuse_kp(m: Any, a: int) -> str | None:
     if not is_position_servo(m, a):
         return "it is no position servo, or its kp is 0 (vary its gain instead)"
-    return _actuation(m, a)
+    return actuation(m, a)
 
 
 def _refuse_kv(m: Any, a: int) -> str | None:
     none = m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
     if not _fixed_gain(m, a) or not (none or _affine_bias(m, a)):
         return "its force is not a fixed gain with an affine bias"
-    return _actuation(m, a)
+    return actuation(m, a)
 
 
 def _refuse_gain(m: Any, a: int) -> str | None:
@@ -195,13 +199,13 @@ def _refuse_gain(m: Any, a: int) -> str | None:
         return "it is a position servo: vary its kp"
     if is_velocity_servo(m, a):
         return "it is a velocity servo: vary its kv"
-    return _actuation(m, a)
+    return actuation(m, a)
 
 
 def _refuse_gear(m: Any, a: int) -> str | None:
     if np.any(m.actuator_gear[a, 1:]):
         return "its gear is a vector: vary its gain instead"
-    return _actuation(m, a)
+    return actuation(m, a)
 
 
 def _refuse_time_constant(m: Any, a: int) -> str | None:
@@ -211,7 +215,7 @@ def _refuse_time_constant(m: Any, a: int) -> str | None:
             'it has no filter: write timeconst="..." (position) or '
             'dyntype="filterexact" dynprm="..." (general) in the model file'
         )
-    return _actuation(m, a)
+    return actuation(m, a)
 
 
 def _kp_entries(m: Any, a: int) -> tuple[Entry, ...]:
@@ -232,7 +236,8 @@ def _open_kv(m: Any, a: int) -> None:
         m.actuator_biasprm[a] = 0.0
 
 
-def _open_force_limit(m: Any, a: int) -> None:
+def open_force_limit(m: Any, a: int) -> None:
+    """Puts a force limit on that is very wide, where there is none."""
     if not m.actuator_forcelimited[a]:
         m.actuator_forcelimited[a] = 1
         m.actuator_forcerange[a] = -NO_LIMIT, NO_LIMIT
@@ -245,20 +250,20 @@ def _read_force_limit(m: Any, a: int) -> float:
     return float(high) if -low == high else math.nan
 
 
-def _linear_drive(m: Any, a: int) -> bool | None:
+def linear_drive(m: Any, a: int) -> bool | None:
     """True for forces along a line, False for torques, None where it is mixed."""
     kind, target = int(m.actuator_trntype[a]), m.actuator_trnid[a, 0]
     if kind == int(mujoco.mjtTrn.mjTRN_TENDON):
         return True
     joint = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-    if kind in map(int, joint) and _is_scalar(m, target):
+    if kind in map(int, joint) and is_scalar(m, target):
         return bool(m.jnt_type[target] == _Joint.mjJNT_SLIDE)
     return None
 
 
 def _drive_unit(linear: str, angular: str) -> Callable[[Any, int], str]:
     def unit(m: Any, a: int) -> str:
-        return angular if _linear_drive(m, a) is False else linear
+        return angular if linear_drive(m, a) is False else linear
 
     return unit
 
@@ -447,32 +452,32 @@ TABLE: dict[str, dict[str, Quantity]] = {
     "joint": {
         "damping": Quantity(
             _dof_entries("dof_damping"),
-            _joint_unit("N s/m", "N m s/rad"),
+            joint_unit("N s/m", "N m s/rad"),
             refuse=_passive,
         ),
         "frictionloss": Quantity(
             _dof_entries("dof_frictionloss"),
-            _joint_unit("N", "N m"),
+            joint_unit("N", "N m"),
             refuse=_dry,
             open=_seed_dofs,
         ),
         "armature": Quantity(
             _dof_entries("dof_armature"),
-            _joint_unit("kg", "kg m^2"),
+            joint_unit("kg", "kg m^2"),
             derived=True,
         ),
         "stiffness": Quantity(
-            _one("jnt_stiffness"), _joint_unit("N/m", "N m/rad"), refuse=_passive
+            _one("jnt_stiffness"), joint_unit("N/m", "N m/rad"), refuse=_passive
         ),
         "springref": Quantity(
             lambda m, j: (Entry("qpos_spring", (int(m.jnt_qposadr[j]),)),),
-            _joint_unit("m", "rad"),
+            joint_unit("m", "rad"),
             low=-_INF,
             refuse=lambda m, j: _scalar_only(m, j) or _passive(m, j),
         ),
         "speed_limit": Quantity(
             _dof_entries("speed_limit"),
-            _joint_unit("m/s", "rad/s"),
+            joint_unit("m/s", "rad/s"),
             refuse=_scalar_only,
         ),
     },
@@ -503,8 +508,8 @@ TABLE: dict[str, dict[str, Quantity]] = {
                 Entry("actuator_forcerange", (a, 0), -1),
             ),
             _drive_unit("N", "N m"),
-            refuse=_actuation,
-            open=_open_force_limit,
+            refuse=actuation,
+            open=open_force_limit,
             read=_read_force_limit,
         ),
         "time_constant": Quantity(

@@ -13,18 +13,24 @@ from easi_jax.segments import Segments
 def predict(
     machine: Machine, model: Any, segments: Segments
 ) -> tuple[jax.Array, jax.Array]:
-    """Open-loop prediction: ``qpos (M, H, nq)``, ``qvel (M, H, nv)``."""
+    """Open-loop prediction: ``qpos (M, H, nq)``, ``qvel (M, H, nv)``.
+
+    Commands on their way at the start are those that the segments know of; before
+    them, the first one counts as sent for ever.
+    """
     model = machine.without_sense(model)  # only controllers read it
 
-    def one(qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array) -> Any:
+    def one(qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array, past: Any) -> Any:
         def step(state: Any, u: jax.Array) -> Any:
             state = machine.step(model, state, u)
             return state, (state.qpos, state.qvel)
 
         first = dataclasses.replace(machine.start(qpos, qvel), sensed=())
+        if not isinstance(past, tuple):
+            first = machine.after(model, first, past)
         return jax.lax.scan(step, first, ctrl)[1]
 
-    return jax.vmap(one)(segments.qpos, segments.qvel, segments.ctrl)
+    return jax.vmap(one)(segments.qpos, segments.qvel, segments.ctrl, segments.past)
 
 
 def innovations(
@@ -61,8 +67,10 @@ def motion(machine: Machine, segments: Segments) -> jax.Array:
 
 
 def features(machine: Machine, segments: Segments) -> jax.Array:
-    """Start state and commands of each segment, flat, ``(M, nq + nv + H nu)``."""
+    """Start state and commands of each segment, past ones where they matter, flat,
+    ``(M, nq + nv + (H + D) nu)``."""
     m = segments.qpos.shape[0]
-    return jnp.concatenate(
-        [segments.qpos, segments.qvel, segments.ctrl.reshape(m, -1)], axis=1
-    )
+    commands = [
+        x.reshape(m, -1) for x in jax.tree.leaves((segments.ctrl, segments.past))
+    ]
+    return jnp.concatenate([segments.qpos, segments.qvel, *commands], axis=1)

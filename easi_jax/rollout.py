@@ -19,8 +19,12 @@ def policy_rollout(
     key: jax.Array,
     steps: int,
     auto_reset: bool = False,
+    past: int = 0,
 ) -> Segments:
     """One trajectory of ``act(obs, key) -> action`` from a reset.
+
+    ``past``: how many commands before each step the segments hold; those before an
+    episode's first are that one.
 
     Returns:
         Segments with horizon 1, ``(steps, 1, ...)``, weight 1 where the transition
@@ -32,9 +36,11 @@ def policy_rollout(
     k_reset, k_run = jax.random.split(key)
 
     def step(carry: Any, k: jax.Array) -> Any:
-        state, alive = carry
+        state, alive, (sent, begun) = carry
         k_act, k_again = jax.random.split(k)
         action = act(state.obs, k_act)
+        ctrl = env.control(state, action)
+        sent = jnp.where(begun, sent, ctrl)
         new = env.step(model, state, action)
         done = new.terminated > 0
         after = new
@@ -44,28 +50,42 @@ def policy_rollout(
         seg = Segments(
             qpos=state.physics.qpos,
             qvel=state.physics.qvel,
-            ctrl=env.control(state, action)[None],
+            ctrl=ctrl[None],
             next_qpos=after.physics.qpos[None],
             next_qvel=after.physics.qvel[None],
             weight=alive,
+            past=sent if past else (),
         )
+        sent = jnp.concatenate([sent, ctrl[None]])[1:]
         if auto_reset:
-            return (after, alive), seg
+            return (after, alive, (sent, ~done)), seg
         # A finished episode stands still instead of running on into nonsense.
         held = jax.tree.map(lambda a, b: jnp.where(alive > 0, a, b), after, state)
-        return (held, alive * (1.0 - done)), seg
+        return (held, alive * (1.0 - done), (sent, jnp.ones((), bool))), seg
 
-    init = (env.reset(model, k_reset), jnp.ones(()))
+    first = env.reset(model, k_reset)
+    ctrl = jax.eval_shape(lambda s: env.control(s, act(s.obs, k_run)), first)
+    sent = jnp.zeros((past, *ctrl.shape))
+    init = (first, jnp.ones(()), (sent, jnp.zeros((), bool)))
     _, out = jax.lax.scan(step, init, jax.random.split(k_run, steps))
     return out
 
 
 def collect(
-    env: Env, model: Any, act: Act, key: jax.Array, trajectories: int, steps: int
+    env: Env,
+    model: Any,
+    act: Act,
+    key: jax.Array,
+    trajectories: int,
+    steps: int,
+    past: int = 0,
 ) -> Segments:
-    """``trajectories`` rollouts of one model: leaves ``(B, steps, ...)``."""
+    """``trajectories`` rollouts of one model: leaves ``(B, steps, ...)``; ``past`` as
+    for `policy_rollout`."""
     keys = jax.random.split(key, trajectories)
-    return jax.vmap(lambda k: policy_rollout(env, model, act, k, steps))(keys)
+    return jax.vmap(lambda k: policy_rollout(env, model, act, k, steps, past=past))(
+        keys
+    )
 
 
 def measured(trajectories: Segments, noise: jax.Array, key: jax.Array) -> Segments:
@@ -89,4 +109,5 @@ def measured(trajectories: Segments, noise: jax.Array, key: jax.Array) -> Segmen
         next_qpos=t.next_qpos + pos[:, end, None] if moved else t.next_qpos,
         next_qvel=t.next_qvel + vel[:, end, None],
         weight=t.weight,
+        past=t.past,
     )

@@ -149,10 +149,12 @@ class Search:
         mean, std = jnp.full(n, 0.5), jnp.full(n, 12.0**-0.5)
         cov = jnp.diag(std**2)
         seg = data.segments
-        width = seg.qpos.shape[1] + seg.qvel.shape[1] + seg.ctrl[0].size
-        width += jax.eval_shape(
-            lambda s: self._outcome(s, (s.next_qpos, s.next_qvel)), seg
-        ).shape[1]
+
+        def inputs(s: Segments) -> tuple[jax.Array, jax.Array]:
+            outcome = self._outcome(s, (s.next_qpos, s.next_qvel))
+            return replay.features(self.machine, s), outcome
+
+        width = sum(x.shape[1] for x in jax.eval_shape(inputs, seg))
         return SearchState(
             strategy=self.strategy.init(k_es, mean, std),
             critic=critic.init(self.critic_config, k_critic, width),
@@ -366,6 +368,7 @@ class Search:
             next_qpos=qpos,
             next_qvel=qvel + noise[..., nv:],
             weight=tile(seg.weight),
+            past=jax.tree.map(tile, seg.past),
         )
         return seg, reference, fake, jax.tree.map(tile, reference)
 
@@ -390,6 +393,7 @@ class Search:
                     k,
                     c.rollout_steps,
                     auto_reset=not c.mask_resets,
+                    past=self.machine.past_steps,
                 )
                 return seg, self._reference(model, seg)
 

@@ -18,6 +18,9 @@ class Segments:
         next_qpos, next_qvel: measured states after each step, ``(M, H, nq)``,
             ``(M, H, nv)``.
         weight: ``(M,)``, 1 where the piece counts, 0 beyond an episode's end.
+        past: commands before the start, oldest first, ``(M, D, nu)``; what comes before
+            a run's or an episode's first command is that command. () where no
+            simulation has use for them.
     """
 
     qpos: Any
@@ -26,6 +29,7 @@ class Segments:
     next_qpos: Any
     next_qvel: Any
     weight: Any
+    past: Any = ()
 
     @property
     def count(self) -> int:
@@ -57,8 +61,12 @@ def cut(
     ctrl: np.ndarray,
     horizon: int,
     every: int,
+    past: int = 0,
 ) -> Segments | None:
-    """Segments of one uninterrupted recording ``(T, ...)``, None if too short."""
+    """Segments of one uninterrupted recording ``(T, ...)``, None if too short.
+
+    ``past``: how many commands before each start they hold.
+    """
     starts = np.arange(0, len(qpos) - horizon, every)
     if not len(starts):
         return None
@@ -70,6 +78,7 @@ def cut(
         next_qpos=qpos[steps + 1],
         next_qvel=qvel[steps + 1],
         weight=np.ones(len(starts)),
+        past=ctrl[np.maximum(starts[:, None] + np.arange(-past, 0), 0)] if past else (),
     )
 
 
@@ -104,6 +113,7 @@ def windows(trajectories: Segments, horizon: int, every: int) -> Segments:
         next_qpos=flat(t.next_qpos[:, rows, 0]),
         next_qvel=flat(t.next_qvel[:, rows, 0]),
         weight=flat(t.weight[:, rows].min(-1)),
+        past=jax.tree.map(lambda x: flat(x[:, starts]), t.past),
     )
 
 

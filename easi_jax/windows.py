@@ -74,11 +74,8 @@ def fitted_velocity(
     rows = len(qpos)
     if rows < 2:
         return np.zeros((rows, configuration.nv))
-    reach = max(int(FIT_SECONDS / dt + 1e-6), FIT_ROWS // 2)
     row = np.arange(rows)
-    # each row's own span: within reach, inside the run, at least FIT_ROWS rows
-    low = np.minimum(np.maximum(row - reach, 0), max(rows - FIT_ROWS, 0))
-    high = np.maximum(np.minimum(row + reach, rows - 1), min(FIT_ROWS, rows) - 1)
+    low, high = _fitted_rows(rows, row, dt)
     velocity = np.zeros((rows, configuration.nv))
     shapes = {(int(a), int(b)) for a, b in zip(low - row, high - row, strict=True)}
     for first, last in shapes:
@@ -132,6 +129,28 @@ def transitions(run: Run) -> Transitions:
         next_qpos=run.qpos[1:],
         next_qvel=run.qvel[1:],
     )
+
+
+def velocity_weights(rows: int, row: int, dt: float) -> tuple[int, np.ndarray]:
+    """How `fitted_velocity` weighs the positions around a row of a run.
+
+    Returns:
+        First row that it reads, counted from ``row``, and the weights [1/s] of that and
+        the following rows.
+    """
+    low, high = (int(x) - row for x in _fitted_rows(rows, np.array(row), dt))
+    return low, _derivative_weights(low, high) / dt
+
+
+def _fitted_rows(
+    rows: int, row: np.ndarray, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """First and last row of each row's own span: within reach, inside the run, at
+    least `FIT_ROWS` rows."""
+    reach = max(int(FIT_SECONDS / dt + 1e-6), FIT_ROWS // 2)
+    low = np.minimum(np.maximum(row - reach, 0), max(rows - FIT_ROWS, 0))
+    high = np.maximum(np.minimum(row + reach, rows - 1), min(FIT_ROWS, rows) - 1)
+    return low, high
 
 
 def _derivative_weights(first: int, last: int) -> np.ndarray:

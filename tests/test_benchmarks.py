@@ -3,10 +3,11 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from benchmarks import summary
+from benchmarks import gap_score, summary
 from benchmarks._common import RESULTS
 from train._command import main
 
@@ -42,3 +43,44 @@ def test_goals_are_judged(tmp_path: Path, ratio: float, said: str) -> None:
     (tmp_path / "speed.json").write_text(json.dumps(result))
     row = page(tmp_path).split("native MuJoCo")[1].splitlines()[0]
     assert said in row
+
+
+def case(kind: str, truth: list[str], named: list[str], sure: float) -> dict[str, Any]:
+    right = named[: len(truth)] == truth if truth else not named
+    return {
+        "kind": kind,
+        "truth": truth,
+        "named": named,
+        "confidence": [sure] * len(named),
+        "verdict": "explained",
+        "right": right,
+    }
+
+
+def test_cases_of_the_gap_are_counted() -> None:
+    rows = [
+        case("single", ["a@x"], ["a@x"], 0.9),
+        case("single", ["a@x"], ["b@x"], 0.9),
+        case("single", ["a@x"], ["b@x"], 0.3),
+        case("none", [], [], 0.0),
+        case("wrong_own", [], ["b@x"], 0.6),
+        case("pair", ["a@x", "b@x"], ["a@x", "b@x"], 1.0),
+    ]
+    got = gap_score.shares(rows)
+    assert got["right name and place first"] == (1, 3)
+    assert got["false alarms without effect"] == (1, 2)
+    assert got["wrong with confidence above 0.8"] == (1, 6)
+    assert got["pairs both found"] == (1, 1)
+    assert gap_score.confusion(rows) == {"a": {"a": 1, "b": 2}}
+    pairs = gap_score.judged(rows)
+    assert [ok for ok, _ in pairs] == [True, False, False, False, True, True]
+    assert gap_score.brier(pairs) == pytest.approx(
+        (0.01 + 0.81 + 0.09 + 0.36 + 0 + 0) / 6
+    )
+    assert gap_score.calibration(pairs)[-1] == (pytest.approx(0.95), 0.75, 4)
+
+
+def test_wilson_interval() -> None:
+    # R. G. Newcombe, Stat. Med. 17 (1998), table I
+    assert gap_score.wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
+    assert gap_score.wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from train._command import say, show_table
+from train._effects import read_given
 from train._log_problem import FINISH, Problem, read_problem
 
 _STEPS = 500_000  # physics steps in a generation that are worth their time
@@ -23,7 +24,7 @@ def run(config: Any) -> None:
 
     with RunFolder.open(
         config.out,
-        config,
+        read_given(config).recorded(config),
         command="train.easi",
         resume=config.resume,
         overwrite=config.overwrite,

@@ -18,7 +18,7 @@ class GapProblem:
         fit, held: runs.
         held_name, held_names: which data are held out.
         noise: of positions and velocities, ``(2 nv,)``.
-        late: joints whose measured velocity lags its position, with the lag [s].
+        late: joints whose measured velocity lags its position (`velocities.Lag`).
         notes: what the user should know of the data.
     """
 
@@ -31,7 +31,7 @@ class GapProblem:
     held_name: str
     held_names: list[str]
     noise: Any
-    late: dict[str, float]
+    late: dict[str, Any]
     notes: list[str]
 
 
@@ -44,61 +44,41 @@ def read_gap_problem(config: Any) -> GapProblem:
     from easi_jax.errors import UserError
     from easi_jax.gap.own import own_space
     from easi_jax.gap.velocities import velocity_lags
-    from easi_jax.io.logs import read_logs
     from easi_jax.io.parameter_file import read_parameter_file
-    from easi_jax.log_data import (
-        pooled_noise,
-        split_held_out,
-        to_common_step,
-        without_odd_ends,
-    )
+    from train._log_problem import read_runs
 
     if not (math.isfinite(config.horizon) and config.horizon > 0):
         raise UserError(f"--horizon is {config.horizon:g}: give seconds above 0")
-    name, path, mj_model = _model(config.model)
+    name, path, mj_model = read_model(config.model)
     space = (
         own_space(mj_model)
         if config.parameters is None
         else read_parameter_file(config.parameters, mj_model)
     )
-    fit_files = [p for p in config.data if p not in config.held_out]
-    if not fit_files:
-        raise UserError("--held-out names all of --data: leave a log to fit")
-    log = read_logs(fit_files, mj_model, config.mapping)
-    notes = list(log.notes)
-    held_log = None
-    if config.held_out:
-        held_log = read_logs(list(config.held_out), mj_model, config.mapping)
-        notes += held_log.notes
-    noise = pooled_noise(log.runs)
-    late = velocity_lags(log.runs)
-    every = [*log.runs, *(held_log.runs if held_log else ())]
-    runs, changed = to_common_step(every)
-    notes += changed
-    fit, odd = without_odd_ends(runs[: len(log.runs)], noise)
-    notes += odd
-    if held_log is None:
-        fit, held, held_name = split_held_out(fit, config.horizon)
-    else:
-        held = runs[len(log.runs) :]
-        held_name = ", ".join(run.name for run in held)
+    runs = read_runs(config, mj_model, config.horizon)
+    late = velocity_lags(runs.recorded)
     joints = {int(d): mj_model.joint(j).name for j, d in enumerate(mj_model.jnt_dofadr)}
     return GapProblem(
         name,
         path,
         mj_model,
         space,
-        fit,
-        held,
-        held_name,
-        [run.name for run in held],
-        noise,
+        runs.fit,
+        runs.held,
+        runs.held_name,
+        [run.name for run in runs.held],
+        runs.noise,
         {joints[d]: lag for d, lag in late.items() if d in joints},
-        notes,
+        runs.notes,
     )
 
 
-def _model(text: str) -> tuple[str, Path | None, Any]:
+def read_model(text: str) -> tuple[str, Path | None, Any]:
+    """Name, path (None for a built-in robot) and compiled model.
+
+    Raises:
+        UserError: no such model.
+    """
     from envs import REGISTRY, make
     from train._log_problem import load_model
 

@@ -38,6 +38,22 @@ def sentence(found: Any) -> str:
     return _WORDS[place.effect].format(at=place.at, kind=place.kind, **shown)
 
 
+def parameters_text(found: Any, between: str) -> str:
+    """Parameters of an effect with deviation and unit."""
+    return between.join(
+        f"{k} {v:.4g} ± {s:.2g} {u}" for k, (v, s, u) in found.values.items()
+    )
+
+
+def disagreement(run: str, times: float) -> str:
+    """What to say of a run that the others contradict."""
+    return (
+        f'Run "{run}" disagrees with the others: the same model predicts it '
+        f"{times:.2g} times worse. Was it recorded with another payload, gain or "
+        "setting? Leave it out, or analyse it alone."
+    )
+
+
 def gap_json(problem: Any, analysis: Any, outcome: Any) -> dict[str, Any]:
     """The content of ``gap.json``, as the log format describes it."""
     from easi_jax import effects
@@ -68,8 +84,10 @@ def gap_json(problem: Any, analysis: Any, outcome: Any) -> dict[str, Any]:
                 "effect": "sensor_delay",
                 "at": f"qvel.{joint}",
                 "kind": "sensor",
-                "parameters": {"delay": {"value": lag, "std": 0.0, "unit": "s"}},
-                "confidence": 0.95,
+                "parameters": {
+                    "delay": {"value": lag.seconds, "std": lag.std, "unit": "s"}
+                },
+                "confidence": lag.confidence,
                 "indistinguishable": [],
                 "gap_after": last.gap,
             }
@@ -103,16 +121,24 @@ def gap_json(problem: Any, analysis: Any, outcome: Any) -> dict[str, Any]:
             for w in places
             if w.share > 0
         ],
+        "disagreeing_runs": outcome.disagreeing,
+        "record_next": outcome.record_next,
         "notes": outcome.notes,
         "seconds": outcome.seconds,
     }
 
 
 def write_results(
-    folder: Any, config: Any, problem: Any, analysis: Any, outcome: Any
+    folder: Any,
+    config: Any,
+    problem: Any,
+    analysis: Any,
+    outcome: Any,
+    retrained: dict[str, Any] | None = None,
 ) -> Path:
-    """Writes all files; returns the report's path."""
-    from easi_jax.io.effects_file import EffectEntry, write_effects
+    """Writes all files; returns the report's path. ``retrained``: see `_retrain`."""
+    from easi_jax.found_effects import EffectEntry
+    from easi_jax.io.effects_file import write_effects
     from easi_jax.io.repaired_model import repaired_xml
 
     entries = []
@@ -127,7 +153,7 @@ def write_results(
                     column_name(c): float(outcome.x[i])
                     for c, i in zip(f.place.columns, index, strict=True)
                 },
-                {},
+                {column_name(f.place.columns[k]): s for k, s in f.deviations.items()},
             )
         )
     shown = [{k: v for k, (v, _, _) in f.values.items()} for f in outcome.found]
@@ -145,8 +171,22 @@ def write_results(
         folder.write("model.xml", xml)
     content = gap_json(problem, analysis, outcome)
     content["not_in_model_xml"] = left
+    if retrained is not None:
+        content["retrained"] = retrained
     folder.write_json("gap.json", content)
     return _report(folder, config, problem, analysis, outcome, content)
+
+
+def retrained_line(retrained: dict[str, Any]) -> str:
+    """What the two trainings came to, in a sentence."""
+    from statistics import median
+
+    with_, without = (median(retrained[k].values()) for k in ("with", "without"))
+    return (
+        f"In the repaired model the policy of {retrained['robot']} that was trained "
+        f"with the effects returns {with_:.1f}, the one trained without them "
+        f"{without:.1f} (medians of {len(retrained['with'])} seeds)."
+    )
 
 
 def column_name(column: Any) -> str:
@@ -198,12 +238,15 @@ def _report(
             f"{100 * rest['share']:.0f} % of it sits "
             f'at "{rest["at"]}", {rest["when"]}.'
         )
+    lines += [disagreement(*item) for item in o.disagreeing.items()]
     for joint, lag in problem.late.items():
         lines.append(
             f'The measured velocity of "{joint}" lags its position by '
-            f"{1000 * lag:.0f} ms: a filter in the drive, not the plant. It is not "
-            "used."
+            f"{1000 * lag.seconds:.0f} ms: a filter in the drive, not the plant. It is "
+            "not used."
         )
+    if "retrained" in content:
+        lines.append(retrained_line(content["retrained"]))
     pictures = []
     labels = ["as given", "refitted", *[f"+ {f.place.key}" for f in o.found]]
     gaps = [o.before.gap, o.refit.gap, *[f.gap_after for f in o.found]]
@@ -219,6 +262,7 @@ def _report(
             "interval.",
         )
     )
+    pictures += _residual_map(problem, analysis, o)
     used = np.flatnonzero(np.isfinite(c.scale))[:6]
     w = _telling(o)
     measured, before, after = _traces(problem, o, w)
@@ -248,10 +292,7 @@ def _report(
                 (
                     f.place.effect,
                     f.place.at or "whole model",
-                    "; ".join(
-                        f"{k} {v:.4g} ± {s:.2g} {u}"
-                        for k, (v, s, u) in f.values.items()
-                    ),
+                    parameters_text(f, "; "),
                     f"{f.confidence:.2f}",
                     ", ".join(f.indistinguishable) or "none",
                 )
@@ -280,9 +321,23 @@ def _report(
             [(r["at"], r["share"], r["when"]) for r in content["where"]],
         ),
         Table(
+            "What to record next",
+            ["so that names can be told apart"],
+            [(line,) for line in o.record_next],
+        ),
+        Table(
             "The model's own parameters",
             ["address", "from", "to", "std"],
             [(r["address"], r["from"], r["to"], r["std"]) for r in o.refitted],
+        ),
+        Table(
+            "Return in the repaired model",
+            ["trained", "seed", "return"],
+            [
+                (f"{which} the effects", seed, f"{value:.1f}")
+                for which in ("without", "with")
+                for seed, value in content.get("retrained", {}).get(which, {}).items()
+            ],
         ),
     ]
     path = folder.path / "report.html"
@@ -300,6 +355,36 @@ def _report(
         ),
     )
     return path
+
+
+def _residual_map(problem: Any, analysis: Any, o: Any) -> list[Any]:
+    """A picture of where errors sit; none where no hinge or slide is compared."""
+    import numpy as np
+
+    from easi_jax import effects
+    from easi_jax.gap.where import condition_errors
+    from easi_jax.io.gap_figures import residual_maps
+    from easi_jax.io.report import Picture
+
+    c = o.channels
+    scalar = effects.scalar_joints(problem.mj_model)
+    joints, names, before = condition_errors(
+        o.before.errors, o.held, analysis.runs, c, scalar
+    )
+    if not joints:
+        return []
+    *_, after = condition_errors(o.after.errors, o.held, analysis.runs, c, scalar)
+    used = [d for _, d in scalar if np.isfinite(c.scale[d])]
+    floor = np.maximum(o.floor_si[used] / c.scale[used], 1e-12)
+    return [
+        Picture(
+            "Where and when",
+            residual_maps(joints, names, before, after, floor),
+            "Two maps of prediction errors, joints by conditions, of the model as "
+            "given and of the repaired one",
+            "RMS error on held-out data in units of the noise floor of each joint.",
+        )
+    ]
 
 
 def _telling(o: Any) -> Any:

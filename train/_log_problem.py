@@ -5,6 +5,8 @@ import math
 from pathlib import Path
 from typing import Any
 
+from train._effects import found_in, read_given
+
 HORIZON = 0.2  # s, of the error that is reported; pieces are no longer
 _ABOVE_NOISE = 30.0  # RMS motion over a piece in units of its noise
 FINISH = 0.5  # s, of pieces in the least-squares finish
@@ -49,44 +51,21 @@ def read_problem(config: Any) -> Problem:
     import numpy as np
 
     from easi_jax.errors import UserError
-    from easi_jax.io.logs import read_logs
-    from easi_jax.log_data import (
-        pooled_noise,
-        split_held_out,
-        to_common_step,
-        trusted_velocity,
-        visible_steps,
-        without_odd_ends,
-    )
+    from easi_jax.found_effects import joined
+    from easi_jax.log_data import trusted_velocity, visible_steps
     from easi_jax.machine import Machine
 
     name, mj_model, space = _model_and_space(config)
+    found = found_in(read_given(config).effects, str(config.effects))
+    space, fixed = joined(mj_model, space, found)
     if config.start is not None:
         space = space.scaled(*config.start)
     horizon = HORIZON if config.horizon is None else config.horizon
     if not (math.isfinite(horizon) and horizon > 0):
         raise UserError(f"--horizon is {horizon:g}: give seconds above 0")
-    fit_files = [p for p in config.data if p not in config.held_out]
-    if not fit_files:
-        raise UserError("--held-out names all of --data: leave a log to fit")
-    log = read_logs(fit_files, mj_model, config.mapping)
-    notes = list(log.notes)
-    held_log = None
-    if config.held_out:
-        held_log = read_logs(list(config.held_out), mj_model, config.mapping)
-        notes += held_log.notes
-    # Before interpolation, which would smooth the noise.
-    noise = pooled_noise(log.runs)
-    every = [*log.runs, *(held_log.runs if held_log else ())]
-    runs, changed = to_common_step(every)
-    notes += changed
-    fit, odd = without_odd_ends(runs[: len(log.runs)], noise)
-    notes += odd
-    if held_log is None:
-        fit, held, held_name = split_held_out(fit, horizon)
-    else:
-        held = runs[len(log.runs) :]
-        held_name = ", ".join(run.name for run in held)
+    measured_runs = read_runs(config, mj_model, horizon)
+    fit, held, noise = measured_runs.fit, measured_runs.held, measured_runs.noise
+    held_name, notes = measured_runs.held_name, measured_runs.notes
     nv = mj_model.nv
     if config.noise:
         noise = np.asarray(config.noise, float)
@@ -95,7 +74,7 @@ def read_problem(config: Any) -> Problem:
             f"--noise is {list(config.noise)}: {name} needs {2 * nv} numbers, 0 or "
             "more: positions, then velocities"
         )
-    machine = Machine(mj_model, space, fit[0].dt)
+    machine = Machine(mj_model, space, fit[0].dt, fixed=fixed)
     measured = np.array([run.qvel_measured for run in fit]).all() & np.all(
         [(trusted_velocity(run) == run.qvel).all(0) for run in fit], axis=0
     )
@@ -126,6 +105,65 @@ def read_problem(config: Any) -> Problem:
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class MeasuredRuns:
+    """Recordings as ``--data`` and ``--held-out`` name them, at one control step.
+
+    Attributes:
+        recorded: those not named by ``--held-out``, as they were recorded.
+        noise: of their positions and velocities, ``(2 nv,)``.
+        fit, held: runs.
+        held_name: which data are held out.
+        notes: what the user should know of the data.
+    """
+
+    recorded: tuple[Any, ...]
+    noise: Any
+    fit: list[Any]
+    held: list[Any]
+    held_name: str
+    notes: list[str]
+
+
+def read_runs(config: Any, mj_model: Any, horizon: float) -> MeasuredRuns:
+    """Reads ``config.data`` and ``config.held_out``.
+
+    Raises:
+        UserError: whatever is wrong with the files, or nothing is left to fit.
+    """
+    from easi_jax.errors import UserError
+    from easi_jax.io.logs import read_logs
+    from easi_jax.log_data import (
+        pooled_noise,
+        split_held_out,
+        to_common_step,
+        without_odd_ends,
+    )
+
+    fit_files = [p for p in config.data if p not in config.held_out]
+    if not fit_files:
+        raise UserError("--held-out names all of --data: leave a log to fit")
+    log = read_logs(fit_files, mj_model, config.mapping)
+    notes = list(log.notes)
+    held_log = None
+    if config.held_out:
+        held_log = read_logs(list(config.held_out), mj_model, config.mapping)
+        notes += held_log.notes
+    # Before interpolation, which would smooth the noise.
+    noise = pooled_noise(log.runs)
+    every = [*log.runs, *(held_log.runs if held_log else ())]
+    runs, changed = to_common_step(every)
+    notes += changed
+    fit, odd = without_odd_ends(runs[: len(log.runs)], noise)
+    notes += odd
+    if held_log is None:
+        fit, held, held_name = split_held_out(fit, horizon)
+    else:
+        held = runs[len(log.runs) :]
+        held_name = ", ".join(run.name for run in held)
+    return MeasuredRuns(log.runs, noise, fit, held, held_name, notes)
+
+
 def _check_lengths(fit: list[Any], held: list[Any], steps: int, dt: float) -> None:
     from easi_jax.errors import UserError
 
@@ -142,6 +180,7 @@ def _check_lengths(fit: list[Any], held: list[Any], steps: int, dt: float) -> No
 def _model_and_space(config: Any) -> tuple[str, Any, Any]:
     from easi_jax.errors import UserError
     from easi_jax.io.parameter_file import read_parameter_file
+    from easi_jax.parameters import ParameterSpace
 
     if config.model is None:
         if config.robot is None:
@@ -158,12 +197,14 @@ def _model_and_space(config: Any) -> tuple[str, Any, Any]:
         return env.name, env.mj_model, space
     if config.robot is not None:
         raise UserError("--model and --robot exclude each other: choose one")
-    if config.parameters is None:
+    if config.parameters is None and config.effects is None:
         raise UserError(
-            "--model needs --parameters P.yaml: say what may vary in the model (see "
-            "docs/your_own_robot.md)"
+            "--model needs --parameters P.yaml (or --effects E.yaml): say what may "
+            "vary in the model (see docs/your_own_robot.md)"
         )
     mj_model = load_model(config.model)
+    if config.parameters is None:
+        return config.model.stem, mj_model, ParameterSpace(())
     space = read_parameter_file(config.parameters, mj_model)
     return config.model.stem, mj_model, space
 

@@ -1,8 +1,10 @@
 """The chain on a built-in robot whose pseudo-real target is known."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from train._command import say, show_table
+from train._effects import effect_notes, read_given, robots, target_name
 from train._robots import (
     load_udr,
     save_policies,
@@ -48,9 +50,12 @@ def run(config: "Config") -> None:
             f"{config.udr} has no policy of seed {missing[0]}: it holds seeds "
             f"{list(udr['seeds'])}"
         )
-    env = udr["env"]
-    changes = target_of(env, config.target)
-    theta = target_parameters(env.space, changes)
+    given = read_given(config)
+    if given.effects is None:
+        given = replace(given, effects=udr["given"].effects)
+    env, real = robots(udr["env"], given)
+    changes = target_of(env, config.target, given)
+    theta = target_parameters((real or env).space, changes)
     noisy = any(x > 0 for x in config.noise)
     horizon = steps_of(config.horizon, env.dt, noisy)
     search = search_config(
@@ -72,20 +77,26 @@ def run(config: "Config") -> None:
             eval_episodes=config.eval_episodes,
         ),
         start=config.start,
+        real=real,
     )
+    if pipe.search.trainer and given.effects != udr["given"].effects:
+        raise UserError(
+            "policy_updates_per_generation goes on with the training of the UDR run: "
+            "run train.udr with the same --effects"
+        )
     index = np.array([udr["seeds"].index(s) for s in seeds])
     states = jax.tree.map(lambda x: x[index], udr["states"])
-    policies = pipe.policies(states)
+    policies = jax.tree.map(lambda x: x[index], udr["policies"])
     target = jnp.asarray(theta, jnp.float32)
     keys = stage_keys(seed_keys(list(seeds)))
     with RunFolder.open(
         config.out,
-        config,
+        given.recorded(config),
         command="train.easi",
         resume=config.resume,
         overwrite=config.overwrite,
     ) as folder:
-        notes: list[str] = []
+        notes = effect_notes(given)
         demos = jax.jit(pipe.demonstrate)(policies, target, keys["demonstrate"])
         training = states if pipe.search.trainer else ()
         advance = jit_chunks(
@@ -110,11 +121,18 @@ def run(config: "Config") -> None:
             checkpoints,
             config.refine,
         )
-        step = jit_chunks(
-            lambda s, dist, target, n: pipe.train_chunk(s, dist, target, n)
-        )
 
-        def train(name: str, dist: Any, first: Any, total: int) -> Any:
+        def steps(pipe: Pipeline) -> Any:
+            return jit_chunks(
+                lambda s, dist, target, n: pipe.train_chunk(s, dist, target, n)
+            )
+
+        compiled = steps(pipe)
+
+        def train(
+            name: str, dist: Any, first: Any, total: int, where: Pipeline = pipe
+        ) -> Any:
+            step = compiled if where is pipe else steps(where)
             return run_stage(
                 folder,
                 name,
@@ -135,14 +153,16 @@ def run(config: "Config") -> None:
         first = udr["method"]
         trained = {first: policies, "EASI": pipe.policies(final)}
         if config.oracle:
-            many = pipe.spread(pipe.point(target), len(seeds))
+            there = pipe if real is None else Pipeline(real, pipe.config)
+            many = there.spread(there.point(target), len(seeds))
             oracle = train(
                 "oracle",
                 many,
-                lambda: pipe.train_init(keys["oracle"], many),
-                pipe.config.training.iterations,
+                lambda: there.train_init(keys["oracle"], many),
+                there.config.training.iterations,
+                there,
             )
-            trained["Oracle"] = pipe.policies(oracle)
+            trained["Oracle"] = there.policies(oracle)
         for name, policy in trained.items():
             save_policies(folder, name, policy)
         play = jax.jit(pipe.play)
@@ -151,7 +171,8 @@ def run(config: "Config") -> None:
         errors = held_out_errors(pipe, estimate, theta, policies, keys["evaluate"])
         curves = {"EASI": training_curve(folder.path, "final", seeds)}
         udr_steps = training_curve(config.udr, "train", seeds)
-        if udr["config"]["target"] == list(changes):
+        same = udr["given"].target_effects == given.target_effects
+        if same and udr["config"]["target"] == list(changes):
             curves = {first: udr_steps, **curves}
         if config.oracle:
             curves["Oracle"] = training_curve(folder.path, "oracle", seeds)
@@ -159,9 +180,10 @@ def run(config: "Config") -> None:
 
         rows = write_pseudo_real(
             folder, pipe, estimate, theta, seeds, returns, errors, curves,
-            played["EASI"][1][0], notes, udr["config"].get("option", ()),
+            played["EASI"][1][0], notes,
+            {"option": udr["config"].get("option", ()), **given.results()},
         )  # fmt: skip
-    names = ", ".join(changes) or "nominal"
+    names = target_name(changes, given)
     show_table(
         f"Return in the target ({names})",
         ("method", "median", *(f"seed {s}" for s in seeds)),

@@ -1,6 +1,6 @@
 """What a finished search leaves in its folder: numbers, figures, the report."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 
@@ -142,6 +142,26 @@ def motion_strip(env: Any, qpos: Any, method: str, notes: list[str]) -> list[Any
     ]
 
 
+def truth_of(pipe: Any, theta: Any) -> Any:
+    """True values ``(n,)`` of the search's parameters, from those of the real robot;
+    what that lacks has no strength there."""
+    import numpy as np
+
+    from easi_jax.addresses import nominal
+
+    real = pipe.real.space
+    known = dict(zip(real.names, np.asarray(theta, float), strict=True))
+    fixed = pipe.real.machine.fixed
+    out = []
+    for p in pipe.space.parameters:
+        value = known.get(p.name)
+        if value is None and p.addresses[0].startswith("effect."):
+            value = fixed.get(p.addresses[0])
+            value = nominal(pipe.env.mj_model, p.addresses) if value is None else value
+        out.append(np.nan if value is None else value)
+    return np.array(out)
+
+
 def write_pseudo_real(
     folder: Any,
     pipe: Any,
@@ -153,12 +173,13 @@ def write_pseudo_real(
     curves: dict[str, Any],
     motion: Any,
     notes: Sequence[str],
-    option: Sequence[str],
+    made_with: Mapping[str, Any],
 ) -> tuple[tuple[str, ...], list[tuple[Any, ...]]]:
     """Writes results, figures and report; returns the parameter table.
 
-    ``motion (T + 1, nq)``: an episode of the EASI policy. ``option``: of the built-in
-    robot, so that its policies can be loaded again.
+    ``motion (T + 1, nq)``: an episode of the EASI policy. ``made_with``: options of the
+    robot and its effects, so that its policies can be loaded again. ``theta`` belongs
+    to the robot that stands for the real one.
     """
     import numpy as np
 
@@ -175,6 +196,7 @@ def write_pseudo_real(
     from easi_jax.rl.presets import algorithm_of
 
     space, config, notes = pipe.space, pipe.config, list(notes)
+    theta = truth_of(pipe, theta)
     dist = estimate.distribution
     results = []
     for i in range(len(seeds)):
@@ -203,7 +225,7 @@ def write_pseudo_real(
         {
             "robot": pipe.env.name,
             "env": folder.config.get("env"),
-            "option": list(option),
+            **made_with,
             "seeds": list(seeds),
             "env_steps": config.training.env_steps,
             "algorithm": algorithm_of(config.training),

@@ -4,6 +4,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from train._effects import Given, robots
+
 
 def training_config(
     env: Any, env_steps: int | None = None, algorithm: str | None = None
@@ -83,7 +85,7 @@ def training_chunk(chunk: int | None, training: Any) -> int:
 
 
 def env_of(folder: Path, made_with: Any, path: Path | None) -> Any:
-    """The environment that a run folder was made with.
+    """The environment that a run folder was made with, its effects left out.
 
     Args:
         folder: named in messages.
@@ -111,9 +113,14 @@ def env_of(folder: Path, made_with: Any, path: Path | None) -> Any:
     return open_env(made_with["robot"], path, made_with.get("option", ()))
 
 
-def target_of(env: Any, given: tuple[str, ...] | None) -> tuple[str, ...]:
-    """Changes of the pseudo-real robot; the environment's own where none are given."""
-    return getattr(env, "default_target", ()) if given is None else given
+def target_of(
+    env: Any, changes: tuple[str, ...] | None, given: Given
+) -> tuple[str, ...]:
+    """Changes of the pseudo-real robot; where none are given the environment's own, or
+    nothing besides the effects that it was given."""
+    if changes is not None:
+        return changes
+    return () if given.target_effects else getattr(env, "default_target", ())
 
 
 def save_policies(folder: Any, method: str, policies: Any) -> None:
@@ -125,7 +132,10 @@ def save_policies(folder: Any, method: str, policies: Any) -> None:
 
 
 def load_policies(
-    folder: Path, method: str | None = None, env_file: Path | None = None
+    folder: Path,
+    method: str | None = None,
+    env_file: Path | None = None,
+    given: Given | None = None,
 ) -> dict[str, Any]:
     """Policies of a finished run of train.udr, train.easi or train.pipeline.
 
@@ -133,9 +143,11 @@ def load_policies(
         folder: the run folder.
         method: UDR, Fixed, EASI or Oracle; the run's own where not given.
         env_file: see `env_of`.
+        given: effects that the robot has; the run's own where there are none.
 
     Returns:
-        ``env``, ``seeds``, ``training``, ``method`` and ``policies`` ``(S, ...)``.
+        ``env``, ``seeds``, ``training``, ``method``, ``policies`` ``(S, ...)``, and the
+        effects that ``env`` has, ``given``.
 
     Raises:
         UserError: no finished run, or none of that method.
@@ -163,7 +175,10 @@ def load_policies(
             f'{folder} has no policy "{chosen}" (it has '
             f"{', '.join(result['methods'])}){nearest(chosen, result['methods'])}"
         )
-    env, seeds = env_of(folder, result, env_file), tuple(result["seeds"])
+    if given is None or given.effects is None:
+        given = Given(result.get("effects"))
+    env = robots(env_of(folder, result, env_file), given)[0]
+    seeds = tuple(result["seeds"])
     training = training_config(env, result["env_steps"], result.get("algorithm", "sac"))
     pipe = Pipeline(env, PipelineConfig(training=training))
     keys = jax.random.split(jax.random.key(0), len(seeds))
@@ -182,13 +197,14 @@ def load_policies(
         "training": training,
         "method": chosen,
         "policies": found.state,
+        "given": given,
     }
 
 
 def load_udr(folder: Path, env_file: Path | None = None) -> dict[str, Any]:
-    """What ``train.udr`` left: environment, seeds, settings, training states.
+    """What ``train.udr`` left: seeds, settings, policies, training states.
 
-    ``env_file``: see `env_of`.
+    ``env_file``: see `env_of`. ``env`` has no effects yet; ``given`` are the run's.
 
     Raises:
         UserError: the folder holds no finished run of train.udr.
@@ -208,8 +224,12 @@ def load_udr(folder: Path, env_file: Path | None = None) -> dict[str, Any]:
             f"{folder} holds an unfinished run of train.udr: finish it with --resume"
         )
     env = env_of(folder, config, env_file)
+    given = Given(config.get("effects"), config.get("target_effects"))
+    trained, real = robots(env, given)
+    if config.get("fixed"):
+        trained = real or trained
     training = training_config(env, config["env_steps"], config.get("algorithm"))
-    pipe = Pipeline(env, PipelineConfig(training=training))
+    pipe = Pipeline(trained, PipelineConfig(training=training))
     seeds = tuple(int(s) for s in config["seeds"])
     keys = seed_keys(list(seeds))
     wide = pipe.spread(pipe.udr(), len(seeds))
@@ -224,6 +244,8 @@ def load_udr(folder: Path, env_file: Path | None = None) -> dict[str, Any]:
         "seeds": seeds,
         "training": training,
         "states": found.state,
+        "policies": pipe.policies(found.state),
+        "given": given,
         "config": config,
         "method": "Fixed" if config.get("fixed") else "UDR",
     }

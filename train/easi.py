@@ -28,6 +28,13 @@ class Config:
     """The pseudo-real robot: parameters that differ from the nominal ones, as
     NAME*FACTOR or NAME=VALUE; not given: half of what the paper's Fig. 6 changes, such
     as cart_kp*0.5 for cartpole."""
+    effects: Path | None = None
+    """Effects that the model lacks (effects.yaml of train.gap): the model gets them,
+    and their parameters are searched with the others; not given: those of the UDR run.
+    """
+    target_effects: Path | None = None
+    """An effects file for the pseudo-real robot alone: it has these effects whether
+    --effects names them or not (without --target, nothing else differs)."""
     data: tuple[Path, ...] = ()
     """Measured logs (CSV, NPZ or Parquet) in place of a pseudo-real target."""
     held_out: tuple[Path, ...] = ()
@@ -95,6 +102,8 @@ def run(config: Config) -> None:
     if config.data:
         from train import _from_logs
 
+        if config.target_effects:
+            raise UserError("--target-effects goes without --data: logs have their own")
         _from_logs.run(config)
         return
     for option in ("model", "parameters", "mapping", "held_out", "robot"):

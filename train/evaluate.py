@@ -24,6 +24,9 @@ class Config:
     target: tuple[str, ...] = ()
     """The robot to test in: parameters that differ from the nominal ones, as
     NAME*FACTOR or NAME=VALUE."""
+    effects: Path | None = None
+    """Effects of the robot to test in (effects.yaml of train.gap); not given: those
+    that the policy was trained with."""
     episodes: int = 100
     """Episodes for each seed."""
     seed: int = 0
@@ -44,13 +47,15 @@ def run(config: Config) -> None:
     from easi_jax.io.files import atomic_write, to_json
     from easi_jax.io.video import check_video, render, write_video
     from easi_jax.pipeline import Pipeline, PipelineConfig, target_parameters
+    from train._effects import effect_notes, read_given
     from train._robots import load_policies
 
     if config.episodes < 1:
         raise UserError(f"--episodes is {config.episodes}: give at least 1")
     if config.render is not None:
         check_video(config.render)
-    saved = load_policies(config.run, config.policy, config.env)
+    given = read_given(config)
+    saved = load_policies(config.run, config.policy, config.env, given)
     env = saved["env"]
     theta = target_parameters(env.space, config.target)
     pipe = Pipeline(
@@ -72,6 +77,8 @@ def run(config: Config) -> None:
         ("seed", "mean return", "std of episodes", "worst episode"),
         rows,
     )
+    for note in effect_notes(saved["given"]):
+        say(note)
     if config.out is not None:
         result = {
             "robot": env.name,
@@ -80,6 +87,7 @@ def run(config: Config) -> None:
             "returns": {
                 str(s): r.tolist() for s, r in zip(saved["seeds"], returns, strict=True)
             },
+            **saved["given"].results(),
         }
         config.out.parent.mkdir(parents=True, exist_ok=True)
         atomic_write(config.out, to_json(result))

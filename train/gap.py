@@ -36,6 +36,14 @@ class Config:
     friction and stiffness that the model states, each within a factor of 5."""
     mapping: Path | None = None
     """Mapping file (YAML) for logs with foreign column names."""
+    retrain: str | None = None
+    """Robot with a task (built-in, or a Python file as --env takes it) whose policy is
+    then trained with what was found and without it, both tested in the repaired model.
+    """
+    retrain_steps: int | None = None
+    """Control steps of each of both trainings; the robot's preset where not given."""
+    retrain_seeds: tuple[int, ...] = (0,)
+    """Seeds of the trainings."""
     overwrite: bool = False
     """Delete the results in the folder first."""
 
@@ -45,11 +53,16 @@ def run(config: Config) -> None:
     from easi_jax.errors import UserError
     from easi_jax.io.runs import RunFolder
     from train._gap_problem import read_gap_problem
-    from train._gap_results import write_results
+    from train._gap_results import retrained_line, write_results
+    from train._retrain import check_robot, retrain
+    from train._robots import check_seeds
 
     if not config.model or not config.data:
         raise UserError("give --model M.xml (or a robot's name) and --data LOG...")
+    check_seeds(config.retrain_seeds)
     problem = read_gap_problem(config)
+    if config.retrain is not None:
+        check_robot(config.retrain, problem.mj_model)
     from easi_jax.gap.analysis import Analysis
 
     analysis = Analysis(
@@ -68,18 +81,68 @@ def run(config: Config) -> None:
             say(f"note: {note}")
         outcome = analysis.run()
         outcome.notes = problem.notes
+        outcome.record_next = _record_next(analysis, outcome, problem, config.horizon)
         report = write_results(folder, config, problem, analysis, outcome)
+        retrained = None
+        if config.retrain is not None and (outcome.found or outcome.refitted):
+            retrained = retrain(
+                config.retrain,
+                config.out,
+                config.out / "effects.yaml",
+                config.retrain_seeds,
+                config.retrain_steps,
+            )
+            write_results(folder, config, problem, analysis, outcome, retrained)
     _show(outcome)
+    if retrained is not None:
+        say(retrained_line(retrained))
     say(f"report: {report}")
 
 
+_ASKED = 3  # rivals of an effect that a test is looked for
+_LONGEST_TEST, _ROWS = 20.0, 5_000  # s, and rows
+
+
+def _record_next(
+    analysis: Any, outcome: Any, problem: Any, horizon: float
+) -> list[str]:
+    """What to record, so that names can be told apart that these data cannot."""
+    from easi_jax.excite.propose import propose, quick_tests
+
+    open_names = [f for f in outcome.found if f.indistinguishable]
+    if not open_names:
+        return []
+    say("looking for what to record next ...")
+    known = {p.key: p for p in (*analysis.places, *analysis.ripples)}
+    # Rows cost time, whatever their rate.
+    seconds = max(10 * horizon, min(_LONGEST_TEST, _ROWS * problem.fit[0].dt))
+    plan = quick_tests(problem.mj_model, problem.fit, seconds)
+    said = []
+    for f in open_names:
+        proposals = propose(
+            problem.mj_model,
+            analysis.predictor,
+            analysis.bounds,
+            outcome.x,
+            outcome.active,
+            f.place,
+            [known[key] for key in f.indistinguishable[:_ASKED]],
+            problem.fit,
+            analysis.noise,
+            horizon,
+            plan,
+        )
+        said += [p.text() for p in proposals]
+    return said
+
+
 def _show(outcome: Any) -> None:
+    from train._gap_results import disagreement, parameters_text
+
     rows = [
         (
             f"{f.place.effect} at {f.place.at}" if f.place.at else f.place.effect,
-            ", ".join(
-                f"{k} {v:.4g} ± {s:.2g} {u}" for k, (v, s, u) in f.values.items()
-            ),
+            parameters_text(f, ", "),
             f"{f.confidence:.2f}",
             ", ".join(f.indistinguishable) or "-",
         )
@@ -91,6 +154,10 @@ def _show(outcome: Any) -> None:
             ["effect", "parameters", "confidence", "as good"],
             rows,
         )
+    for item in outcome.disagreeing.items():
+        say(disagreement(*item))
+    for line in outcome.record_next:
+        say(line)
     say(
         f"verdict: {outcome.verdict}; gap {outcome.before.gap:.3g} as given, "
         f"{outcome.refit.gap:.3g} refitted, {outcome.after.gap:.3g} after, floor "

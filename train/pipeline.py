@@ -31,6 +31,12 @@ class Config:
     """The pseudo-real robot: parameters that differ from the nominal ones, as
     NAME*FACTOR or NAME=VALUE; not given: half of what the paper's Fig. 6 changes, such
     as cart_kp*0.5 for cartpole."""
+    effects: Path | None = None
+    """Effects that the model lacks (effects.yaml of train.gap): the robot gets them,
+    and their parameters vary with the others."""
+    target_effects: Path | None = None
+    """An effects file for the pseudo-real robot alone: it has these effects whether
+    --effects names them or not (without --target, nothing else differs)."""
     seeds: tuple[int, ...] = (0,)
     """Seeds, each an independent chain."""
     env_steps: int | None = None
@@ -63,6 +69,7 @@ class Config:
 
 def run(config: Config) -> None:
     """Compiles, runs and reports."""
+    from train._effects import effect_notes, read_given, robots, target_name
     from train._pseudo_real import steps_of
     from train._robots import (
         check_seeds,
@@ -91,9 +98,10 @@ def run(config: Config) -> None:
     from train._results import write_pseudo_real
     from train._stages import search_rows, training_rows
 
-    env = open_env(config.robot, config.env, config.option)
-    changes = target_of(env, config.target)
-    theta = target_parameters(env.space, changes)
+    given = read_given(config)
+    env, real = robots(open_env(config.robot, config.env, config.option), given)
+    changes = target_of(env, config.target, given)
+    theta = target_parameters((real or env).space, changes)
     noisy = any(x > 0 for x in config.noise)
     search = search_config(
         config.preset,
@@ -114,10 +122,14 @@ def run(config: Config) -> None:
             eval_episodes=config.eval_episodes,
         ),
         start=config.start,
+        real=real,
     )
     target, keys = jnp.asarray(theta, jnp.float32), seed_keys(list(config.seeds))
     with RunFolder.open(
-        config.out, config, command="train.pipeline", overwrite=config.overwrite
+        config.out,
+        given.recorded(config),
+        command="train.pipeline",
+        overwrite=config.overwrite,
     ) as folder:
         say("compiling one program for the whole chain ...")
         begin = time.monotonic()
@@ -161,11 +173,15 @@ def run(config: Config) -> None:
         write_pseudo_real(
             folder, pipe, out["estimate"], theta, config.seeds, returns, errors, curves,
             out["motion"][0],
-            [f"one program: compiled in {compiled - begin:.0f} s, ran {seconds:.0f} s"],
-            config.option,
+            [
+                f"one program: compiled in {compiled - begin:.0f} s, ran "
+                f"{seconds:.0f} s",
+                *effect_notes(given),
+            ],
+            {"option": list(config.option), **given.results()},
         )  # fmt: skip
     show_table(
-        f"Return in the target ({', '.join(changes) or 'nominal'})",
+        f"Return in the target ({target_name(changes, given)})",
         ("method", "median", *(f"seed {s}" for s in config.seeds)),
         [
             (name, f"{np.median(r):.1f}", *(f"{x:.1f}" for x in r))

@@ -30,6 +30,11 @@ class Config:
     target: tuple[str, ...] = ()
     """Where the policy is evaluated: the nominal robot with parameters changed, as
     NAME*FACTOR or NAME=VALUE."""
+    effects: Path | None = None
+    """Effects that the model lacks (effects.yaml of train.gap): the robot gets them,
+    and their parameters vary with the others."""
+    target_effects: Path | None = None
+    """An effects file for the target alone, instead of --effects."""
     fixed: bool = False
     """Train in the target itself, without randomization: the nominal model where no
     target is given."""
@@ -50,6 +55,7 @@ class Config:
 
 def run(config: Config) -> None:
     """Trains, evaluates and writes the run folder."""
+    from train._effects import effect_notes, read_given, robots
     from train._robots import (
         check_chunk,
         check_seeds,
@@ -80,24 +86,26 @@ def run(config: Config) -> None:
     from train._results import motion_strip, per_seed_json
     from train._stages import jit_chunks, run_stage, training_curve, training_rows
 
-    env = open_env(config.robot, config.env, config.option)
+    given = read_given(config)
+    env, real = robots(open_env(config.robot, config.env, config.option), given)
     training = training_config(env, config.env_steps, config.algorithm)
-    theta = target_parameters(env.space, config.target)
+    theta = target_parameters((real or env).space, config.target)
     method = "Fixed" if config.fixed else "UDR"
     how = "in the target itself" if config.fixed else "under uniform randomization"
-    pipe = Pipeline(
-        env, PipelineConfig(training=training, eval_episodes=config.eval_episodes)
-    )
+    settings = PipelineConfig(training=training, eval_episodes=config.eval_episodes)
+    if config.fixed:
+        env, real = real or env, None
+    pipe = Pipeline(env, settings, real=real)
     target = jnp.asarray(theta, jnp.float32)
     keys = stage_keys(seed_keys(list(config.seeds)))
     with RunFolder.open(
         config.out,
-        config,
+        given.recorded(config),
         command="train.udr",
         resume=config.resume,
         overwrite=config.overwrite,
     ) as folder:
-        notes: list[str] = []
+        notes = effect_notes(given)
         physics = pipe.point(target) if config.fixed else pipe.udr()
         wide = pipe.spread(physics, len(config.seeds))
         step = jit_chunks(
@@ -125,8 +133,9 @@ def run(config: Config) -> None:
             "env_steps": training.env_steps,
             "algorithm": algorithm_of(training),
             "methods": [method],
-            "target": dict(zip(env.space.names, theta.tolist(), strict=True)),
+            "target": dict(zip(pipe.real.space.names, theta.tolist(), strict=True)),
             "returns": {method: per_seed_json(config.seeds, per_seed)},
+            **given.results(),
         }
         folder.write_json("results.json", results)
         steps, curve = training_curve(folder.path, "train", config.seeds)

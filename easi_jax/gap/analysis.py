@@ -15,11 +15,10 @@ import numpy as np
 
 from easi_jax.errors import UserError
 from easi_jax.gap import measure
-from easi_jax.gap.fit import Bounds, window_weights
+from easi_jax.gap.fit import bounds_of, window_weights
 from easi_jax.gap.outcome import Figures, Found, Outcome, for_people
-from easi_jax.gap.predictor import Predictor, join, window_set
+from easi_jax.gap.predictor import BLOCK, Predictor, join, window_set
 from easi_jax.gap.residuals import (
-    Residuals,
     make_residuals,
     start_sensitivity,
     velocity_slack,
@@ -35,7 +34,7 @@ from easi_jax.gap.selection import (
     shortlist,
     simplest,
 )
-from easi_jax.gap.table import Layout, Place, places, ripples
+from easi_jax.gap.table import REFITTED, Layout, Place, covered, places, ripples
 from easi_jax.parameters import ParameterSpace
 from easi_jax.recording import Run, physics_steps
 
@@ -43,6 +42,7 @@ _FITTED = (32, 96)  # windows that fits see
 _STEPS = 9_600  # physics steps in them
 _BLOCKS = 10
 _MOST = 5  # effects
+_STAGES = 8  # of adding one and taking out what has become needless
 _RIPPLES = [0.75 * k for k in range(3, 27)]  # cycles over the range of a joint
 _CLOSED = 1.1  # times the floor: nothing left to explain
 _GOAL = 1.25
@@ -77,7 +77,7 @@ class Analysis:
         dt = fit[0].dt
         self.scales = scales_of(mj_model, fit)
         self.everywhere = places(mj_model, self.scales)
-        self.places = [p for p in self.everywhere if self._offered(p)]
+        self.places = [p for p in self.everywhere if not covered(p, space)]
         self.ripples = [
             p
             for j in range(mj_model.njnt)
@@ -85,10 +85,8 @@ class Analysis:
             for p in ripples(mj_model, j, self.scales, self._cycles(j))
         ]
         layout = Layout(mj_model, [*self.everywhere, *self.ripples])
-        past = math.ceil(self.scales.longest / dt) + 1
-        late = math.ceil(self.scales.longest / dt)
-        fitted = window_set(fit, horizon, past, late)
-        kept = window_set(held, horizon, past, late, len(fit))
+        fitted = window_set(fit, horizon, self.scales.longest)
+        kept = window_set(held, horizon, self.scales.longest, len(fit))
         if fitted is None or kept is None:
             what = "to fit" if fitted is None else "held out"
             raise UserError(
@@ -99,13 +97,17 @@ class Analysis:
         most = min(max(_STEPS // physics, _FITTED[0]), _FITTED[1])
         chosen = _spread(len(fitted), most)
         self.fit_windows, self.held = fitted.take(chosen), kept
-        pad = -len(self.fit_windows) % 16
+        pad = -len(self.fit_windows) % BLOCK
         repeated = np.r_[np.arange(len(chosen)), np.full(pad, len(chosen) - 1)]
         self.predictor = Predictor(
-            mj_model, space, layout, join([fitted.take(chosen[repeated]), kept]), dt
+            mj_model,
+            space,
+            layout,
+            join([fitted.take(chosen[repeated]), kept]),
+            dt,
         )
-        self.fit_blocks = np.arange(len(repeated) // 16)
-        self.held_blocks = np.arange(len(repeated) // 16, self.predictor.blocks)
+        self.fit_blocks = np.arange(len(repeated) // BLOCK)
+        self.held_blocks = np.arange(len(repeated) // BLOCK, self.predictor.blocks)
         machine = self.predictor.machine
         self.channels = measure.channels(
             mj_model,
@@ -119,31 +121,17 @@ class Analysis:
                 "nothing moves by more than five times its noise over a horizon of "
                 f"{horizon:g} s: record larger or faster motion, or lengthen --horizon"
             )
-        self.slack = velocity_slack(fit, self.noise, dt / machine.substeps)
-        low, high = space.bounds
-        columns = layout.columns
-        nominal = np.asarray(space.nominal, float)
-        self.bounds = Bounds(
-            np.r_[low, [c.low for c in columns]],
-            np.r_[high, [c.high for c in columns]],
-            np.r_[0.05 * np.abs(nominal), [c.size for c in columns]],
-        )
+        self.slack = velocity_slack(fit, dt / machine.substeps)
+        self.bounds = bounds_of(space, layout)
         count = len(self.fit_windows)
         self.group = np.arange(count) * min(_BLOCKS, count) // count
         self.selector = Selector(
             self.predictor,
-            Residuals(
-                np.zeros((1, 1)),
-                self.channels.scale,
-                np.zeros((1, 1, 1)),
-                np.zeros((1, 1, 1)),
-            ),
             self.fit_blocks,
             count,
             self.bounds,
             self.group,
             range(space.size),
-            tell,
         )
 
     def _cycles(self, j: int) -> list[float]:
@@ -151,17 +139,6 @@ class Analysis:
         span = float(self.scales.span[int(self.m.jnt_dofadr[j])])
         slow = 1 if self.m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE else 2
         return [slow * k * 2 * math.pi / span for k in _RIPPLES]
-
-    def _offered(self, place: Place) -> bool:
-        """Whether an effect is not what the model's own refit already covers."""
-        same = {
-            "viscous_damping": "damping",
-            "coulomb_friction": "frictionloss",
-            "joint_stiffness": "stiffness",
-        }
-        quantity = same.get(place.effect)
-        own = {a for p in self.space.parameters for a in p.addresses}
-        return quantity is None or f"joint.{place.at}.{quantity}" not in own
 
     # -- pieces ----------------------------------------------------------------
 
@@ -199,11 +176,10 @@ class Analysis:
         return np.concatenate([position, speed])
 
     def refit(self, own: Sequence[int]) -> Model:
-        """The model as given with some of its own parameters refitted."""
+        """The model as given, whitened there, with some of its own parameters
+        refitted."""
         self.selector.own = tuple(own)
-        x = self.predictor.neutral.copy()
-        self.whiten(x)
-        model = self.selector.fit([], x)
+        model = self.selector.fit([], self.predictor.neutral)
         if own:
             self.whiten(model.fit.x)
             self.selector.weight = window_weights(model.fit.residual)
@@ -250,6 +226,18 @@ class Analysis:
         error = moved[:, :count] - still[:, :count] - targets
         return np.mean(error.astype(float) ** 2, (0, 1, 2))
 
+    def disagreeing(self, x: np.ndarray, kept: Figures) -> dict[str, float]:
+        """Runs whose windows are predicted far worse than the others', by how much.
+
+        ``kept``: the held-out figures at ``x``.
+        """
+        count = len(self.fit_windows)
+        fitted = self.predictor.errors(x[None], self.fit_blocks)[0][:count]
+        square = np.concatenate([measure.squares(fitted), kept.square])
+        run = np.concatenate([self.fit_windows.run, self.held.run])
+        odd = measure.odd_runs(square, self.channels.scale, run)
+        return {self.runs[r].name: ratio for r, ratio in odd.items()}
+
     # -- the whole -------------------------------------------------------------
 
     def run(self) -> Outcome:
@@ -269,6 +257,7 @@ class Analysis:
             self.tell(f"{names}: refitted to a bound, so undone")
             for i in stuck:
                 self._offer(self.space.parameters[i].addresses)
+            self.whiten(self.predictor.neutral)
             base = self.refit([i for i in own if i not in stuck])
         return self.measured(base, self.select(base), began)
 
@@ -277,17 +266,12 @@ class Analysis:
         return bool(x[i] <= low * 1.001 or x[i] >= high * 0.999)
 
     def _offer(self, addresses: Sequence[str]) -> None:
-        kinds = {
-            "damping": "viscous_damping",
-            "frictionloss": "coulomb_friction",
-            "stiffness": "joint_stiffness",
-        }
         for address in addresses:
             name, quantity = address.split(".", 1)[1].rsplit(".", 1)
             self.places += [
                 p
                 for p in self.everywhere
-                if p.at == name and p.effect == kinds.get(quantity)
+                if p.at == name and REFITTED.get(p.effect) == quantity
             ]
 
     def select(self, base: Model) -> Model:
@@ -297,7 +281,9 @@ class Analysis:
         what one alone, and wrong, does nearly as well.
         """
         chosen, model, beam = self.selector, base, [base]
-        while len(model.places) < _MOST:
+        for _ in range(_STAGES):
+            if len(model.places) >= _MOST:
+                break
             self.whiten(model.fit.x)
             chosen.weight = window_weights(
                 chosen.fit(model.places, model.fit.x).fit.residual
@@ -306,6 +292,8 @@ class Analysis:
             if self.fit_gap <= _CLOSED * self.fit_floor:
                 break
             found: dict[frozenset[str], Model] = {}
+            # What was taken out of the best may still be in the others.
+            beam = [b for b in beam if len(b.places) <= len(model.places)]
             for parent in beam:
                 if parent is not beam[0]:
                     parent = chosen.fit(parent.places, parent.fit.x)
@@ -351,7 +339,6 @@ class Analysis:
         refit = self.figures(base.fit.x)
         after = self.figures(model.fit.x) if model.places else refit
         floor = self.floor(model.fit.x if model.places else base.fit.x)
-        steps = []
         found = []
         deviation = self.deviations(model)
         for k, place in enumerate(model.places):
@@ -382,9 +369,9 @@ class Analysis:
                     1.0 / (1.0 + odds),
                     same,
                     figures.gap,
+                    self.column_deviations(model, place, deviation),
                 )
             )
-            steps.append((place.key, figures.gap))
         floor_gap = float(measure.gap(floor, scale))
         goal = _GOAL * floor_gap
         if refit.gap <= goal:
@@ -396,6 +383,7 @@ class Analysis:
         if verdict == "no_gap":
             found = []
             after = refit
+        x = model.fit.x if found else base.fit.x
         return Outcome(
             verdict=verdict,
             found=found,
@@ -407,8 +395,9 @@ class Analysis:
             floor_si=np.sqrt(floor),
             channels=self.channels,
             held=self.held,
-            x=model.fit.x if found else base.fit.x,
-            steps=steps,
+            x=x,
+            active=model.fit.active.tolist(),
+            disagreeing=self.disagreeing(x, after),
             seconds=time.perf_counter() - began,
         )
 
@@ -437,19 +426,30 @@ class Analysis:
         cov = np.where(np.diag(scattered) > np.diag(inverse), scattered, inverse)
         return np.sqrt(np.maximum(np.diag(cov), 0.0)) * size
 
+    def column_deviations(
+        self, model: Model, place: Place, deviation: np.ndarray
+    ) -> dict[int, float]:
+        """Of a place's columns that the fit moved, by number."""
+        index = self.selector.columns(place, fitted=False).tolist()
+        active = model.fit.active.tolist()
+        return {
+            k: float(deviation[active.index(i)])
+            for k, i in enumerate(index)
+            if i in active
+        }
+
     def values(
         self, model: Model, place: Place, deviation: np.ndarray
     ) -> dict[str, tuple[float, float, str]]:
         """Parameters of an effect as the table names them."""
         index = self.selector.columns(place, fitted=False)
-        active = model.fit.active.tolist()
+        std = self.column_deviations(model, place, deviation)
         got = {}
-        for i, c in zip(index, place.columns, strict=True):
+        for k, (i, c) in enumerate(zip(index, place.columns, strict=True)):
             if c.parameter:
-                std = deviation[active.index(int(i))] if int(i) in active else 0.0
                 got[c.parameter] = (
                     c.of * float(model.fit.x[i]),
-                    c.of * float(std),
+                    c.of * std.get(k, 0.0),
                     c.unit,
                 )
         return for_people(place, got)

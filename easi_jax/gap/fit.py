@@ -10,6 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from easi_jax.gap.table import Layout
+from easi_jax.parameters import ParameterSpace
+
 _ROUNDS = 12
 _DAMPING = (1.0, 30.0, 1000.0)
 _PAYS = 0.05  # relative gain of a round that lets slopes be followed further
@@ -48,6 +51,17 @@ class Bounds:
     low: np.ndarray
     high: np.ndarray
     size: np.ndarray
+
+
+def bounds_of(space: ParameterSpace, layout: Layout) -> Bounds:
+    """Of a whole vector: the model's own parameters, then the columns of effects."""
+    low, high = space.bounds
+    nominal, columns = np.asarray(space.nominal, float), layout.columns
+    return Bounds(
+        np.r_[low, [c.low for c in columns]],
+        np.r_[high, [c.high for c in columns]],
+        np.r_[0.05 * np.abs(nominal), [c.size for c in columns]],
+    )
 
 
 def window_weights(residual: np.ndarray) -> np.ndarray:

@@ -7,10 +7,11 @@ import mujoco
 import numpy as np
 
 from easi_jax.gap.predictor import WindowSet
-from easi_jax.gap.residuals import velocity_weights
+from easi_jax.gap.residuals import noise_rows
 from easi_jax.recording import Run
 
 _VISIBLE = 5.0  # times the noise
+_ODD = 3.0  # times the error of other runs
 _DRAWS = 2000
 
 
@@ -99,6 +100,31 @@ def squares(errors: np.ndarray) -> np.ndarray:
     return np.mean(errors.astype(np.float64) ** 2, 1)
 
 
+def odd_runs(
+    square: np.ndarray, scale: np.ndarray, run: np.ndarray
+) -> dict[int, float]:
+    """Runs whose windows are predicted far worse than those of the other runs.
+
+    Args:
+        square: mean squares of each window, ``(W, nv)``.
+        run: which run each window is of, ``(W,)``.
+
+    Returns:
+        For each such run its median error over that of the others; empty where there
+        are fewer than three runs.
+    """
+    error = gap(square, scale)
+    typical = {int(r): float(np.median(error[run == r])) for r in np.unique(run)}
+    if len(typical) < 3:
+        return {}
+    out = {}
+    for r, mine in typical.items():
+        others = float(np.median([x for k, x in typical.items() if k != r]))
+        if mine > _ODD * others:
+            out[r] = mine / max(others, 1e-30)
+    return out
+
+
 def resampled(count: int, seed: int) -> np.ndarray:
     """Bootstrap weights of windows, ``(draws, W)``; neighbors overlap, so in pairs."""
     rng = np.random.default_rng(seed)
@@ -135,15 +161,11 @@ def floor_squares(
     out = np.zeros((len(windows), nv))
     for w in range(len(windows)):
         run, row = runs[windows.run[w]], int(windows.row[w])
-        first, weights = velocity_weights(len(run), row, run.dt)
+        origin, weights = noise_rows(run, row, steps)
         for c in range(nv):
-            span = np.arange(min(first, 0), max(steps, first + len(weights) - 1) + 1)
-            weight = np.zeros(len(span))
-            weight[first - span[0] : first - span[0] + len(weights)] = weights
-            # (H, nv, rows)
-            a = slope[nv + c, w][:, :, None] * weight
-            a[:, :, -span[0]] += slope[c, w]
-            a[np.arange(steps), c, np.arange(1, steps + 1) - span[0]] -= 1.0
+            a = slope[nv + c, w][:, :, None] * weights  # (H, nv, rows)
+            a[:, :, origin] += slope[c, w]
+            a[np.arange(steps), c, origin + np.arange(1, steps + 1)] -= 1.0
             out[w] += noise[c] ** 2 * (a**2).sum(-1).mean(0)
     return out
 
@@ -165,12 +187,9 @@ def drawn_noise(
     targets = np.zeros((draws, len(windows), steps, nv))
     for w in range(len(windows)):
         run, row = runs[windows.run[w]], int(windows.row[w])
-        first, weights = velocity_weights(len(run), row, run.dt)
-        low = min(first, 0)
-        high = max(steps, first + len(weights) - 1)
-        rows = noise * rng.normal(size=(draws, high - low + 1, nv))
-        fitted = rows[:, first - low : first - low + len(weights)]
-        offsets[:, w, :nv] = rows[:, -low]
-        offsets[:, w, nv:] = np.einsum("k,dkc->dc", weights, fitted)
-        targets[:, w] = rows[:, 1 - low : 1 - low + steps]
+        origin, weights = noise_rows(run, row, steps)
+        rows = noise * rng.normal(size=(draws, len(weights), nv))
+        offsets[:, w, :nv] = rows[:, origin]
+        offsets[:, w, nv:] = np.einsum("k,dkc->dc", weights, rows)
+        targets[:, w] = rows[:, origin + 1 : origin + 1 + steps]
     return offsets, targets

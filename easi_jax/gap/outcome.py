@@ -20,6 +20,8 @@ class Found:
         confidence: probability of this name against its rivals.
         indistinguishable: rivals that predict the held-out data as well.
         gap_after: held-out gap with it and those before it.
+        deviations: standard deviation of each of the place's columns that the fit
+            moved, by its number among them.
     """
 
     place: Place
@@ -27,6 +29,7 @@ class Found:
     confidence: float
     indistinguishable: list[str]
     gap_after: float
+    deviations: dict[int, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,15 @@ class Figures:
 
 @dataclass
 class Outcome:
-    """What the workflow found; see the log format's ``gap.json``."""
+    """What the workflow found; see the log format's ``gap.json``.
+
+    Attributes:
+        x: the whole vector at the end, and ``active`` its entries that the last fit
+            moved.
+        disagreeing: runs that the model predicts far worse than the others, with how
+            many times.
+        record_next: what to record to tell names apart, a sentence for each pair.
+    """
 
     verdict: str
     found: list[Found]
@@ -63,8 +74,10 @@ class Outcome:
     channels: Channels
     held: WindowSet
     x: np.ndarray
-    steps: list[tuple[str, float]]
+    active: list[int]
     notes: list[str] = field(default_factory=list)
+    disagreeing: dict[str, float] = field(default_factory=dict)
+    record_next: list[str] = field(default_factory=list)
     seconds: float = 0.0
 
 

@@ -8,26 +8,33 @@ one size.
 """
 
 import copy
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
 
-from easi_jax import effects
+from easi_jax import backlash, effects
+from easi_jax.backlash import Rotor
+from easi_jax.effect_quantities import EFFECT_TABLE
+from easi_jax.effects import Effects
 from easi_jax.gap.table import Layout
 from easi_jax.machine import Machine
 from easi_jax.mesh import make_mesh, sharded_map
-from easi_jax.model import Model
+from easi_jax.model import Model, full_structure
 from easi_jax.parameters import ParameterSpace
-from easi_jax.physics import Physics
-from easi_jax.quantities import direct_solref
+from easi_jax.physics import Physics, arrived_step
 from easi_jax.recording import Run
 from easi_jax.windows import fitted_velocity, make_windows
 
-_BLOCK = 16  # windows
+BLOCK = 16  # windows
+_BEFORE = 0.6  # s before a window in which a drive with play finds its side
+_ROW = 0.01  # s of it at a time
 
 
 def opened(m: mujoco.MjModel) -> mujoco.MjModel:
@@ -37,16 +44,17 @@ def opened(m: mujoco.MjModel) -> mujoco.MjModel:
     stiffness varies in its direct form.
     """
     out = copy.deepcopy(m)
-    scalar = [d for _, d in effects.scalar_joints(m)]
-    loss = out.dof_frictionloss
-    loss[scalar] = np.maximum(loss[scalar], 1e-9)
-    free = out.actuator_forcelimited == 0
-    out.actuator_forcerange[free] = [-1e9, 1e9]
-    out.actuator_forcelimited[:] = 1
-    for solref in (*out.geom_solref, *out.pair_solref):
-        if solref[0] > 0:
-            solref[:] = -np.asarray(direct_solref(m, solref))
+    count = {"joint": m.njnt, "actuator": m.nu, "body": m.nbody, "model": 1}
+    for row in EFFECT_TABLE.values():
+        for i in range(count[row.on]):
+            if row.refuse(m, i) is None:
+                row.open(out, i)
     return out
+
+
+_PLAY = ("width", "rotor", "felt")
+# Most predictions have no use for drives of their own.
+_RIGID = tuple(f for f in Effects.__dataclass_fields__ if f not in _PLAY)
 
 
 @dataclass(frozen=True)
@@ -62,6 +70,8 @@ class WindowSet:
         ctrl: ``(W, H, nu)``.
         past: commands before, oldest first, ``(W, D, nu)``; before a run's first row
             its first command.
+        past_qpos: positions in those rows, ``(W, D, nq)``.
+        past_qvel: fitted velocities there, ``(W, D, nv)``; at rest before a run.
         target: measured positions after each step, ``(W, H, nq)``.
     """
 
@@ -71,6 +81,8 @@ class WindowSet:
     start_qvel: np.ndarray
     ctrl: np.ndarray
     past: np.ndarray
+    past_qpos: np.ndarray
+    past_qvel: np.ndarray
     target: np.ndarray
 
     def __len__(self) -> int:
@@ -88,23 +100,25 @@ def join(sets: Sequence[WindowSet]) -> WindowSet:
 
 
 def window_set(
-    runs: Sequence[Run], horizon_s: float, past: int, late: int, first_run: int = 0
+    runs: Sequence[Run], horizon_s: float, longest: float, first_run: int = 0
 ) -> WindowSet | None:
     """Windows every half horizon, each inside one run; None where there are none.
 
     Args:
-        past: commands before a window.
-        late: rows after its start in which a late reading of the start may come.
+        longest: delay of commands and readings that predictions allow for [s].
         first_run: index of the first of ``runs``.
     """
     parts = []
     for i, run in enumerate(runs):
+        late = math.ceil(longest / run.dt - 1e-9)
+        past = math.ceil(max(longest, _BEFORE) / run.dt) + 1
         w = make_windows(run, horizon_s)
         if not len(w.start_row):
             continue
         velocity = fitted_velocity(run.qpos, run.dt, run.configuration)
         after = np.minimum(w.start_row[:, None] + np.arange(late + 1), len(run) - 1)
-        before = np.maximum(w.start_row[:, None] + np.arange(-past, 0), 0)
+        rows = w.start_row[:, None] + np.arange(-past, 0)
+        before = np.maximum(rows, 0)
         parts.append(
             WindowSet(
                 run=np.full(len(w.start_row), first_run + i),
@@ -113,6 +127,8 @@ def window_set(
                 start_qvel=velocity[after],
                 ctrl=w.ctrl,
                 past=run.ctrl[before],
+                past_qpos=run.qpos[before],
+                past_qvel=np.where(rows[..., None] < 0, 0.0, velocity[before]),
                 target=w.target_qpos,
             )
         )
@@ -140,6 +156,9 @@ class Predictor:
         dt: float,
     ) -> None:
         self.machine = Machine(opened(mj_model), space, dt)
+        # Centers of mass move.
+        base = self.machine.base
+        self.machine.base = base.replace(mjx=full_structure(base.mjx))
         self.layout, self.windows = layout, windows
         self.own = len(space.nominal)
         self.neutral = np.concatenate([np.asarray(space.nominal), layout.neutral])
@@ -150,81 +169,128 @@ class Predictor:
             hinge = m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
             if hinge and not m.jnt_limited[j]:
                 self.wrapped[m.jnt_dofadr[j]] = True
+        self._scalar = tuple(
+            np.array(k, int) for k in zip(*effects.scalar_joints(m), strict=True)
+        )
         self._mesh = make_mesh()
-        n = len(windows)
-        self.blocks = -(-n // _BLOCK)
-        pad = np.minimum(np.arange(self.blocks * _BLOCK), n - 1)
-        padded = windows.take(pad)
+        self.blocks = -(-len(windows) // BLOCK)
+        self._data = self._placed(windows)
+        # Items that a device works on together.
+        self._batch = max(1, self.machine.batch // BLOCK)
+        self._delay_steps = windows.start_qpos.shape[1]  # late rows, and one
+        self._program = jax.jit(self._sharded, static_argnums=0)
+        width = [i for i, c in enumerate(layout.columns) if c.field == "width"]
+        self._width = self.own + np.array(width, int)
+
+    def _placed(self, windows: WindowSet) -> tuple[jax.Array, ...]:
+        """The windows in blocks, on all devices; the last is repeated to fill them."""
+        fill = np.minimum(np.arange(self.blocks * BLOCK), len(windows) - 1)
+        padded = windows.take(fill)
+        whole = NamedSharding(self._mesh, PartitionSpec())
 
         def blocks(x: np.ndarray) -> jax.Array:
-            return jnp.asarray(
-                x.reshape(self.blocks, _BLOCK, *x.shape[1:]), jnp.float32
-            )
+            shape = (self.blocks, BLOCK, *x.shape[1:])
+            return jax.device_put(np.asarray(x, np.float32).reshape(shape), whole)
 
-        self._data = tuple(
+        return tuple(
             blocks(x)
             for x in (
                 padded.start_qpos,
                 padded.start_qvel,
                 padded.ctrl,
                 padded.past,
+                padded.past_qpos,
+                padded.past_qvel,
                 padded.target,
             )
         )
-        # Items that a device works on together.
-        self._batch = max(1, self.machine.batch // _BLOCK)
-        self._delay_steps = windows.past.shape[1]
-        self._program = jax.jit(self._sharded)
 
-    def model(self, x: jax.Array) -> Model:
-        """The model of a vector ``(n,)``; pure."""
+    @property
+    def capacity(self) -> int:
+        """Windows that the compiled program has room for."""
+        return self.blocks * BLOCK
+
+    def on(self, windows: WindowSet) -> "Predictor":
+        """The same predictions of other windows, by the program that is compiled.
+
+        Args:
+            windows: at most `capacity`, of the same length and with as much before
+                and after their starts.
+
+        Raises:
+            ValueError: windows of another shape, or too many.
+        """
+        mine = (getattr(self.windows, f).shape[1:] for f in ("ctrl", "past"))
+        theirs = (getattr(windows, f).shape[1:] for f in ("ctrl", "past"))
+        if tuple(mine) != tuple(theirs) or len(windows) > self.capacity:
+            raise ValueError("windows of another shape, or more than there is room for")
+        other = copy.copy(self)
+        other.windows = windows
+        other._data = other._placed(windows)
+        return other
+
+    def model(self, x: jax.Array, play: bool = True) -> Model:
+        """The model of a vector ``(n,)``; pure. ``play``: whether drives may have."""
         e = self.layout.effects(x[self.own :])
         model = self.machine.model(x[: self.own])
+        present = None if play else _RIGID
         return model.replace(
-            mjx=effects.with_effects(model.mjx, e),
+            mjx=effects.with_effects(model.mjx, e, present),
             effects=e,
+            present=present,
             delay_steps=self._delay_steps,
         )
 
-    def _sharded(self, x: jax.Array, block: jax.Array, moved: jax.Array) -> jax.Array:
+    def _sharded(
+        self,
+        play: bool,
+        x: jax.Array,
+        block: jax.Array,
+        moved: jax.Array,
+        *windows: jax.Array,
+    ) -> jax.Array:
         def local(items: tuple[jax.Array, ...], *data: jax.Array) -> jax.Array:
-            return jax.vmap(lambda *i: self._block(data, *i))(*items)
+            return jax.vmap(lambda *i: self._block(play, data, *i))(*items)
 
-        return sharded_map(local, self._mesh, (x, block, moved), *self._data)
+        return sharded_map(local, self._mesh, (x, block, moved), *windows)
 
     def _block(
         self,
+        play: bool,
         data: tuple[jax.Array, ...],
         x: jax.Array,
         block: jax.Array,
         moved: jax.Array,
     ) -> jax.Array:
-        model = self.model(x)
+        model = self.model(x, play)
         return jax.vmap(lambda w, d: self._window(model, w, d))(
             tuple(a[block] for a in data), moved
         )
 
     def _window(self, model: Model, window: tuple, moved: jax.Array) -> jax.Array:
         """Readings less measurements after each step, ``(H, nv)``."""
-        start_q, start_v, ctrl, past, target = window
+        start_q, start_v, ctrl, *before, target = window
         machine, e, nv = self.machine, model.effects, self.nv
         assert e is not None
         q, v = self._true_start(e, start_q, start_v)
-        physics = machine.start(machine.move(q, moved[:nv]), v + moved[nv:])
-        memory = effects.first_memory(self._delay_steps, ctrl.shape[1])
-
-        def warm(memory: effects.CommandMemory, u: jax.Array) -> tuple:
-            _, memory = effects.commands(e, memory, u, machine.dt, machine.substeps)
-            return memory, None
-
-        memory, _ = jax.lax.scan(warm, memory, past)
-        physics = physics.replace(memory=memory)
+        physics = machine.start(machine.move(q, moved[:nv]), v + moved[nv:], model)
+        physics = physics.replace(memory=())
+        past, *states = before
+        arrived = effects.command_sequence(
+            e,
+            jnp.concatenate([past, ctrl]),
+            self._delay_steps,
+            machine.dt,
+            machine.substeps,
+        )
+        if effects.turns(model.present):
+            physics = self._turned(model, physics, arrived[: len(past)], *states)
 
         def step(state: Physics, u: jax.Array) -> tuple:
-            state = machine.step(model, state, u)
+            state = arrived_step(model, state, u)
             return state, (state.qpos, state.qvel)
 
-        _, (qs, vs) = jax.lax.scan(step, physics, ctrl)
+        _, (qs, vs) = jax.lax.scan(step, physics, arrived[len(past) :])
         qs = jnp.concatenate([physics.qpos[None], qs])
         vs = jnp.concatenate([physics.qvel[None], vs])
         # From the start, so that readings are plain numbers also where q is not.
@@ -239,6 +305,48 @@ class Predictor:
         near = error - turn * jnp.round(error / turn)
         return jnp.where(self.wrapped, near, error)
 
+    def _turned(
+        self, model: Model, first: Physics, arrived: Any, qpos: Any, qvel: Any
+    ) -> Physics:
+        """The first state with drives as they turned before, while their joints moved
+        as measured."""
+        machine, e = self.machine, model.effects
+        assert e is not None
+        drives = backlash.geared(model.mjx)
+        if not drives:
+            return first
+        at, dof = self._scalar
+        still = jnp.full(self.nv, 1e6)  # as heavy as what is not moved
+        # Rows of a millisecond would only cost time.
+        every = max(1, round(_ROW / machine.dt))
+        count = len(qpos) // every
+        rows = len(qpos) - every * np.arange(count, 0, -1)
+        q = jnp.zeros((count + 1, self.nv))
+        q = q.at[:-1, dof].set(qpos[rows][:, at]).at[-1, dof].set(first.qpos[at])
+        v = jnp.concatenate([qvel[rows], first.qvel[None]])
+        sent = arrived[len(qpos) - every * count :]
+        sent = sent.reshape(count, -1, sent.shape[-1]).mean(1)
+
+        def row(rotor: Rotor, now: tuple) -> tuple:
+            u, q, v, before = now
+            return backlash.pushes(
+                *(model.mjx, drives, rotor.replace(joint=before), e.width, e.rotor),
+                *(still, (q, v), backlash.sent(model.mjx, u, first.act)),
+                jnp.asarray(every * machine.dt),
+            ), None
+
+        begin = first.rotor.replace(angle=q[0], speed=v[0])
+        # Speeds a row earlier, such that each row ends at the next one's speed.
+        before = 2 * v[:-1] - v[1:]
+        rotor, _ = jax.lax.scan(row, begin, (sent, q[:-1], v[:-1], before))
+        # Teeth as softly as these steps need would spring back in shorter ones.
+        twist = jnp.clip(rotor.angle - q[-1], -0.5 * e.width, 0.5 * e.width)
+        return first.replace(
+            rotor=rotor.replace(
+                angle=q[-1] + twist, push=jnp.zeros(self.nv), joint=first.qvel
+            )
+        )
+
     def _true_start(
         self, e: effects.Effects, q: jax.Array, v: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
@@ -246,10 +354,7 @@ class Predictor:
 
         What is late is read in the rows after the start, ``q (R, nq)``.
         """
-        m = self.machine.mj_model
-        at, dof = (
-            np.array(k, int) for k in zip(*effects.scalar_joints(m), strict=True)
-        )
+        at, dof = self._scalar
         when = e.late[dof] / self.machine.dt
         row = jnp.clip(jnp.floor(when), 0, max(q.shape[0] - 2, 0)).astype(jnp.int32)
         s = when - row
@@ -268,7 +373,7 @@ class Predictor:
 
         Args:
             x: vectors, ``(B, n)``.
-            windows: which blocks of windows, sorted; all where None. See `blocks_of`.
+            windows: which blocks of `BLOCK` windows, sorted; all where None.
             moved: offsets of start positions and velocities, ``(B, W, 2 nv)``.
         """
         blocks = np.arange(self.blocks) if windows is None else np.asarray(windows)
@@ -276,21 +381,31 @@ class Predictor:
         items = count * nb
         vectors = np.repeat(x, nb, 0).astype(np.float32)
         which = np.tile(blocks, count).astype(np.int32)
-        shape = (items, _BLOCK, 2 * self.nv)
+        shape = (items, BLOCK, 2 * self.nv)
         if moved is None:
             offsets = np.zeros(shape, np.float32)
         else:
-            whole = np.zeros((count, nb * _BLOCK, 2 * self.nv), np.float32)
+            whole = np.zeros((count, nb * BLOCK, 2 * self.nv), np.float32)
             whole[:, : moved.shape[1]] = moved
             offsets = whole.reshape(shape)
+        out = np.empty((items, BLOCK, self.steps, self.nv), np.float32)
+        loose = (vectors[:, self._width] > 0).any(1)
+        for play in (False, True):
+            chosen = np.flatnonzero(loose == play)
+            for part in self._batches(chosen):
+                args = vectors[part], which[part], offsets[part]
+                got = self._program(play, *args, *self._data)
+                out[part] = np.asarray(got)
+        out = out.reshape(count, nb * BLOCK, self.steps, self.nv)
+        return out[:, : self.count(windows)]
+
+    def _batches(self, chosen: np.ndarray) -> list[np.ndarray]:
+        """Items by batches of one size; the last item fills the last of them."""
         batch = self._batch * self._mesh.size
-        out = np.empty((items, _BLOCK, self.steps, self.nv), np.float32)
-        for first in range(0, items, batch):
-            part = np.minimum(np.arange(first, first + batch), items - 1)
-            got = self._program(vectors[part], which[part], offsets[part])
-            keep = min(batch, items - first)
-            out[first : first + keep] = np.asarray(got)[:keep]
-        out = out.reshape(count, nb * _BLOCK, self.steps, self.nv)
-        if windows is None:
-            out = out[:, : len(self.windows)]
-        return out
+        pad = -len(chosen) % batch
+        filled = np.concatenate([chosen, np.repeat(chosen[-1:], pad)])
+        return list(filled.reshape(-1, batch))
+
+    def count(self, windows: np.ndarray | None) -> int:
+        """Number of windows in some blocks; all where None."""
+        return len(self.windows) if windows is None else len(windows) * BLOCK

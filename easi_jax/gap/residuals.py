@@ -15,7 +15,12 @@ import numpy as np
 
 from easi_jax.gap.predictor import Predictor, WindowSet
 from easi_jax.recording import Run
-from easi_jax.windows import FIT_ROWS, FIT_SECONDS, fitted_velocity
+from easi_jax.windows import (
+    FIT_ROWS,
+    FIT_SECONDS,
+    fitted_velocity,
+    velocity_weights,
+)
 
 _GROUPS = 12  # of steps in a window, at most
 
@@ -59,14 +64,18 @@ def step_groups(steps: int) -> np.ndarray:
     return out
 
 
-def velocity_weights(rows: int, row: int, dt: float) -> tuple[int, np.ndarray]:
-    """First row and weights of the fitted velocity at ``row`` of a run."""
-    reach = max(int(FIT_SECONDS / dt + 1e-6), FIT_ROWS // 2)
-    low = min(max(row - reach, 0), max(rows - FIT_ROWS, 0))
-    high = max(min(row + reach, rows - 1), min(FIT_ROWS, rows) - 1)
-    offset = np.arange(low, high + 1) - row
-    powers = np.vander(offset, min(2, len(offset) - 1) + 1, increasing=True)
-    return low - row, np.linalg.pinv(powers.astype(float))[1] / dt
+def noise_rows(run: Run, row: int, steps: int) -> tuple[int, np.ndarray]:
+    """The rows whose noise enters the errors of a window that starts at ``row``.
+
+    Returns:
+        Place of the start row among them (its targets are the ``steps`` rows after),
+        and the weight of each row in the fitted start velocity, ``(rows,)`` [1/s].
+    """
+    first, weights = velocity_weights(len(run), row, run.dt)
+    low = min(first, 0)
+    out = np.zeros(max(steps, first + len(weights) - 1) - low + 1)
+    out[first - low : first - low + len(weights)] = weights
+    return -low, out
 
 
 def start_sensitivity(
@@ -80,8 +89,7 @@ def start_sensitivity(
     """
     nv = predictor.nv
     step = np.maximum(3.0 * noise, 1e-5)
-    base = predictor.errors(x[None], blocks)
-    windows = base.shape[1]
+    windows = predictor.count(blocks)
     moved = np.zeros((4 * nv, windows, 2 * nv))
     for i in range(2 * nv):
         moved[2 * i, :, i], moved[2 * i + 1, :, i] = step[i], -step[i]
@@ -119,24 +127,15 @@ def make_residuals(
     n = k * nv
     root, plain = np.zeros((2, len(windows), n, n))
     unit = np.tile(1.0 / scale, k)
-    cache: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
     for w in range(len(windows)):
         run, row = runs[windows.run[w]], int(windows.row[w])
-        rows = len(run)
-        key = (min(row, 1000), min(rows - row, 1000))
-        if key not in cache:
-            cache[key] = velocity_weights(rows, row, run.dt)
-        first, weights = cache[key]
-        low = min(first, 0)
-        span = max(steps, first + len(weights) - 1) - low + 1
+        origin, weights = noise_rows(run, row, steps)
         total = np.zeros((n, n))
         for c in range(nv):
-            a = np.zeros((k, nv, span))
-            a[:, :, -low] += sq[w, :, :, c]
-            at = slice(first - low, first - low + len(weights))
-            a[:, :, at] += sv[w, :, :, c, None] * weights
-            a[:, c, 1 - low : 1 - low + steps] -= groups
-            flat = a.reshape(n, span)
+            a = sv[w, :, :, c, None] * weights
+            a[:, :, origin] += sq[w, :, :, c]
+            a[:, c, origin + 1 : origin + 1 + steps] -= groups
+            flat = a.reshape(n, -1)
             total += noise[c] ** 2 * (flat @ flat.T)
         more = (sv[w] * extra).reshape(n, nv)
         total += more @ more.T
@@ -149,15 +148,14 @@ def make_residuals(
     return Residuals(groups, scale, root, plain)
 
 
-def velocity_slack(runs: Sequence[Run], noise: np.ndarray, step: float) -> np.ndarray:
+def velocity_slack(runs: Sequence[Run], step: float) -> np.ndarray:
     """What the start velocity is off by besides noise, RMS over rows, ``(nv,)``.
 
     The derivative of a quadratic misses a tenth of the jerk times the squared half
     span; and a semi-implicit step of length ``step`` [s] moves with the velocity of
     half a step later.
     """
-    nv = len(noise)
-    square, count = np.zeros(nv), 0
+    square, count = np.zeros(runs[0].configuration.nv), 0
     for run in runs:
         if len(run) < 8 * FIT_ROWS:
             continue

@@ -6,7 +6,7 @@ fit (by the fit's own derivatives, which for least squares needs no fit anew), n
 the fitting error, and never by the held-out data.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from math import erf, sqrt
 
@@ -18,7 +18,6 @@ from easi_jax.gap.fit import (
     difference,
     least_squares,
     lockstep,
-    window_weights,
 )
 from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.residuals import Residuals
@@ -27,9 +26,10 @@ from easi_jax.gap.table import RARE, Place
 _SHORTLIST = 7  # names that are fitted in full at each stage
 _STARTS = 2  # of each
 _HOPELESS = 4.0  # times the best promise; beyond, only the first few are fitted
-_BLOCKS = 10  # of windows, for cross-validation
 _SURE = 1.7  # standard errors by which an effect has to help
 _HELPS = 0.05  # share of the squared gap by which each of its numbers has to help
+_LARGE = 0.3
+_TINY = 1e-300
 _RARE = 0.1  # relative loss by which a rare effect has to be better than others
 _ALIKE = 0.02  # relative difference of losses that says nothing
 _AS_GOOD = 1.5  # standard errors within which the simpler of two candidates wins
@@ -71,37 +71,34 @@ class Model:
 class Selector:
     """Fits sets of effects to some windows.
 
+    Its ``residuals`` have to be set before it fits.
+
     Args:
         predictor: predictions.
-        residuals: of the chosen windows.
         blocks: blocks of windows that are fitted.
         count: windows in them that count.
         bounds: of the whole vector.
         group: block of cross-validation that each window is in, ``(count,)``.
         own: indices of the model's own parameters that may be refitted.
-        tell: called with a line of progress.
     """
 
     def __init__(
         self,
         predictor: Predictor,
-        residuals: Residuals,
         blocks: np.ndarray,
         count: int,
         bounds: Bounds,
         group: np.ndarray,
         own: Sequence[int],
-        tell: Callable[[str], None] = lambda _: None,
     ) -> None:
-        self.predictor, self.residuals = predictor, residuals
+        self.predictor = predictor
+        self.residuals: Residuals
         self.blocks, self.count, self.bounds = blocks, count, bounds
-        self.group, self.own, self.tell = group, tuple(own), tell
+        self.group, self.own = group, tuple(own)
         self.weight = np.ones(count)
-        self.simulated = 0
 
     def simulate(self, x: np.ndarray) -> np.ndarray:
         """Whitened errors ``(B, W, m)`` of vectors ``(B, n)``."""
-        self.simulated += len(x)
         errors = self.predictor.errors(x, self.blocks)[:, : self.count]
         return self.residuals.whitened(self.residuals.grouped(errors))
 
@@ -319,12 +316,18 @@ def better(model: Model, base: Model) -> bool:
     """Whether a model predicts better than a smaller one by more than chance.
 
     Both in units of the noise and of the gap, and in one of them by a share that each
-    of its numbers has to earn.
+    of its numbers has to earn. A large gain may also be sure by its ratios: where a few
+    blocks hold most of the error, differences scatter as much as they are large.
     """
     helps = _HELPS * max(1, len(model.fit.active) - len(base.fit.active))
     both = ((model.loss, base.loss), (model.gap, base.gap))
     sure = [advantage(a, b) for a, b in both]
     gain = [1 - a.mean() / max(b.mean(), 1e-300) for a, b in both]
+    if min(gain) > _LARGE:
+        sure = [
+            max(s, advantage(np.log(a + _TINY), np.log(b + _TINY)))
+            for s, (a, b) in zip(sure, both, strict=True)
+        ]
     return min(sure) > _SURE and min(gain) > 0 and max(gain) > helps
 
 
@@ -345,6 +348,14 @@ def contains(a: Place, b: Place) -> bool:
     return a.at == b.at and a.kind == b.kind and _CONTAINS.get(a.effect) == b.effect
 
 
+def _within(a: Model, b: Model) -> bool:
+    """Whether a model is another with one effect less general."""
+    mine, theirs = ({p.key: p for p in x.places} for x in (a, b))
+    only = [p for k, p in mine.items() if k not in theirs]
+    rest = [p for k, p in theirs.items() if k not in mine]
+    return len(only) == len(rest) == 1 and contains(rest[0], only[0])
+
+
 def simplest(models: Sequence[Model], base: Model) -> Model:
     """The best of models sorted by loss, or a simpler one that is as good.
 
@@ -353,8 +364,7 @@ def simplest(models: Sequence[Model], base: Model) -> Model:
     """
     best = models[0]
     for m in models[1:]:
-        kept = [p.key for p in m.places[:-1]] == [p.key for p in best.places[:-1]]
-        if kept and contains(best.places[-1], m.places[-1]):
+        if _within(m, best):
             whole = base.loss.mean() - best.loss.mean()
             if base.loss.mean() - m.loss.mean() > _NEARLY * whole:
                 best = m
@@ -378,8 +388,3 @@ def probability(model: Model, rival: Model) -> float:
     if contains(rival.places[-1], model.places[-1]):
         t = max(t, 0.0) + 1.0
     return 0.5 * (1 + erf(t / sqrt(2)))
-
-
-def weights_of(model: Model) -> np.ndarray:
-    """Weights of windows that keep outliers from deciding."""
-    return window_weights(model.fit.residual)

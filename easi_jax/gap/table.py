@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from easi_jax import effects
+from easi_jax import backlash, effects
 from easi_jax.effects import Effects
 from easi_jax.errors import UserError
+from easi_jax.parameters import ParameterSpace
 from easi_jax.quantities import direct_solref
 
 EFFECTS = (
@@ -49,11 +50,20 @@ RARE = (
     "quadratic_drag",
     "joint_stiffness",
     "torque_ripple",
+    "backlash",
     "actuator_saturation",
     "actuator_deadband",
     "com_offset",
     "gravity_tilt",
 )
+
+
+# Effects that are also quantities which a model states and a refit may move.
+REFITTED = {
+    "viscous_damping": "damping",
+    "coulomb_friction": "frictionloss",
+    "joint_stiffness": "stiffness",
+}
 
 
 @dataclass(frozen=True)
@@ -167,9 +177,12 @@ def object_id(m: mujoco.MjModel, kind: str, name: str) -> int:
 def places(m: mujoco.MjModel, s: Scales) -> list[Place]:
     """Every effect at every place of a model where it can sit."""
     out: list[Place] = []
+    geared = backlash.geared(m)
     for j in range(m.njnt):
         if m.jnt_type[j] >= 2:
             out += _at_joint(m, j, s)
+            if int(m.jnt_dofadr[j]) in geared:
+                out.append(_play(m, j, s))
     for a in range(m.nu):
         out += _at_actuator(m, a, s)
     moving = [b for b in range(1, m.nbody) if m.body_mass[b] > 0 and _moves(m, b)]
@@ -222,6 +235,13 @@ def places(m: mujoco.MjModel, s: Scales) -> list[Place]:
             )
         )
     return out
+
+
+def covered(place: Place, space: ParameterSpace) -> bool:
+    """Whether the refit of the model's own parameters does what an effect does."""
+    quantity = REFITTED.get(place.effect)
+    own = {a for p in space.parameters for a in p.addresses}
+    return quantity is not None and f"joint.{place.at}.{quantity}" in own
 
 
 def _moves(m: mujoco.MjModel, b: int) -> bool:
@@ -389,6 +409,31 @@ def _at_joint(m: mujoco.MjModel, j: int, s: Scales) -> list[Place]:
     return out
 
 
+def _play(m: mujoco.MjModel, j: int, s: Scales) -> Place:
+    """Backlash; the drive's share of the inertia is fitted with it."""
+    d = int(m.jnt_dofadr[j])
+    hinge = m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
+    own = float(m.dof_armature[d])
+    most = own if own > 0 else 0.7 * float(s.inertia[d])
+    reach = min(float(s.span[d]), 1.0 if hinge else np.inf)
+    return Place(
+        "backlash",
+        name_of(m, "joint", j),
+        "joint",
+        (
+            Column(
+                *("width", (d,), "width", "rad" if hinge else "m"),
+                *(0.0, 0.0, 0.5 * reach, 0.005 * reach),
+            ),
+            Column(
+                *("rotor", (d,), "", "kg m2" if hinge else "kg"),
+                *(0.6 * most, 0.1 * most, 0.98 * most, 0.1 * most),
+            ),
+        ),
+        tuple((w * reach, 0.6 * most) for w in (0.01, 0.03, 0.1)),
+    )
+
+
 def _at_actuator(m: mujoco.MjModel, a: int, s: Scales) -> list[Place]:
     at = name_of(m, "actuator", a)
     command, force = max(float(s.command[a]), 1e-9), max(float(s.force[a]), 1e-9)
@@ -490,6 +535,23 @@ def _at_body(m: mujoco.MjModel, b: int) -> list[Place]:
             ((0.0, 0.0, 0.0),),
         )
     )
+    if m.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
+        # Enough to hold its weight at 1 m/s.
+        most = 20.0 * mass
+        out.append(
+            Place(
+                "quadratic_drag",
+                at,
+                "body",
+                (
+                    Column(
+                        *("resistance", (b,), "coefficient", "N s2/m2"),
+                        *(0.0, 0.0, most, 0.003 * most),
+                    ),
+                ),
+                ((0.0,),),
+            )
+        )
     out.append(
         Place(
             "constant_force",

@@ -1,6 +1,8 @@
 """Whether measured velocities come later than the positions that they belong to."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 
@@ -10,10 +12,27 @@ from easi_jax.windows import fitted_velocity
 _LONGEST = 0.1  # s
 _LATE = 0.003  # s; less is the velocity fit's own doing
 _ALIKE = 0.5  # share of the squared difference that the shift has to explain
+_PIECES = 10
 
 
-def velocity_lags(runs: Sequence[Run]) -> dict[int, float]:
-    """Lag [s] of each measured velocity (place in qvel) behind the positions.
+@dataclass(frozen=True)
+class Lag:
+    """How late a measured velocity is.
+
+    Attributes:
+        seconds: of all data.
+        std: standard error, from pieces of the data.
+        confidence: share of the pieces that are late by themselves, one more of either
+            kind counted (Laplace).
+    """
+
+    seconds: float
+    std: float
+    confidence: float
+
+
+def velocity_lags(runs: Sequence[Run]) -> dict[int, Lag]:
+    """Lag of each measured velocity (place in qvel) behind the positions.
 
     A filtered velocity is the derivative of the positions of some time ago. The lag is
     the shift at which both agree best; only where it explains most of the difference.
@@ -22,27 +41,49 @@ def velocity_lags(runs: Sequence[Run]) -> dict[int, float]:
     if not measured:
         return {}
     dt = measured[0].dt
+    shifts = round(_LONGEST / dt) + 1
     found = {}
-    shifts = np.arange(round(_LONGEST / dt) + 1)
     for dof in range(measured[0].qvel.shape[1]):
-        cost = np.zeros(len(shifts))
-        for run in measured:
-            fitted = fitted_velocity(run.qpos, run.dt, run.configuration)[:, dof]
-            told = run.qvel[:, dof]
-            n = len(told) - len(shifts)
-            if n < len(shifts):
-                continue
-            for i, s in enumerate(shifts):
-                cost[i] += np.sum(
-                    (told[len(shifts) :] - fitted[len(shifts) - s : -s or None][:n])
-                    ** 2
-                )
-        best = int(np.argmin(cost))
-        if 0 < best < len(shifts) - 1:
-            a, b, c = cost[best - 1 : best + 2]
-            lag = (best + 0.5 * (a - c) / max(a - 2 * b + c, 1e-300)) * dt
-        else:
-            lag = best * dt
-        if lag > max(_LATE, 0.5 * dt) and cost[best] < _ALIKE * cost[0]:
-            found[dof] = float(lag)
+        costs = _costs(measured, dof, shifts)
+        lag = _lag(costs.sum(0), dt)
+        if lag is None:
+            continue
+        alone = [_lag(c, dt) for c in costs]
+        late = [x for x in alone if x is not None]
+        spread = float(np.std(late, ddof=1)) if len(late) > 1 else dt
+        found[dof] = Lag(
+            lag,
+            max(spread, 0.1 * dt) / sqrt(max(len(late), 1)),
+            (len(late) + 1) / (len(alone) + 2),
+        )
     return found
+
+
+def _costs(runs: Sequence[Run], dof: int, shifts: int) -> np.ndarray:
+    """Squared differences by pieces of the data and shifts, ``(pieces, shifts)``."""
+    rows = []
+    for run in runs:
+        fitted = fitted_velocity(run.qpos, run.dt, run.configuration)[:, dof]
+        told = run.qvel[shifts:, dof]
+        n = len(told)
+        if n < shifts:
+            continue
+        rows.append(
+            [(told - fitted[shifts - s : shifts - s + n]) ** 2 for s in range(shifts)]
+        )
+    if not rows:
+        return np.zeros((1, shifts))
+    pieces = np.array_split(np.concatenate(rows, 1), _PIECES, axis=1)
+    return np.array([p.sum(1) for p in pieces])
+
+
+def _lag(cost: np.ndarray, dt: float) -> float | None:
+    """The shift of least cost [s]; None where it is no better than none."""
+    best = int(np.argmin(cost))
+    lag = float(best)
+    if 0 < best < len(cost) - 1:
+        a, b, c = cost[best - 1 : best + 2]
+        lag += 0.5 * (a - c) / max(a - 2 * b + c, 1e-300)
+    if lag * dt > max(_LATE, 0.5 * dt) and cost[best] < _ALIKE * cost[0]:
+        return lag * dt
+    return None

@@ -100,3 +100,37 @@ def where(
                 ratio, when = max(best)
         out.append(Where(joint, float(mine.sum() / total), when, float(ratio)))
     return sorted(out, key=lambda w: -w.share)
+
+
+def condition_errors(
+    errors: np.ndarray,
+    windows: WindowSet,
+    runs: Sequence[Run],
+    channels: Channels,
+    scalar: Sequence[tuple[int, int]],
+) -> tuple[list[str], list[str], np.ndarray]:
+    """RMS errors of joints under each condition, as shares of their motion.
+
+    Args:
+        errors: ``(W, H, nv)``.
+        scalar: places in qpos and qvel of hinges and slides.
+
+    Returns:
+        Joints, conditions, and errors ``(joints, conditions)``, NaN where a condition
+        holds in too few windows.
+    """
+    square = np.mean(errors.astype(float) ** 2, 1)
+    joints, rows = [], []
+    names = ["throughout"]
+    for q, dof in scalar:
+        if not np.isfinite(channels.scale[dof]):
+            continue
+        mine = square[:, dof] / channels.scale[dof] ** 2
+        found = conditions(windows, runs, dof, q)
+        names = ["throughout", *found]
+        means = [mine.mean()]
+        for mask in found.values():
+            means.append(mine[mask].mean() if mask.sum() >= _FEW else np.nan)
+        joints.append(channels.joints[dof])
+        rows.append(np.sqrt(means))
+    return joints, names, np.array(rows).reshape(len(joints), -1)

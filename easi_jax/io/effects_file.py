@@ -12,7 +12,7 @@ refitted:
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -23,32 +23,13 @@ import yaml
 from easi_jax import effects
 from easi_jax.effects import Effects
 from easi_jax.errors import UserError, nearest
+from easi_jax.found_effects import EffectEntry, FoundEffects
 from easi_jax.gap.table import EFFECTS, object_id
 from easi_jax.io.files import atomic_write, to_plain
 from easi_jax.io.strict_yaml import read_yaml
 
 _KEYS = ("effect", "at", "kind", "columns", "parameters", "std")
 _SIZED = {"joint": "nv", "actuator": "nu", "body": "nbody"}
-
-
-@dataclass(frozen=True)
-class EffectEntry:
-    """One effect of a file.
-
-    Attributes:
-        effect: name.
-        at: joint, actuator or body; "" for the whole model.
-        kind: what ``at`` is.
-        columns: values of fields of `Effects`, by name; vectors have a name for each
-            entry, such as ``com.0``.
-        std: their standard deviations, where known.
-    """
-
-    effect: str
-    at: str
-    kind: str
-    columns: Mapping[str, float]
-    std: Mapping[str, float]
 
 
 def write_effects(
@@ -95,7 +76,16 @@ def read_effects(path: Path) -> tuple[list[EffectEntry], dict[str, float]]:
     Raises:
         UserError: not such a file; names the entry and what is wrong with it.
     """
-    content = read_yaml(path)
+    found = parsed_effects(read_yaml(path), str(path))
+    return list(found.entries), dict(found.own or {})
+
+
+def parsed_effects(content: Any, path: str) -> FoundEffects:
+    """Effects from the content of a file; ``path`` is named in messages.
+
+    Raises:
+        UserError: as `read_effects`.
+    """
     if not isinstance(content, dict) or not isinstance(content.get("effects"), list):
         raise UserError(f'{path}: an effects file has the key "effects:" with a list')
     for key in content:
@@ -103,16 +93,19 @@ def read_effects(path: Path) -> tuple[list[EffectEntry], dict[str, float]]:
             raise UserError(f'{path}: unknown key "{key}" (known: effects, refitted)')
     entries = [_entry(path, i, e) for i, e in enumerate(content["effects"], 1)]
     own: dict[str, float] = {}
-    for i, item in enumerate(content.get("refitted") or [], 1):
+    refitted = content.get("refitted") or []
+    if not isinstance(refitted, list):
+        raise UserError(f"{path}: refitted: holds a list")
+    for i, item in enumerate(refitted, 1):
         if not isinstance(item, dict) or set(item) != {"address", "value"}:
             raise UserError(
                 f"{path}, refitted {i}: write {{address: joint.NAME.damping, value: 1}}"
             )
         own[str(item["address"])] = _number(path, f"refitted {i}", item["value"])
-    return entries, own
+    return FoundEffects(tuple(entries), own)
 
 
-def _entry(path: Path, i: int, item: Any) -> EffectEntry:
+def _entry(path: str, i: int, item: Any) -> EffectEntry:
     where = f"effect {i}"
     if not isinstance(item, dict):
         raise UserError(f"{path}, {where}: write effect:, at:, kind: and columns:")
@@ -151,7 +144,7 @@ def _entry(path: Path, i: int, item: Any) -> EffectEntry:
     )
 
 
-def _number(path: Path, where: str, value: Any) -> float:
+def _number(path: str, where: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise UserError(f'{path}, {where}: "{value}" is not a number')
     if not math.isfinite(value):

@@ -80,34 +80,41 @@ def gap_steps(
 
 
 @styled
-def error_map(rows: Sequence[str], columns: Sequence[str], values: np.ndarray) -> str:
-    """Where the remaining error sits: squared error of joints over its mean.
+def residual_maps(
+    joints: Sequence[str],
+    conditions: Sequence[str],
+    before: np.ndarray,
+    after: np.ndarray,
+    floor: np.ndarray,
+) -> str:
+    """Errors of joints under conditions, in units of the noise floor, two maps.
 
     Args:
-        values: ``(rows, columns)``; NaN where not measured.
+        before, after: ``(joints, conditions)``; NaN where it did not occur.
+        floor: of each joint, ``(joints,)``, in the same units.
     """
-    figure, (axis,) = grid(1, 1, 0.4 * len(rows) + 1.2)
-    shown = np.ma.masked_invalid(values)
-    axis.imshow(
-        shown,
-        cmap="cividis",
-        vmin=0.0,
-        vmax=max(2.0, float(shown.max())),
-        aspect="auto",
-    )
-    for i in range(len(rows)):
-        for j in range(len(columns)):
-            if np.isfinite(values[i, j]):
-                dark = values[i, j] < 0.6 * max(2.0, float(shown.max()))
-                axis.text(
-                    j,
-                    i,
-                    f"{values[i, j]:.1f}",
-                    ha="center",
-                    va="center",
-                    color="white" if dark else "black",
-                )
-    axis.set_xticks(range(len(columns)), columns, rotation=20, ha="right")
-    axis.set_yticks(range(len(rows)), [r.replace("$", r"\$") for r in rows])
-    axis.grid(visible=False)
+    figure, axes = grid(2, 2, 0.42 * len(joints) + 1.9)
+    maps = [np.maximum(x / floor[:, None], 1e-3) for x in (before, after)]
+    most = max(float(np.nanmax(maps[0])), 2.0)
+    for axis, shown, title in zip(
+        axes, maps, ("model as given", "repaired"), strict=True
+    ):
+        axis.imshow(
+            np.log10(shown), cmap="YlOrRd", vmin=0.0, vmax=np.log10(most), aspect="auto"
+        )
+        for i, j in np.argwhere(np.isfinite(shown)).tolist():
+            dark = np.log10(shown[i, j]) > 0.6 * np.log10(most)
+            axis.text(
+                j,
+                i,
+                f"{shown[i, j]:.2g}",
+                ha="center",
+                va="center",
+                fontsize="small",
+                color="white" if dark else INK,
+            )
+        axis.set_xticks(range(len(conditions)), conditions, rotation=55, ha="right")
+        axis.set_yticks(range(len(joints)), list(joints))
+        axis.set_title(title)
+        axis.grid(visible=False)
     return svg(figure)

@@ -7,7 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from easi_jax.io.effects_file import EffectEntry
+from easi_jax.found_effects import EffectEntry
 
 _SAID = {
     "coulomb_friction",

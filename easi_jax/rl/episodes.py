@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,14 @@ from easi_jax.mesh import sharded_map
 from easi_jax.rl.evaluate import evaluate
 from easi_jax.rl.learner import Info
 from easi_jax.rl.networks import PolicyParams, act
+
+
+class Tested(NamedTuple):
+    """Where evaluations are made: environment, ``bind`` and ``draw`` of `Episodes`."""
+
+    env: Env
+    bind: Callable[[Any], Model]
+    draw: Callable[[Any, jax.Array], Any]
 
 
 @dataclass(frozen=True)
@@ -26,6 +34,7 @@ class Episodes:
         num_envs: environments that step together.
         eval_envs: episodes of an evaluation.
         mesh: devices that the environments are split over; None: where the caller is.
+        tested: where evaluations are made; None: where training is.
     """
 
     env: Env
@@ -34,6 +43,7 @@ class Episodes:
     num_envs: int
     eval_envs: int
     mesh: Mesh | None = None
+    tested: Tested | None = None
 
     def unborn(self, dist: Any, key: jax.Array) -> tuple[EnvState, Any]:
         """Environments that count as finished, so that the first step resets them.
@@ -85,11 +95,12 @@ class Episodes:
     ) -> Info:
         """``eval_return`` and ``eval_nonfinite`` where ``due``, NaN and 0 elsewhere."""
         n = self.eval_envs
+        env, bind, draw = self.tested or (self.env, self.bind, self.draw)
 
         def local(keys: Any, dist: Any, policy: PolicyParams) -> jax.Array:
             k_draw, k_run = keys
-            models = jax.vmap(self.bind)(jax.vmap(self.draw, (None, 0))(dist, k_draw))
-            return evaluate(self.env, models, policy, act, k_run, batched=True)
+            models = jax.vmap(bind)(jax.vmap(draw, (None, 0))(dist, k_draw))
+            return evaluate(env, models, policy, act, k_run, batched=True)
 
         def run() -> Info:
             keys = jax.vmap(lambda k: jax.random.split(k, n))(jax.random.split(key))

@@ -25,7 +25,7 @@ from jax.sharding import Mesh
 
 from easi_jax.env import Env, EnvState, Model
 from easi_jax.rl.config import PpoConfig
-from easi_jax.rl.episodes import Episodes, finite, mean_where, raw_key
+from easi_jax.rl.episodes import Episodes, Tested, finite, mean_where, raw_key
 from easi_jax.rl.learner import Info
 from easi_jax.rl.networks import PolicyParams, make_networks, standardize
 
@@ -67,10 +67,13 @@ class Ppo:
         config: PpoConfig,
         bind: Callable[[Any], Model],
         draw: Callable[[Any, jax.Array], Any],
+        tested: Tested | None = None,
     ) -> None:
         """Builds networks and loss; arguments as for `Sac`."""
         self.env, self.config = env, config
-        self._episodes = Episodes(env, bind, draw, config.num_envs, config.eval_envs)
+        self._episodes = Episodes(
+            env, bind, draw, config.num_envs, config.eval_envs, tested=tested
+        )
         actor = make_networks(env.obs_size, env.action_size, config.hidden)
         build: Any = PPONetworks
         self._networks = build(

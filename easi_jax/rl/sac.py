@@ -25,7 +25,7 @@ from jax.sharding import Mesh
 from easi_jax.env import Env, EnvState, Model
 from easi_jax.rl.buffer import RingQueue
 from easi_jax.rl.config import SacConfig
-from easi_jax.rl.episodes import Episodes, finite, mean_where, raw_key
+from easi_jax.rl.episodes import Episodes, Tested, finite, mean_where, raw_key
 from easi_jax.rl.learner import Info, Learner, LearnerState
 from easi_jax.rl.networks import PolicyParams, act
 
@@ -64,6 +64,7 @@ class Sac:
         config: SacConfig,
         bind: Callable[[Any], Model],
         draw: Callable[[Any, jax.Array], Any],
+        tested: Tested | None = None,
     ) -> None:
         """Builds networks and losses.
 
@@ -73,9 +74,12 @@ class Sac:
             bind: the model for parameters ``theta``; pure.
             draw: ``draw(dist, key) -> theta``, one sample of a distribution, which
                 is any pytree of arrays.
+            tested: where evaluations are made, if not in ``env``.
         """
         self.env, self.config = env, config
-        self._episodes = Episodes(env, bind, draw, config.num_envs, config.eval_envs)
+        self._episodes = Episodes(
+            env, bind, draw, config.num_envs, config.eval_envs, tested=tested
+        )
         self._learner = Learner(config, env.obs_size, env.action_size)
         obs, zero = jnp.zeros(env.obs_size), jnp.zeros(())
         self._buffer = RingQueue(

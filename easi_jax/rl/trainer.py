@@ -8,6 +8,7 @@ from jax.sharding import Mesh
 
 from easi_jax.env import Env, Model
 from easi_jax.rl.config import PpoConfig, SacConfig
+from easi_jax.rl.episodes import Tested
 from easi_jax.rl.learner import Info
 from easi_jax.rl.networks import PolicyParams
 from easi_jax.rl.ppo import Ppo
@@ -50,8 +51,9 @@ def make_trainer(
     config: TrainingConfig,
     bind: Callable[[Any], Model],
     draw: Callable[[Any, jax.Array], Any],
+    tested: Tested | None = None,
 ) -> Trainer:
-    """The algorithm that ``config`` is of."""
+    """The algorithm that ``config`` is of; arguments as for `Sac`."""
     if isinstance(config, PpoConfig):
-        return Ppo(env, config, bind, draw)
-    return Sac(env, config, bind, draw)
+        return Ppo(env, config, bind, draw, tested)
+    return Sac(env, config, bind, draw, tested)

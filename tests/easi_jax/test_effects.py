@@ -59,9 +59,7 @@ def simulate(model: mujoco.MjModel, ctrl: np.ndarray) -> Any:
         m = base.replace(
             mjx=effects.with_effects(base.mjx, e), effects=e, delay_steps=DELAYS
         )
-        first = machine.start(jnp.zeros(2), jnp.zeros(2)).replace(
-            memory=effects.first_memory(DELAYS, 2)
-        )
+        first = machine.start(jnp.zeros(2), jnp.zeros(2), m)
 
         def step(s: Any, u: jax.Array) -> Any:
             s = machine.step(m, s, u)
@@ -173,6 +171,22 @@ def test_drag_and_stribeck_follow_their_law(
     )
     want = native(copy.deepcopy(model), ctrl, stribeck)
     np.testing.assert_allclose(simulate(e), want, atol=2e-3)
+
+
+def test_bodies_resist_motion_as_its_square(
+    simulate: Any, model: mujoco.MjModel, ctrl: np.ndarray
+) -> None:
+    def resist(m: mujoco.MjModel, d: mujoco.MjData) -> None:
+        mujoco.mj_forward(m, d)
+        v = np.zeros(6)
+        mujoco.mj_objectVelocity(m, d, mujoco.mjtObj.mjOBJ_BODY, 2, v, 0)
+        v = v[3:]  # of the center of mass
+        d.xfrc_applied[2, :3] = -0.3 * np.linalg.norm(v) * v
+
+    got = simulate(effects.none(model).replace(resistance=vector(3, 2, 0.3)))
+    want = native(copy.deepcopy(model), ctrl, resist)
+    np.testing.assert_allclose(got, want, atol=1e-3)
+    assert np.abs(want - native(model, ctrl)).max() > 0.02, "the effect is visible"
 
 
 @pytest.mark.parametrize("spread", [0.0, 1.0])

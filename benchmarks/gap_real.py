@@ -1,0 +1,155 @@
+"""What train.gap finds in recordings of real machines.
+
+    python -m benchmarks.gap_real --data ../shared/data
+
+``expected`` is what is known of each machine from elsewhere; no method sees it.
+Recordings under ``held_out`` take part in no fit.
+"""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+from train._command import main, say, show_table
+
+
+@dataclasses.dataclass(frozen=True)
+class Machine:
+    """Recordings of one machine, and what is known of it."""
+
+    folder: str
+    data: tuple[str, ...]
+    held_out: tuple[str, ...]
+    horizon: float
+    expected: tuple[str, ...]
+    """Names, alternatives joined by |."""
+    never: tuple[str, ...] = ()
+
+
+MACHINES = {
+    "emps": Machine(
+        "emps",
+        ("run1.csv",),
+        ("run2_pulses.csv",),
+        0.5,
+        (
+            "viscous_damping@slide",
+            "coulomb_friction@slide|stribeck_friction@slide",
+            "constant_force@slide",
+        ),
+        ("actuator_delay", "sensor_delay"),
+    ),
+    "cartpole": Machine(
+        "quanser_cartpole",
+        ("chirp_plus_*.csv", "chirp_minus_*.csv"),
+        ("swingup_0?.csv",),
+        0.5,
+        (
+            "payload_mass@cart|armature@slider",
+            "coulomb_friction@slider|stribeck_friction@slider",
+        ),
+    ),
+    "drive_velocities": Machine(
+        "quanser_cartpole",
+        ("swingup_00_with_drive_velocities.csv",),
+        (),
+        0.2,
+        ("sensor_delay@qvel.slider",),
+    ),
+    "pendulum": Machine(
+        "dfki_pendulum",
+        ("sac.csv", "energy_0.5kg.csv"),
+        ("swingup_ddp.csv",),
+        0.5,
+        ("coulomb_friction|stribeck_friction", "actuator_gain|payload_mass|armature"),
+    ),
+    "pendulum_1kg": Machine(
+        "dfki_pendulum", ("energy_1kg.csv",), (), 0.2, ("payload_mass",)
+    ),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Runs train.gap on recordings of real machines."""
+
+    data: Path = Path("../shared/data")
+    """Folder of the recordings."""
+    machines: tuple[str, ...] = tuple(MACHINES)
+    """Which of them."""
+    out: Path = Path("results/gap_real")
+    """Folder of the runs."""
+
+
+def run(config: Config) -> None:
+    """Analyses each, and writes what was found."""
+    from benchmarks._common import command_of, write_result
+    from easi_jax.errors import UserError, nearest
+
+    for name in config.machines:
+        if name not in MACHINES:
+            raise UserError(f'unknown machine "{name}"{nearest(name, MACHINES)}')
+        if not (config.data / MACHINES[name].folder / "model.xml").is_file():
+            raise UserError(f"{config.data} does not hold the recordings; give --data")
+    for name in config.machines:
+        chosen = dataclasses.replace(config, machines=(name,))
+        told = analysed(MACHINES[name], config.data, config.out / name)
+        path = write_result(
+            f"gap_real_{name}",
+            command_of("benchmarks.gap_real", chosen),
+            {**dataclasses.asdict(MACHINES[name]), "machine": name},
+            **told,
+        )
+        show_table(
+            name,
+            ("expected", "found"),
+            [(e, "yes" if ok else "NO") for e, ok in told["found"].items()],
+        )
+        say(f"written: {path}")
+
+
+def analysed(machine: Machine, data: Path, out: Path) -> dict[str, Any]:
+    """What train.gap says, and which of the expected names are among it."""
+    from train import gap
+
+    folder = data / machine.folder
+
+    def files(patterns: tuple[str, ...]) -> tuple[Path, ...]:
+        return tuple(p for x in patterns for p in sorted(folder.glob(x)))
+
+    held = files(machine.held_out)
+    gap.run(
+        gap.Config(
+            model=str(folder / "model.xml"),
+            data=(*files(machine.data), *held),
+            held_out=held,
+            horizon=machine.horizon,
+            out=out,
+            overwrite=True,
+        )
+    )
+    told = json.loads((out / "gap.json").read_text())
+    effects = told["effects"]
+
+    def there(expected: str) -> bool:
+        """Named, at its place where one is given."""
+        options = expected.split("|")
+        names = [f"{e['effect']}@{e['at']}" for e in effects]
+        return any(n == o or n.split("@")[0] == o for n in names for o in options)
+
+    return {
+        "found": {e: there(e) for e in machine.expected},
+        "wrongly_named": [e["effect"] for e in effects if e["effect"] in machine.never],
+        **{
+            k: told[k]
+            for k in (
+                *("verdict", "effects", "refitted", "gap", "gap_si", "held_out"),
+                *("disagreeing_runs", "record_next", "seconds"),
+            )
+        },
+    }
+
+
+if __name__ == "__main__":
+    main(Config, run, name="benchmarks.gap_real")

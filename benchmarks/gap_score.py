@@ -1,0 +1,106 @@
+"""How often train.gap is right, counted over the cases of ``benchmarks.gap``."""
+
+import json
+from collections.abc import Sequence
+from math import sqrt
+from pathlib import Path
+from typing import Any
+
+GOALS = {
+    "right name and place first": (0.95, "at least"),
+    "false alarms without effect": (0.02, "at most"),
+    "wrong with confidence above 0.8": (0.02, "at most"),
+    "pairs both found": (0.80, "at least"),
+    "unexplained where it is right": (0.80, "at least"),
+}
+_SURE = 0.8
+_BINS = 5
+
+
+def read_cases(path: Path) -> list[dict[str, Any]]:
+    """One row a case; none where the file is missing."""
+    if not path.is_file():
+        return []
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
+    """95 % interval of a share (E. B. Wilson, *J. Am. Stat. Assoc.* 22, 1927)."""
+    if not count:
+        return 0.0, 1.0
+    p = hits / count
+    middle = (p + z * z / (2 * count)) / (1 + z * z / count)
+    half = z * sqrt(p * (1 - p) / count + z * z / (4 * count**2)) / (1 + z * z / count)
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def shares(rows: Sequence[dict[str, Any]]) -> dict[str, tuple[int, int]]:
+    """Hits and counts of what is asked, by its name in `GOALS`."""
+    kinds = {k: [r for r in rows if r["kind"] == k] for k in ("single", "pair")}
+    without = [r for r in rows if r["kind"] in ("none", "wrong_own")]
+    outside = [r for r in rows if r["kind"] == "outside"]
+
+    def count(part: Sequence[dict[str, Any]], hit: Any) -> tuple[int, int]:
+        return sum(bool(hit(r)) for r in part), len(part)
+
+    def rash(r: dict[str, Any]) -> bool:
+        return any(not ok and c > _SURE for ok, c in judged([r]))
+
+    return {
+        "right name and place first": count(kinds["single"], lambda r: r["right"]),
+        "false alarms without effect": count(without, lambda r: r["named"]),
+        "wrong with confidence above 0.8": count(rows, rash),
+        "pairs both found": count(kinds["pair"], lambda r: r["right"]),
+        "unexplained where it is right": count(
+            outside, lambda r: r["verdict"] == "unexplained"
+        ),
+    }
+
+
+def judged(rows: Sequence[dict[str, Any]]) -> list[tuple[bool, float]]:
+    """For every effect named: whether it is there, and the confidence stated.
+
+    Twins by physics count as there where the case was right as a whole.
+    """
+    out = []
+    for r in rows:
+        for name, confidence in zip(r["named"], r["confidence"], strict=True):
+            there = name in r["truth"]
+            if not there and r["right"] and r["kind"] in ("single", "pair"):
+                there = name in r["named"][: len(r["truth"])]
+            out.append((there, float(confidence)))
+    return out
+
+
+def brier(pairs: Sequence[tuple[bool, float]]) -> float:
+    """Mean squared distance of confidence from what was the case."""
+    return sum((c - ok) ** 2 for ok, c in pairs) / max(len(pairs), 1)
+
+
+def calibration(pairs: Sequence[tuple[bool, float]]) -> list[tuple[float, float, int]]:
+    """Mean confidence, share that was right, and count, by bins of confidence."""
+    out = []
+    for k in range(_BINS):
+        inside = [(ok, c) for ok, c in pairs if min(int(c * _BINS), _BINS - 1) == k]
+        n = len(inside)
+        if n:
+            mean = sum(c for _, c in inside) / n
+            out.append((mean, sum(ok for ok, _ in inside) / n, n))
+    return out
+
+
+def confusion(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:
+    """First name by true effect, of cases with one."""
+    out: dict[str, dict[str, int]] = {}
+    for r in rows:
+        if r["kind"] != "single":
+            continue
+        truth = r["truth"][0].split("@")[0]
+        first = "right twin" if r["right"] else "none"
+        if r["named"] and not r["right"]:
+            first = r["named"][0].split("@")[0]
+        elif r["named"] and r["named"][0] in r["truth"]:
+            first = truth
+        row = out.setdefault(truth, {})
+        row[first] = row.get(first, 0) + 1
+    return out

@@ -1,0 +1,94 @@
+"""Pages of results on the gap workflow."""
+
+from pathlib import Path
+
+from benchmarks._common import markdown_table
+from benchmarks.gap_real import MACHINES
+from benchmarks.gap_score import (
+    GOALS,
+    brier,
+    calibration,
+    confusion,
+    judged,
+    read_cases,
+    shares,
+    wilson,
+)
+
+
+def generated(folder: Path) -> list[str]:
+    """Cases with a hidden effect."""
+    rows = read_cases(folder / "gap_cases.jsonl")
+    if not rows:
+        return ["## Hidden effects", "Not run: `python -m benchmarks.gap`."]
+    out = [
+        "## Hidden effects",
+        f"{len(rows)} generated cases (`python -m benchmarks.gap`), commits "
+        f"{', '.join(sorted({r['commit'][:7] for r in rows}))}.",
+    ]
+    lines = []
+    for name, (hits, count) in shares(rows).items():
+        goal, way = GOALS[name]
+        if not count:
+            lines.append((name, "not run", "", f"{way} {goal:.0%}", ""))
+            continue
+        low, high = wilson(hits, count)
+        met = hits / count >= goal if way == "at least" else hits / count <= goal
+        lines.append(
+            (
+                name,
+                f"{hits} of {count}",
+                f"{low:.0%} to {high:.0%}",
+                f"{way} {goal:.0%}",
+                "met" if met else "missed",
+            )
+        )
+    out.append(markdown_table(("what", "cases", "95 % (Wilson)", "goal", ""), lines))
+    pairs = judged(rows)
+    bins = [(f"{c:.2f}", f"{s:.2f}", n) for c, s, n in calibration(pairs)]
+    out.append(
+        markdown_table(("confidence stated", "share right", "names"), list(bins))
+    )
+    out.append(f"Brier score {brier(pairs):.3f} over {len(pairs)} names.")
+    found = [
+        (truth, ", ".join(f"{name} {n}" for name, n in sorted(row.items())))
+        for truth, row in sorted(confusion(rows).items())
+    ]
+    out.append(markdown_table(("true effect", "named first"), found))
+    return out
+
+
+def real(folder: Path) -> list[str]:
+    """Recordings of real machines."""
+    from easi_jax.io.files import read_json
+
+    out = ["## Effects in real recordings"]
+    lines: list[tuple[object, ...]] = []
+    for name in MACHINES:
+        path = folder / f"gap_real_{name}.json"
+        if not path.is_file():
+            continue
+        r = read_json(path)
+        named = ", ".join(
+            f"{e['effect']}@{e['at']} ({e['confidence']:.2f})" for e in r["effects"]
+        )
+        missing = [k for k, ok in r["found"].items() if not ok]
+        gap = r["gap"]
+        lines.append(
+            (
+                name,
+                named or "none",
+                ", ".join(missing) or "none",
+                ", ".join(r["wrongly_named"]) or "none",
+                f"{gap['before']:.3g}, {gap['refit']:.3g}, {gap['after']:.3g}",
+                f"{gap['floor']:.2g}",
+                f"{r['seconds']:.0f}",
+            )
+        )
+    if not lines:
+        return [*out, "Not run: `python -m benchmarks.gap_real`."]
+    head = (
+        *("recordings", "named (confidence)", "expected but not named"),
+        *("never to be named", "gap given, refitted, after", "floor", "s"),
+    )
+    return [*out, "`python -m benchmarks.gap_real`.", markdown_table(head, lines)]

@@ -1,0 +1,137 @@
+"""What several runs would say of every effect: simulated once, in one program."""
+
+from collections.abc import Callable, Sequence
+
+import mujoco
+import numpy as np
+
+from easi_jax.excite.separation import Design
+from easi_jax.gap import measure
+from easi_jax.gap.fit import Bounds
+from easi_jax.gap.predictor import Predictor, WindowSet, join, window_set
+from easi_jax.gap.residuals import make_residuals, start_sensitivity, velocity_slack
+from easi_jax.gap.table import Layout, Place, Scales
+from easi_jax.parameters import ParameterSpace
+from easi_jax.recording import Run
+
+_TOGETHER = 16  # vectors in one call, between two lines of progress
+_FLOOR = 0.05  # of the error that the start velocity's own fit makes
+
+Tell = Callable[[str], None]
+
+
+def windows_of(
+    runs: Sequence[Run], horizon: float, longest: float, most: int
+) -> list[WindowSet]:
+    """At most ``most`` windows of each run, at even distances.
+
+    Args:
+        horizon: length of a window [s].
+        longest: delay that predictions have to allow for [s].
+    """
+    out = []
+    for i, run in enumerate(runs):
+        every = window_set([run], horizon, longest, i)
+        if every is None:
+            raise ValueError(f"{run.name} is shorter than a window")
+        count = len(every)
+        pick = np.linspace(0, count - 1, min(most, count)).round().astype(int)
+        out.append(every.take(pick))
+    return out
+
+
+def make_design(
+    predictor: Predictor,
+    bounds: Bounds,
+    found: Sequence[Place],
+    truths: dict[str, np.ndarray] | None = None,
+) -> Design:
+    """A design of some effects about the model as given."""
+    own = range(predictor.own)
+    design = Design(predictor, bounds, predictor.neutral.copy(), list(own))
+    for place in found:
+        design.add(place, (truths or {}).get(place.key))
+    return design
+
+
+def products_of(
+    m: mujoco.MjModel,
+    design: Design,
+    parts: Sequence[WindowSet],
+    runs: Sequence[Run],
+    noise: np.ndarray,
+    scales: Scales,
+    tell: Tell = lambda _: None,
+) -> list[np.ndarray]:
+    """Products of all signatures in each run, in units of noise, ``(P, P)`` each.
+
+    Args:
+        design: its predictor predicts all ``parts``, one after another.
+        parts: windows of each run; ``run`` counts ``runs``.
+        noise: of measured positions, ``(nv,)``.
+        scales: how large motion is.
+    """
+    p, nv = design.predictor, m.nv
+    step = runs[0].dt / p.machine.substeps
+    slack = [velocity_slack([r], step) for r in runs]
+    moved = np.concatenate(
+        [
+            np.maximum(1e-3 * scales.position, noise),
+            np.maximum(0.01 * scales.speed, np.max(slack, 0)),
+        ]
+    )
+    slope = start_sensitivity(p, design.base, moved, None)
+    groups: list[np.ndarray] = []
+    for first in range(0, len(design.vectors), _TOGETHER):
+        x = np.array(design.vectors[first : first + _TOGETHER])
+        groups.append(p.errors(x))
+        tell(f"simulated {first + len(x)} of {len(design.vectors)} changes")
+    errors = np.concatenate(groups)
+    names = [n.removeprefix("qpos.") for n in p.machine.state_names[:nv]]
+    out, at = [], 0
+    for part, run, loose in zip(parts, runs, slack, strict=True):
+        here = slice(at, at + len(part))
+        at += len(part)
+        scale = measure.channels(m, names, [run], noise, p.steps).scale
+        found = np.zeros((len(design.pairs),) * 2)
+        if np.isfinite(scale).any():
+            found = _products(
+                *(design, part, runs, slope[:, here], errors[:, here]),
+                *(noise, loose, scale),
+            )
+            # Windows overlap by half, and not all were simulated.
+            found *= len(run) / p.steps / len(part)
+        out.append(found)
+    return out
+
+
+def _products(
+    design: Design,
+    windows: WindowSet,
+    runs: Sequence[Run],
+    slope: np.ndarray,
+    errors: np.ndarray,
+    noise: np.ndarray,
+    slack: np.ndarray,
+    scale: np.ndarray,
+) -> np.ndarray:
+    """Products of all signatures in some windows, in units of noise, ``(P, P)``."""
+    rms = np.sqrt(np.mean(errors[0].astype(float) ** 2, (0, 1)))
+    residuals = make_residuals(windows, runs, slope, noise, slack, _FLOOR * rms, scale)
+    # Differences first: they are small beside what single precision carries.
+    a, b = (np.array(x) for x in zip(*design.pairs, strict=True))
+    change = residuals.grouped(errors[a].astype(np.float64) - errors[b])
+    flat = residuals.whitened(change).reshape(len(a), -1)
+    flat = np.where(np.isfinite(flat), flat, 0.0)
+    return flat @ flat.T
+
+
+def make_predictor(
+    m: mujoco.MjModel,
+    space: ParameterSpace,
+    found: Sequence[Place],
+    parts: Sequence[WindowSet],
+    dt: float,
+) -> Predictor:
+    """A predictor of all parts, one after another."""
+    return Predictor(m, space, Layout(m, found), join(list(parts)), dt)

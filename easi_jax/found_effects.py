@@ -1,0 +1,215 @@
+"""From effects that were found to a model that has them and parameters to search.
+
+`train.gap` finds effects and says how sure it is; here they become part of a machine:
+their values are its new nominal ones, and what is uncertain about them joins the
+parameters that training draws and a search looks for.
+"""
+
+import copy
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from easi_jax import addresses as language
+from easi_jax.effect_quantities import EFFECT_TABLE, READINGS
+from easi_jax.errors import UserError
+from easi_jax.machine import Machine
+from easi_jax.parameters import Parameter, ParameterSpace
+
+_SHAPES = ("spread", "jump")  # say which kind, not how much
+_STDS = 3.0
+_SHARE = 0.1  # of a value, at least, that it is taken to be uncertain by
+_FARTHER = 2.0  # times the upper end of where a search starts, that a delay may reach
+
+
+@dataclass(frozen=True)
+class EffectEntry:
+    """One effect.
+
+    Attributes:
+        effect: name.
+        at: joint, actuator or body; "" for the whole model.
+        kind: what ``at`` is.
+        columns: values of fields of `easi_jax.effects.Effects`, by name; vectors have
+            a name for each entry, such as ``com.0``.
+        std: their standard deviations, where known.
+    """
+
+    effect: str
+    at: str
+    kind: str
+    columns: Mapping[str, float]
+    std: Mapping[str, float]
+
+    def address(self, column: str) -> str:
+        """The address of one of its numbers."""
+        field, *part = column.split(".")
+        return ".".join(["effect", field, *([self.at] if self.at else []), *part])
+
+
+@dataclass(frozen=True)
+class FoundEffects:
+    """Effects of a machine, and values of its model's own parameters.
+
+    Attributes:
+        entries: the effects.
+        own: values by address.
+    """
+
+    entries: tuple[EffectEntry, ...] = ()
+    own: Mapping[str, float] | None = None
+
+    def __bool__(self) -> bool:
+        return bool(self.entries or self.own)
+
+
+def joined(
+    m: mujoco.MjModel, space: ParameterSpace, found: FoundEffects
+) -> tuple[ParameterSpace, dict[str, float]]:
+    """Parameters of a model with effects, and values that stay, by address.
+
+    A number of an effect becomes a parameter, named ``EFFECT@PLACE.NUMBER``. Its search
+    starts within three standard deviations of what was found, a tenth of the value at
+    least; its bounds are those of physics. Parameters of ``space`` whose own values
+    were refitted start about the new ones.
+
+    Raises:
+        UserError: a joint, actuator or body that the model lacks, an effect that is in
+            the readings, a value outside what physics allows.
+    """
+    own = dict(found.own or {})
+    space, rest = _renewed(m, space, own)
+    new: list[Parameter] = []
+    stay = dict(rest)
+    for entry in found.entries:
+        _check(m, entry)
+        for column, value in entry.columns.items():
+            p = _parameter(m, entry, column, value)
+            if p is None:
+                stay[entry.address(column)] = value
+            else:
+                new.append(p)
+    return ParameterSpace((*space.parameters, *new)), stay
+
+
+def _check(m: mujoco.MjModel, entry: EffectEntry) -> None:
+    where = f'effect {entry.effect} at "{entry.at}"' if entry.at else entry.effect
+    for column in entry.columns:
+        if column.split(".")[0] in READINGS:
+            raise UserError(
+                f"{where}: it is in the readings, not in the physics, and cannot be "
+                "simulated; take it out of the effects file (a delay of all readings "
+                "acts as one of all commands: actuator_delay)"
+            )
+        if column not in EFFECT_TABLE:
+            raise UserError(f'{where}: no column "{column}"')
+        row = EFFECT_TABLE[column]
+        if row.on != entry.kind:
+            raise UserError(
+                f'{where}: column "{column}" is of kind {row.on}, not {entry.kind}'
+            )
+        language.places(m, entry.address(column))
+
+
+def _parameter(
+    m: mujoco.MjModel, entry: EffectEntry, column: str, value: float
+) -> Parameter | None:
+    """None where nothing is uncertain."""
+    half = max(_STDS * entry.std.get(column, 0.0), _SHARE * abs(value))
+    if column.split(".")[0] in _SHAPES or half == 0:
+        return None
+    address = entry.address(column)
+    unit, (low, high) = language.describe(m, (address,))
+    start = max(value - half, low), min(value + half, high)
+    if column in ("delay", "lag"):
+        high = min(high, _FARTHER * start[1])
+    place = f"@{entry.at}" if entry.at else ""
+    name = f"{entry.effect}{place}.{EFFECT_TABLE[column].word}"
+    return Parameter(name, (address,), value, start, (low, high), unit, log=False)
+
+
+Number = tuple[str, tuple[int, ...], int]
+
+
+def _numbers(m: mujoco.MjModel, addresses: Iterable[str]) -> list[Number]:
+    writers = language.resolve(m, (tuple(addresses),))
+    return [(e.field, e.index, e.sign) for w in writers for e in w.entries]
+
+
+def _renewed(
+    m: mujoco.MjModel, space: ParameterSpace, own: Mapping[str, float]
+) -> tuple[ParameterSpace, dict[str, float]]:
+    """Parameters about refitted values, and the values that no parameter sets.
+
+    Where a parameter sets several places, it gets their mean.
+    """
+    values = {n: v for a, v in own.items() for n in _numbers(m, (a,))}
+    owners: set[Number] = set()
+    out = []
+    for p in space.parameters:
+        places = _numbers(m, p.addresses)
+        if not any(n in values for n in places):
+            out.append(p)
+            continue
+        owners.update(places)
+        nominal = float(np.mean([values.get(n, p.nominal) for n in places]))
+        out.append(_about(p, nominal))
+    rest = {a: v for a, v in own.items() if not owners & set(_numbers(m, (a,)))}
+    return ParameterSpace(tuple(out)), rest
+
+
+def _about(p: Parameter, nominal: float) -> Parameter:
+    """The parameter with another nominal value and its range moved along."""
+    (low, high), (least, most) = p.initial, p.bounds
+    if p.nominal > 0 and nominal > 0:
+        low, high = low * nominal / p.nominal, high * nominal / p.nominal
+    else:
+        low, high = low + nominal - p.nominal, high + nominal - p.nominal
+    return replace(p, nominal=nominal, initial=(max(low, least), min(high, most)))
+
+
+def machine_with(machine: Machine, found: FoundEffects) -> Machine:
+    """The machine with effects in its physics and in its space.
+
+    Raises:
+        UserError: as `joined`.
+    """
+    space, fixed = joined(machine.mj_model, machine.space, found)
+    return machine.rebuilt(space=space, fixed={**machine.fixed, **fixed})
+
+
+def env_with(env: Any, found: FoundEffects) -> Any:
+    """An environment with effects; the given one stays as it is.
+
+    Raises:
+        UserError: as `joined`; or the environment simulates with something else than
+            its ``machine``.
+    """
+    if not found:
+        return env
+    if not isinstance(getattr(env, "machine", None), Machine):
+        raise UserError(
+            f"{env.name}: effects need an environment whose `machine` is an "
+            "easi_jax.machine.Machine"
+        )
+    out = copy.copy(env)
+    out.machine = machine_with(env.machine, found)
+    out.space = out.machine.space
+    theta = jnp.asarray(out.space.nominal, jnp.float32)
+    model = jax.eval_shape(out.model, theta)
+    if getattr(model, "present", None) != out.machine.base.present:
+        raise UserError(
+            f"{env.name}: effects need an environment whose model() is that of its "
+            "`machine` (self.machine.model(theta))"
+        )
+    return out
+
+
+def named(entries: Sequence[EffectEntry]) -> str:
+    """``EFFECT@PLACE`` of all, for a line of text."""
+    return ", ".join(f"{e.effect}@{e.at}" if e.at else e.effect for e in entries)

@@ -1,0 +1,252 @@
+"""What ``train.excite`` is asked: model, limits, noise, what is to be told apart."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+_NOISE = 1e-3  # rad, m
+_TRAVEL = {2: 0.5, 3: math.pi}  # m for slides, rad for hinges
+_RATE = 100.0  # Hz
+
+
+@dataclasses.dataclass(frozen=True)
+class ExciteProblem:
+    """A machine that is to be excited.
+
+    Attributes:
+        name: of the model.
+        mj_model: compiled.
+        space: its own parameters that a refit may move.
+        bench: model, wrong models, start, hold, limits.
+        most: largest change of each command, ``(nu,)``.
+        noise: of positions, ``(nv,)``.
+        scales: of --data; None without.
+        pairs: effects that are to be told apart; empty: all.
+        strengths: of those, by key, then field and index.
+        notes: what the user should know.
+    """
+
+    name: str
+    mj_model: Any
+    space: Any
+    bench: Any
+    most: Any
+    noise: Any
+    scales: Any
+    pairs: list[tuple[str, str]]
+    strengths: dict[str, dict[tuple[str, tuple[int, ...]], float]]
+    notes: list[str]
+
+
+def read_excite_problem(config: Any) -> ExciteProblem:
+    """Reads and checks everything; nothing is written yet.
+
+    Raises:
+        UserError: whatever is wrong with the files or the options.
+    """
+    import numpy as np
+
+    from easi_jax.errors import UserError
+    from easi_jax.excite.candidates import LEAD, make_bench
+    from easi_jax.excite.choose import check_names
+    from easi_jax.excite.drives import joint_name, limits_of, scalar_dofs
+    from easi_jax.gap.own import own_space
+    from easi_jax.io.parameter_file import read_parameter_file
+    from train._gap_problem import read_model
+
+    if not config.model:
+        raise UserError("give --model M.xml (or a robot's name)")
+    _check_numbers(config, LEAD)
+    check_names(config.effects)
+    _check_out(config)
+    name, _, m = read_model(config.model)
+    if not m.nu:
+        raise UserError(f"{config.model}: the model has no actuator to excite")
+    for kind, count, named in (
+        ("joint", m.njnt, m.joint),
+        ("actuator", m.nu, m.actuator),
+    ):
+        if any(not named(i).name for i in range(count)):
+            raise UserError(
+                f"{config.model}: a log names every {kind}, so give each one a name"
+            )
+    space = (
+        own_space(m)
+        if config.parameters is None
+        else read_parameter_file(config.parameters, m)
+    )
+    joints = {joint_name(m, j): qd for j, qd in scalar_dofs(m).items()}
+    of_joint = {n: d for n, (_, d) in joints.items()}
+    of_actuator = {m.actuator(a).name: a for a in range(m.nu)}
+    notes = []
+    dt, noise, scales = _from_data(config, m, notes)
+    if config.rate is not None:
+        dt = 1.0 / config.rate
+    if dt is None:
+        dt = _built_in_step(config.model) or 1.0 / _RATE
+    noise = _numbers("--noise", config.noise, of_joint, noise)
+    speed = _numbers("--max-speed", config.max_speed, of_joint, np.full(m.nv, np.inf))
+    default = np.full(m.nv, _TRAVEL[3])
+    for j, (_, d) in scalar_dofs(m).items():
+        default[d] = _TRAVEL[int(m.jnt_type[j])]
+    travel = _numbers("--travel", config.travel, of_joint, default)
+    most = _numbers("--amplitude", config.amplitude, of_actuator, np.full(m.nu, np.inf))
+    limits = limits_of(m, config.margin, travel, speed)
+    for joint in limits.assumed:
+        reach = travel[of_joint[joint]]
+        notes.append(
+            f'joint "{joint}" has no range in the model: kept within {reach:.3g} of '
+            "its start (--travel)"
+        )
+    if any(m.jnt_type[j] < 2 for j in range(m.njnt)):
+        notes.append(
+            "nothing checks what a free or ball joint does: hang up the base, or watch "
+            "the predicted positions"
+        )
+    rows = round(config.duration / dt) + 1
+    bench, more = make_bench(m, limits, dt, rows, config.play)
+    pairs, strengths = _from_gap(config, m, notes)
+    return ExciteProblem(
+        name,
+        m,
+        space,
+        bench,
+        most,
+        noise,
+        scales,
+        pairs,
+        strengths,
+        [*notes, *more],
+    )
+
+
+def _check_numbers(config: Any, lead: float) -> None:
+    from easi_jax.errors import UserError
+
+    least = 2 * lead + max(2.0, 4 * config.horizon)
+    if not (math.isfinite(config.duration) and least <= config.duration <= 600):
+        raise UserError(
+            f"--duration is {config.duration:g}: give {least:g} to 600 s, of which "
+            f"{2 * lead:g} are rest"
+        )
+    if config.rate is not None and not 10 <= config.rate <= 2000:
+        raise UserError(f"--rate is {config.rate:g}: give 10 to 2000 Hz")
+    if not 0 <= config.margin < 0.4:
+        raise UserError(f"--margin is {config.margin:g}: give a share from 0 to 0.4")
+    if not (math.isfinite(config.horizon) and 0 < config.horizon <= 5):
+        raise UserError(f"--horizon is {config.horizon:g}: give seconds, at most 5")
+    if config.seed < 0:
+        raise UserError(f"--seed is {config.seed}: give a whole number from 0 up")
+
+
+def _check_out(config: Any) -> None:
+    """Refuses to touch a file before minutes of work, not after."""
+    from easi_jax.errors import UserError
+
+    if config.out.suffix and config.out.suffix != ".csv":
+        raise UserError(f"--out {config.out}: give a folder, or a file NAME.csv")
+    if config.out.suffix == ".csv":
+        for path in (config.out, config.out.with_suffix(".json")):
+            if path.exists() and not config.overwrite:
+                raise UserError(
+                    f"{path} exists: --overwrite replaces it, or choose another --out"
+                )
+    elif (config.out / "config.json").exists() and not config.overwrite:
+        raise UserError(
+            f"{config.out} already holds a run: --overwrite deletes it, or choose "
+            "another --out"
+        )
+
+
+def _numbers(
+    option: str, given: Sequence[str], index: Mapping[str, int], default: Any
+) -> Any:
+    """Values of ``1.5`` (for all) and ``NAME=1.5`` over defaults ``(n,)``.
+
+    Raises:
+        UserError: no number above 0, or an unknown name.
+    """
+    import numpy as np
+
+    from easi_jax.errors import UserError, nearest
+
+    out = np.array(default, float)
+    for text in sorted(given, key=lambda t: "=" in t):
+        name, _, number = text.rpartition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            value = math.nan
+        if not (math.isfinite(value) and value > 0):
+            raise UserError(f'{option} "{text}": give a number above 0, or NAME=NUMBER')
+        if "=" not in text:
+            out[:] = value
+        elif name in index:
+            out[index[name]] = value
+        else:
+            raise UserError(
+                f'{option}: the model has no "{name}"{nearest(name, index)} (known: '
+                f"{', '.join(index)})"
+            )
+    return out
+
+
+def _built_in_step(model: str) -> float | None:
+    from envs import REGISTRY, make
+
+    return float(make(model).dt) if model in REGISTRY else None
+
+
+def _from_data(config: Any, m: Any, notes: list[str]) -> tuple[Any, Any, Any]:
+    """Control step, noise ``(nv,)`` and scales of earlier logs."""
+    import numpy as np
+
+    if not config.data:
+        return None, np.full(m.nv, _NOISE), None
+    from easi_jax.gap.scales import scales_of
+    from easi_jax.io.logs import read_logs
+    from easi_jax.log_data import pooled_noise, to_common_step
+
+    log = read_logs(list(config.data), m, config.mapping)
+    notes += log.notes
+    runs, changed = to_common_step(log.runs)
+    notes += changed
+    noise = np.maximum(pooled_noise(log.runs)[: m.nv], 1e-6)
+    return runs[0].dt, noise, scales_of(m, runs)
+
+
+def _from_gap(config: Any, m: Any, notes: list[str]) -> tuple[list[Any], Any]:
+    """What a result of train.gap leaves open, with the strengths that it found."""
+    if config.gap is None:
+        return [], {}
+    from easi_jax.errors import UserError
+    from easi_jax.gap.table import object_id
+    from easi_jax.io.effects_file import read_effects
+    from easi_jax.io.files import read_json
+
+    path = config.gap / "gap.json" if config.gap.is_dir() else config.gap
+    told = read_json(path)
+    if not isinstance(told, dict) or not isinstance(told.get("effects"), list):
+        raise UserError(f"{path}: not a gap.json of train.gap")
+    pairs = []
+    for effect in told["effects"]:
+        key = f"{effect['effect']}@{effect['at']}"
+        pairs += [(key, other) for other in effect["indistinguishable"]]
+    if not pairs:
+        notes.append(f"{path} leaves no names open: the test is chosen for all effects")
+        return [], {}
+    pairs += [(b, a) for a, b in pairs]
+    beside = path.parent / "effects.yaml"
+    strengths: dict[str, dict[tuple[str, tuple[int, ...]], float]] = {}
+    for e in read_effects(beside)[0] if beside.exists() else []:
+        index: tuple[int, ...] = ()
+        if e.kind in ("joint", "actuator", "body"):
+            i = object_id(m, e.kind, e.at)
+            index = (int(m.jnt_dofadr[i]) if e.kind == "joint" else i,)
+        values = {}
+        for column, value in e.columns.items():
+            field, _, part = column.partition(".")
+            values[(field, (*index, int(part)) if part else index)] = value
+        strengths[f"{e.effect}@{e.at}"] = values
+    return list(dict.fromkeys(pairs)), strengths
