@@ -5,13 +5,13 @@ Imports no jax, so that ``--help`` is quick; a command's ``run`` imports what it
 
 import contextlib
 import re
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Any, NoReturn, Protocol, TypeVar
+
+from train import _interrupt
 
 _Config = TypeVar("_Config")
 
@@ -25,7 +25,11 @@ class Progress(Protocol):
     """A bar or, where nobody watches, a log."""
 
     def advance(self, n: int = 1, **fields: float | int | str) -> None:
-        """``n`` steps are done; ``fields`` are the numbers worth watching."""
+        """``n`` steps are done; ``fields`` are the numbers worth watching.
+
+        Raises:
+            KeyboardInterrupt: where the command was told to stop.
+        """
         ...
 
 
@@ -56,16 +60,20 @@ def main(
         from easi_jax.errors import UserError
 
         try:
-            with _terminate_as_interrupt():
+            with _interrupt.remembered():
                 run(config)
         except UserError as error:
             _stop(f"error: {' '.join(str(error).split())}", USER_ERROR)
-    except KeyboardInterrupt:
-        _stop(_interrupted(getattr(config, "out", None)), INTERRUPTED)
     except BrokenPipeError:
         # The reader of our output has gone, as in `... | head`.
         sys.stderr.close()
         raise SystemExit(1) from None
+    except BaseException as error:
+        # An event loop or a callback turns the interrupt into an error of its own.
+        told = isinstance(error, KeyboardInterrupt) or _interrupt.asked()
+        if not told or isinstance(error, SystemExit):
+            raise
+        _stop(_interrupted(getattr(config, "out", None)), INTERRUPTED)
 
 
 def show_table(
@@ -173,6 +181,7 @@ class _Log:
         self._last = -float("inf")
 
     def advance(self, n: int = 1, **fields: float | int | str) -> None:
+        _interrupt.check()
         self._meter.advance(n)
         due = self._meter.elapsed - self._last >= LOG_SECONDS
         if due or self._meter.done >= self._meter.total:
@@ -209,6 +218,7 @@ def _bar(name: str, meter: Meter) -> Iterator[Progress]:
 
     class Shown:
         def advance(self, n: int = 1, **fields: float | int | str) -> None:
+            _interrupt.check()
             meter.advance(n)
             bar.update(task, advance=n, values=_fields(fields))
 
@@ -243,20 +253,6 @@ def _interrupted(out: Path | str | None) -> str:
             "command with --resume goes on from there"
         )
     return f"interrupted before the first checkpoint; nothing to resume in {out}"
-
-
-@contextlib.contextmanager
-def _terminate_as_interrupt() -> Iterator[None]:
-    """A cluster's SIGTERM ends a run as tidily as Ctrl-C does."""
-
-    def stop(number: int, frame: FrameType | None) -> NoReturn:
-        raise KeyboardInterrupt
-
-    old = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, old)
 
 
 def _stop(message: str, status: int) -> NoReturn:

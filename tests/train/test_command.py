@@ -1,3 +1,5 @@
+import asyncio
+import contextlib
 import dataclasses
 import os
 import signal
@@ -111,6 +113,59 @@ def test_interrupt_says_what_is_kept(tmp_path, capsys, kept, said, number):
     assert said in err
     assert str(tmp_path) in err
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_interrupt_that_python_drops_is_not_lost(tmp_path, capsys, number):
+    """A finalizer, jax's callback of the garbage collector: exceptions end there."""
+
+    class Finalized:
+        def __del__(self):
+            os.kill(os.getpid(), number)
+
+    passed = []
+
+    def run(config):
+        with progress("search", total=4) as shown:
+            shown.advance()
+            Finalized()
+            passed.append("the finalizer")
+            shown.advance()
+            passed.append("the next chunk")
+
+    with pytest.raises(SystemExit) as exit_:
+        _call(run, "--out", str(tmp_path))
+    assert exit_.value.code == 130
+    assert passed == ["the finalizer"]
+    assert "interrupted" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_cancelled_event_loop_is_an_interrupt(tmp_path, capsys):
+    def run(config):
+        with contextlib.suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+        raise asyncio.CancelledError
+
+    with pytest.raises(SystemExit) as exit_:
+        _call(run, "--out", str(tmp_path))
+    assert exit_.value.code == 130
+    assert "Traceback" not in capsys.readouterr().err
+    with pytest.raises(asyncio.CancelledError):
+        _call(lambda c: asyncio.run(_cancelled()), "--out", str(tmp_path))
+
+
+async def _cancelled():
+    raise asyncio.CancelledError
+
+
+def test_an_ignored_signal_stays_ignored(tmp_path):
+    """As under ``nohup``, or in the background of a shell without job control."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        _call(lambda c: os.kill(os.getpid(), signal.SIGINT), "--out", str(tmp_path))
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_progress_without_terminal_is_plain_lines(capsys, monkeypatch):
