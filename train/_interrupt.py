@@ -1,9 +1,9 @@
 """Ctrl-C and SIGTERM that do not get lost.
 
-Python raises ``KeyboardInterrupt`` wherever the main thread happens to be. In a finalizer
-or a garbage-collection callback (jax has one) it is printed and dropped; an event loop
-(orbax saves in one) turns it into a cancellation. The wish is therefore remembered, and
-``check`` raises again between two chunks of work.
+Python raises ``KeyboardInterrupt`` wherever the main thread happens to be. In a
+finalizer or a garbage-collection callback (jax has one) it is printed and dropped; an
+event loop (orbax saves in one) turns it into a cancellation. The wish is therefore
+remembered, and ``check`` raises again between two chunks of work.
 """
 
 import contextlib
