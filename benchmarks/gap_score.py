@@ -1,8 +1,8 @@
 """How often train.gap is right, counted over the cases of ``benchmarks.gap``."""
 
 import json
-from collections.abc import Sequence
-from math import sqrt
+from collections.abc import Mapping, Sequence
+from math import hypot, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,9 @@ GOALS = {
     "pairs both found": (0.80, "at least"),
     "unexplained where it is right": (0.80, "at least"),
 }
+PARAMETER_GOAL = 0.10  # median relative error
+RATIO_GOAL = 1.2  # median gap after, in floors
+_VECTORS = (("x", "y", "z"), ("roll", "pitch"))
 _SURE = 0.8
 _BINS = 5
 
@@ -87,6 +90,39 @@ def calibration(pairs: Sequence[tuple[bool, float]]) -> list[tuple[float, float,
             mean = sum(c for _, c in inside) / n
             out.append((mean, sum(ok for ok, _ in inside) / n, n))
     return out
+
+
+def parameter_errors(rows: Sequence[dict[str, Any]]) -> list[float]:
+    """Relative errors of the parameters of effects that were named right, one each.
+
+    The parts of a vector (x, y, z; roll, pitch) are one parameter. Left out is where a
+    ripple stands in its period, which has no size.
+    """
+    out = []
+    for r in rows:
+        for name, truth in zip(r["truth"], r["true_parameters"], strict=True):
+            if name not in r["named"]:
+                continue
+            told = r["parameters"][r["named"].index(name)]
+            for group in _grouped(truth):
+                size = hypot(*(truth[k] for k in group))
+                if size > 0 and all(k in told for k in group):
+                    out.append(hypot(*(told[k] - truth[k] for k in group)) / size)
+    return out
+
+
+def _grouped(parameters: Mapping[str, float]) -> list[list[str]]:
+    vectors = [[k for k in v if k in parameters] for v in _VECTORS]
+    inside = {k for v in _VECTORS for k in v}
+    single = [[k] for k in parameters if k not in inside | {"phase"}]
+    return [g for g in (*vectors, *single) if g]
+
+
+def ratios(rows: Sequence[dict[str, Any]]) -> list[float]:
+    """Gap after over floor, of cases with one effect."""
+    return [
+        r["gap"]["after"] / r["gap"]["floor"] for r in rows if r["kind"] == "single"
+    ]
 
 
 def confusion(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:

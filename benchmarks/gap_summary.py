@@ -1,15 +1,20 @@
 """Pages of results on the gap workflow."""
 
 from pathlib import Path
+from statistics import median
 
 from benchmarks._common import markdown_table
 from benchmarks.gap_real import MACHINES
 from benchmarks.gap_score import (
     GOALS,
+    PARAMETER_GOAL,
+    RATIO_GOAL,
     brier,
     calibration,
     confusion,
     judged,
+    parameter_errors,
+    ratios,
     read_cases,
     shares,
     wilson,
@@ -43,6 +48,23 @@ def generated(folder: Path) -> list[str]:
                 "met" if met else "missed",
             )
         )
+    for name, values, goal, shown in (
+        ("error of a parameter, median", parameter_errors(rows), PARAMETER_GOAL, "%"),
+        ("gap after in floors, one effect, median", ratios(rows), RATIO_GOAL, ""),
+    ):
+        if values:
+            middle = median(values)
+            told = f"{100 * middle:.1f} %" if shown else f"{middle:.2f}"
+            most = f"at most {100 * goal:.0f} %" if shown else f"at most {goal:g}"
+            lines.append(
+                (
+                    f"{name} of {len(values)}",
+                    told,
+                    "",
+                    most,
+                    "met" if middle <= goal else "missed",
+                )
+            )
     out.append(markdown_table(("what", "cases", "95 % (Wilson)", "goal", ""), lines))
     pairs = judged(rows)
     bins = [(f"{c:.2f}", f"{s:.2f}", n) for c, s, n in calibration(pairs)]
@@ -50,12 +72,30 @@ def generated(folder: Path) -> list[str]:
         markdown_table(("confidence stated", "share right", "names"), list(bins))
     )
     out.append(f"Brier score {brier(pairs):.3f} over {len(pairs)} names.")
-    found = [
-        (truth, ", ".join(f"{name} {n}" for name, n in sorted(row.items())))
-        for truth, row in sorted(confusion(rows).items())
+    out += [
+        "![Calibration of the stated confidence](gap_calibration.svg)",
+        "![What each true effect was named](gap_confusion.svg)",
+        "The counts are in `gap_confusion.json`.",
     ]
-    out.append(markdown_table(("true effect", "named first"), found))
     return out
+
+
+def figures(folder: Path) -> dict[str, str]:
+    """Texts of the pictures and counts, by file name; none without cases."""
+    from benchmarks.gap_figures import calibration_curve, confusion_matrix
+    from easi_jax.io.files import to_json
+
+    rows = read_cases(folder / "gap_cases.jsonl")
+    if not rows:
+        return {}
+    counts, pairs = confusion(rows), judged(rows)
+    bins = calibration(pairs)
+    reach = [wilson(round(share * n), n) for _, share, n in bins]
+    return {
+        "gap_confusion.json": to_json(counts),
+        "gap_confusion.svg": confusion_matrix(counts),
+        "gap_calibration.svg": calibration_curve(bins, reach),
+    }
 
 
 def real(folder: Path) -> list[str]:

@@ -2,11 +2,12 @@
 
     python -m train.udr --robot ant --seeds 0 1 --out results/ant_udr
     python -m train.udr --robot ant --seeds 0 1 --fixed --out results/ant_fixed
-    python -m benchmarks.policies --runs results/ant_udr results/ant_fixed
+    python -m benchmarks.policies --runs results/ant_udr
+    python -m benchmarks.policies --runs results/ant_fixed
 
-Writes one file a robot: curves, minutes on this machine (of uninterrupted runs), the
-return in the nominal robot and, for go2, the speed reached at commands from -1 to 1.5
-m/s.
+Writes one file for a robot and the ways it was trained: curves, minutes on this machine
+(of uninterrupted runs), the return in the nominal robot and, for go2, the speed reached
+at commands from -1 to 1.5 m/s.
 """
 
 import dataclasses
@@ -78,8 +79,9 @@ def run(config: Config) -> None:
     if len(robots) > 1:
         raise UserError(f"--runs are of several robots: {', '.join(sorted(robots))}")
     (robot,) = robots
+    methods = "_".join(sorted({r["method"].lower() for r in found}))
     path = write_result(
-        f"policies_{robot}",
+        f"policies_{robot}_{methods}",
         command_of("benchmarks.policies", config),
         config,
         robot=robot,

@@ -7,6 +7,8 @@ The policy of ``train.udr`` records in the nominal robot, without noise; the sea
 never sees that robot's parameters. ``recovery``: the search, then the least-squares
 finish, from UDR's range and from ranges that exclude the truth. ``time``: a search of
 50 generations of 300 individuals, compiled before. ``memory``: a generation of 4,096.
+``buffer``: SAC with a full replay buffer of a million transitions, with its checkpoint.
+Time and memory do not depend on how well the policy was trained.
 """
 
 import dataclasses
@@ -23,7 +25,8 @@ STARTS: dict[str, tuple[float, float] | None] = {
     "high": (2.0, 4.0),
 }
 STEPS = {"ballbalance": 50}  # control steps of an individual in the timed search
-PARTS = ("recovery", "time", "memory")
+PARTS = ("recovery", "time", "memory", "buffer")
+BUFFER = 1_000_000  # transitions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +38,7 @@ class Config:
     option: tuple[str, ...] = ()
     """Options of the built-in robot in place of those of the run."""
     part: str = "recovery"
-    """What to run: recovery, time or memory."""
+    """What to run: recovery, time, memory or buffer."""
     starts: tuple[str, ...] = tuple(STARTS)
     """Where searches start: within, low, high."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
@@ -75,6 +78,8 @@ def run(config: Config) -> None:
         _time(config, env, saved, label)
     elif config.part == "memory":
         _memory(config, env, saved, label)
+    elif config.part == "buffer":
+        _buffer(config, env, label)
     else:
         for start in config.starts:
             chosen = dataclasses.replace(config, starts=(start,))
@@ -201,6 +206,44 @@ def _memory(config: Config, env: Any, saved: Any, label: str) -> None:
         config,
         robot=env.name,
         what=f"search, population {population}",
+        peak_gib=peak_gib(),
+        goal_gib=8.0,
+    )
+    say(f"written: {path}")
+
+
+def _buffer(config: Config, env: Any, label: str) -> None:
+    import tempfile
+
+    import jax
+    import jax.numpy as jnp
+
+    from benchmarks._common import command_of, write_result
+    from easi_jax.io import checkpoints
+    from easi_jax.pipeline import Pipeline, PipelineConfig, seed_keys, stage_keys
+    from easi_jax.rl.presets import training_preset
+
+    training = dataclasses.replace(
+        training_preset(env, "sac"), env_steps=BUFFER, buffer_size=BUFFER
+    )
+    pipe = Pipeline(env, PipelineConfig(training=training))
+    keys = stage_keys(seed_keys(list(config.seeds[:1])))
+    wide = pipe.spread(pipe.udr(), 1)
+    states = pipe.train_init(keys["udr"], wide)
+    target = jnp.asarray(env.space.nominal, jnp.float32)
+    count = 2 * training.random_iterations  # half of them with updates
+    chunk = jax.jit(lambda s, d, t: pipe.train_chunk(s, d, t, count))
+    states, _ = jax.block_until_ready(chunk(states, wide, target))
+    with tempfile.TemporaryDirectory() as folder:
+        checkpoints.save(Path(folder), count, states, config_hash="none")
+    held = states.buffer.data.shape
+    say(f"{label}: a buffer of {held[-2]:,} transitions, peak {peak_gib():.2f} GiB")
+    path = write_result(
+        f"memory_{label}_buffer",
+        command_of("benchmarks.robots", config),
+        config,
+        robot=env.name,
+        what=f"SAC, a buffer of {held[-2]:,} transitions of {held[-1]} numbers",
         peak_gib=peak_gib(),
         goal_gib=8.0,
     )

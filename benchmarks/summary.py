@@ -31,7 +31,7 @@ class Config:
 
 
 def run(config: Config) -> None:
-    """Writes ``README.md``."""
+    """Writes ``README.md`` and the pictures in it."""
     from easi_jax.io.files import atomic_write
 
     parts = ["# Results", "Made by `python -m benchmarks.summary` from the files here."]
@@ -40,6 +40,8 @@ def run(config: Config) -> None:
         *(gap_summary.generated, gap_summary.real),
     ):
         parts += section(config.results)
+    for name, text in gap_summary.figures(config.results).items():
+        atomic_write(config.results / name, text)
     path = config.results / "README.md"
     atomic_write(path, "\n\n".join(parts) + "\n")
     say(f"written: {path}")
@@ -180,10 +182,12 @@ def _robots(folder: Path) -> list[str]:
     for path in sorted(folder.glob("memory_*.json")):
         r = _read(folder, path.stem)
         ok = _met(r["peak_gib"] < r["goal_gib"])
-        label = path.stem.removeprefix("memory_")
+        label = r["robot"]
         rows.append((label, r["what"], f"{r['peak_gib']:.1f}", ok))
     if rows:
-        out.append("`python -m benchmarks.robots --udr RUN --part memory`")
+        out.append(
+            "`python -m benchmarks.robots --udr RUN --part memory` (or `--part buffer`)"
+        )
         out.append(markdown_table(("robot", "run", "peak GiB", "goal 8"), rows))
     rows, said, missing = [], [], []
     for name in ROBOTS:

@@ -21,6 +21,8 @@ def test_committed_page_is_that_of_the_committed_files(tmp_path: Path) -> None:
     folder = tmp_path / "results"
     shutil.copytree(RESULTS, folder)
     assert page(folder) == (RESULTS / "README.md").read_text()
+    for picture in RESULTS.glob("gap_c*"):
+        assert (folder / picture.name).read_text() == picture.read_text()
 
 
 def test_nothing_run_is_said(tmp_path: Path) -> None:
@@ -78,6 +80,16 @@ def test_cases_of_the_gap_are_counted() -> None:
         (0.01 + 0.81 + 0.09 + 0.36 + 0 + 0) / 6
     )
     assert gap_score.calibration(pairs)[-1] == (pytest.approx(0.95), 0.75, 4)
+
+
+def test_parameters_are_compared_as_what_they_are() -> None:
+    row = case("single", ["a@x"], ["a@x"], 0.9)
+    row["true_parameters"] = [{"x": 3.0, "y": 4.0, "mass": 2.0, "phase": 1.0}]
+    row["parameters"] = [{"x": 3.0, "y": 4.5, "mass": 1.0, "phase": 7.0}]
+    wrong = {**row, "named": ["b@x"]}
+    assert gap_score.parameter_errors([row, wrong]) == pytest.approx([0.1, 0.5])
+    row["gap"] = {"after": 0.3, "floor": 0.2}
+    assert gap_score.ratios([row, {**row, "kind": "pair"}]) == pytest.approx([1.5])
 
 
 def test_wilson_interval() -> None:

@@ -42,6 +42,7 @@ def read_gap_problem(config: Any) -> GapProblem:
         UserError: whatever is wrong with the files or the options.
     """
     from easi_jax.errors import UserError
+    from easi_jax.gap.coverage import coverage_notes
     from easi_jax.gap.own import own_space
     from easi_jax.gap.velocities import velocity_lags
     from easi_jax.io.parameter_file import read_parameter_file
@@ -69,7 +70,7 @@ def read_gap_problem(config: Any) -> GapProblem:
         [run.name for run in runs.held],
         runs.noise,
         {joints[d]: lag for d, lag in late.items() if d in joints},
-        runs.notes,
+        [*runs.notes, *coverage_notes(mj_model, runs.fit, runs.held)],
     )
 
 

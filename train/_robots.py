@@ -249,3 +249,40 @@ def load_udr(folder: Path, env_file: Path | None = None) -> dict[str, Any]:
         "config": config,
         "method": "Fixed" if config.get("fixed") else "UDR",
     }
+
+
+def load_networks(
+    folder: Path,
+    env_file: Path | None,
+    env: Any,
+    training: Any,
+    seeds: tuple[int, ...],
+) -> Any:
+    """Training states of a run of train.udr, one for each of ``seeds``; a seed that it
+    lacks gets those of its first.
+
+    Raises:
+        UserError: no finished run, or networks of another shape or algorithm.
+    """
+    import jax
+    import numpy as np
+
+    from easi_jax.errors import UserError
+    from easi_jax.rl.presets import algorithm_of
+
+    old = load_udr(folder, env_file)
+    theirs = old["training"]
+    pairs = (
+        ("robot", old["env"].name, env.name),
+        ("observation size", old["env"].obs_size, env.obs_size),
+        ("action size", old["env"].action_size, env.action_size),
+        ("algorithm", algorithm_of(theirs), algorithm_of(training)),
+        ("hidden layers", tuple(theirs.hidden), tuple(training.hidden)),
+    )
+    for what, one, other in pairs:
+        if one != other:
+            raise UserError(
+                f"--start-from {folder}: its {what} is {one}, this training's {other}"
+            )
+    at = np.array([old["seeds"].index(s) if s in old["seeds"] else 0 for s in seeds])
+    return jax.tree.map(lambda x: x[at], old["states"])

@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 from train._command import main, say, show_table
 
@@ -38,6 +39,9 @@ class Config:
     fixed: bool = False
     """Train in the target itself, without randomization: the nominal model where no
     target is given."""
+    start_from: Path | None = None
+    """Run folder of train.udr whose networks the training goes on from (fine-tuning);
+    a seed that it lacks starts from its first."""
     env_steps: int | None = None
     """Control steps of training; the robot's preset where not given."""
     algorithm: str | None = None
@@ -59,6 +63,7 @@ def run(config: Config) -> None:
     from train._robots import (
         check_chunk,
         check_seeds,
+        load_networks,
         save_policies,
         training_chunk,
         training_config,
@@ -98,6 +103,9 @@ def run(config: Config) -> None:
     pipe = Pipeline(env, settings, real=real)
     target = jnp.asarray(theta, jnp.float32)
     keys = stage_keys(seed_keys(list(config.seeds)))
+    old = None
+    if config.start_from is not None:
+        old = load_networks(config.start_from, config.env, env, training, config.seeds)
     with RunFolder.open(
         config.out,
         given.recorded(config),
@@ -116,7 +124,7 @@ def run(config: Config) -> None:
             "train",
             training.iterations,
             training_chunk(config.chunk, training),
-            lambda: pipe.train_init(keys["udr"], wide),
+            lambda: _begun(pipe, keys["udr"], wide, old),
             lambda s, n: step(s, wide, target, n),
             training_rows(config.seeds, training.steps_per_iteration),
             notes,
@@ -173,6 +181,14 @@ def run(config: Config) -> None:
         )
     show_table(title, ("seed", "return"), rows)
     say(f"report: {config.out / 'report.html'}")
+
+
+def _begun(pipe: Any, keys: Any, wide: Any, old: Any) -> Any:
+    """Training states before the first step, with old networks where there are any."""
+    import jax
+
+    fresh = pipe.train_init(keys, wide)
+    return fresh if old is None else jax.vmap(pipe.trainer.continued)(fresh, old)
 
 
 if __name__ == "__main__":

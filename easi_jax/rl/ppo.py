@@ -118,6 +118,11 @@ class Ppo:
             iteration=jnp.zeros((), jnp.int32),
         )
 
+    def continued(self, fresh: PpoState, old: PpoState) -> PpoState:
+        """A fresh state with the networks and observation statistics of another
+        training; optimizer, environments and step count start anew."""
+        return replace(fresh, params=old.params, normalizer=old.normalizer)
+
     def policy(self, state: PpoState) -> PolicyParams:
         """The policy as it is now, for ``act``."""
         statistics: Any = state.normalizer

@@ -110,6 +110,18 @@ class Sac:
             iteration=jnp.zeros((), jnp.int32),
         )
 
+    def continued(self, fresh: SacState, old: SacState) -> SacState:
+        """A fresh state with the networks, temperature and observation statistics of
+        another training; optimizer, buffer and step count start anew."""
+        learner = replace(
+            fresh.learner,
+            policy=old.learner.policy,
+            critics=old.learner.critics,
+            target_critics=old.learner.target_critics,
+            log_temperature=old.learner.log_temperature,
+        )
+        return replace(fresh, learner=learner, normalizer=old.normalizer)
+
     def policy(self, state: SacState) -> PolicyParams:
         """The policy as it is now, for ``act``."""
         statistics: Any = state.normalizer

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from envs import make
 from train import easi, evaluate, pipeline, udr
 from train._command import main
 from train._retrain import check_robot, retrain
+from train._robots import load_policies
 
 pytestmark = pytest.mark.timeout(1500)
 
@@ -94,6 +96,27 @@ def test_evaluate_restores_the_effects_and_takes_others(
     assert NAMES[0] in got[1]["target"] and NAMES[1] not in got[1]["target"]
     assert got[0]["returns"] != got[1]["returns"]
     assert "coulomb_friction@cart, actuator_delay@cart" in capsys.readouterr().out
+
+
+def test_training_goes_on_from_another_run(trained: Path, files: Path, capsys) -> None:
+    """One iteration of random actions and no update: networks are those of the first
+    run, for a seed of its own and for one that the run lacks."""
+    out = files / "tuned"
+    short = ("--env-steps", 200, "--eval-episodes", 4)
+    start = ("--start-from", trained, "--effects", files / "found.yaml")
+    _main(udr, *start, "--out", out, *short, "--seeds", 0, 7)
+    first = load_policies(trained)["policies"]
+    tuned = load_policies(out)["policies"]
+    for a, b in zip(
+        jax.tree.leaves(first.network), jax.tree.leaves(tuned.network), strict=True
+    ):
+        for seed in (0, 1):
+            np.testing.assert_array_equal(a[0], b[seed])
+    said = _refused(
+        capsys, udr, *start, "--out", files / "no", *short, "--algorithm", "ppo"
+    )
+    assert "its algorithm is sac, this training's ppo" in said
+    assert not (files / "no").exists()
 
 
 def test_resume_needs_the_same_effects(trained: Path, files: Path, capsys) -> None:
