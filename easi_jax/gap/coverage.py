@@ -68,6 +68,6 @@ def _beyond(what: str, fit: np.ndarray, held: np.ndarray, unit: str) -> list[str
         return []
     unit = f" {unit}" if unit else ""
     return [
-        f"{what} reaches {theirs:.3g}{unit} in the held-out data and {mine:.3g}{unit} in "
-        "the fitting data: effects that only show beyond that are extrapolated"
+        f"{what} reaches {theirs:.3g}{unit} in the held-out data and {mine:.3g}{unit} "
+        "in the fitting data: effects that only show beyond that are extrapolated"
     ]
