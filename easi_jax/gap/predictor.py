@@ -11,6 +11,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -30,6 +31,7 @@ from easi_jax.model import Model, full_structure
 from easi_jax.parameters import ParameterSpace
 from easi_jax.physics import Physics, arrived_step
 from easi_jax.recording import Run
+from easi_jax.runtime import fast_loops, quick_compile
 from easi_jax.windows import fitted_velocity, make_windows
 
 BLOCK = 16  # windows
@@ -178,7 +180,14 @@ class Predictor:
         # Items that a device works on together.
         self._batch = max(1, self.machine.batch // BLOCK)
         self._delay_steps = windows.start_qpos.shape[1]  # late rows, and one
-        self._program = jax.jit(self._sharded, static_argnums=0)
+        # The second is for the few predictions in which a drive has play.
+        self._programs = tuple(
+            jax.jit(partial(self._sharded, play), compiler_options=options)
+            for play, options in (
+                (False, fast_loops() | quick_compile()),
+                (True, quick_compile()),
+            )
+        )
         width = [i for i, c in enumerate(layout.columns) if c.field == "width"]
         self._width = self.own + np.array(width, int)
 
@@ -394,7 +403,7 @@ class Predictor:
             chosen = np.flatnonzero(loose == play)
             for part in self._batches(chosen):
                 args = vectors[part], which[part], offsets[part]
-                got = self._program(play, *args, *self._data)
+                got = self._programs[play](*args, *self._data)
                 out[part] = np.asarray(got)
         out = out.reshape(count, nb * BLOCK, self.steps, self.nv)
         return out[:, : self.count(windows)]
