@@ -57,7 +57,8 @@ def calibration_curve(
     x = np.array([b[0] for b in bins])
     y = np.array([b[1] for b in bins])
     reach = np.array(intervals).reshape(-1, 2).T
-    axis.errorbar(x, y, (y - reach[0], reach[1] - y), fmt="o", color=BLUE, capsize=3)
+    bars = np.maximum((y - reach[0], reach[1] - y), 0.0)  # 0 of 5 rounds below 0
+    axis.errorbar(x, y, bars, fmt="o", color=BLUE, capsize=3)
     for (at, share, count), (low, _) in zip(bins, intervals, strict=True):
         axis.annotate(
             f"{count}", (at, min(share, low)), (6, 0), textcoords="offset points"
