@@ -54,7 +54,7 @@ def run(config: Config) -> None:
             except CaseError as error:
                 say(f"{config.kind} {seed}: no case ({error})")
                 continue
-            row = _solved(data, Path(folder) / "gap")
+            row = solved(data, Path(folder) / "gap")
         row = {
             "kind": config.kind,
             "seed": seed,
@@ -73,7 +73,8 @@ def run(config: Config) -> None:
         )
 
 
-def _solved(data: Path, out: Path) -> dict[str, Any]:
+def solved(data: Path, out: Path) -> dict[str, Any]:
+    """Runs train.gap on a case that was written to ``data``, and grades it."""
     from train import gap
 
     began = time.perf_counter()

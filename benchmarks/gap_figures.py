@@ -63,7 +63,7 @@ def calibration_curve(
         axis.annotate(
             f"{count}", (at, min(share, low)), (6, 0), textcoords="offset points"
         )
-    axis.text(0.02, 0.09, "calibrated", color=FAINT, rotation=0)
+    axis.text(0.42, 0.33, "calibrated", color=FAINT)
     axis.set_xlim(-0.02, 1.06)
     axis.set_ylim(-0.02, 1.06)
     axis.set_xlabel("confidence stated (numbers: names in the bin)")

@@ -8,7 +8,7 @@ _WORDS = {
     "stribeck_friction": 'joint "{at}" has dry friction of {static} at rest that falls '
     "to {kinetic} in motion",
     "viscous_damping": 'joint "{at}" has {damping} of viscous damping',
-    "quadratic_drag": 'joint "{at}" has a drag of {coefficient} on the squared speed',
+    "quadratic_drag": '{kind} "{at}" has a drag of {coefficient} on the squared speed',
     "joint_stiffness": 'joint "{at}" is pulled by a spring of {stiffness}',
     "constant_force": 'a constant force acts at {kind} "{at}"',
     "torque_ripple": 'joint "{at}" has a torque ripple of {amplitude}, '

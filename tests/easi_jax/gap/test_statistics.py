@@ -11,7 +11,7 @@ from easi_jax.gap.outcome import for_people
 from easi_jax.gap.predictor import Predictor, window_set
 from easi_jax.gap.residuals import make_residuals, start_sensitivity, step_groups
 from easi_jax.gap.scales import scales_of
-from easi_jax.gap.selection import Model, advantage, simplest
+from easi_jax.gap.selection import Model, advantage, better, simplest
 from easi_jax.gap.table import EFFECTS, Layout, places, ripples
 from easi_jax.gap.velocities import velocity_lags
 from easi_jax.parameters import ParameterSpace
@@ -310,6 +310,27 @@ def test_a_run_that_the_others_contradict_is_told() -> None:
     ((odd, times),) = measure.odd_runs(square, scale, run).items()
     assert odd == 2 and times == pytest.approx(5.0, rel=0.2)
     assert measure.odd_runs(square[20:], scale, run[20:]) == {}, "one of two: which?"
+
+
+def test_rare_effects_have_to_help_by_either_measure(
+    model: mujoco.MjModel, runs: list[Run]
+) -> None:
+    every = places(model, scales_of(model, runs))
+    found = {p.effect: p for p in every if p.kind == "joint"}
+
+    def fitted(loss: float, gap: float, *names: str) -> Model:
+        n = len(names)
+        fit = Fitted(np.zeros(n), np.arange(n), np.zeros(1), np.zeros(1), loss)
+        even = 1 + 1e-3 * np.arange(10)
+        return Model([found[name] for name in names], fit, loss * even, gap * even)
+
+    base = fitted(10.0, 10.0, "coulomb_friction")
+    for name, usual in (("viscous_damping", True), ("quadratic_drag", False)):
+        both = ("coulomb_friction", name)
+        assert better(fitted(6.0, 9.8, *both), base) == usual, name
+        assert better(fitted(6.0, 6.0, *both), base), name
+        assert not better(fitted(6.0, 10.2, *both), base), name
+        assert not better(fitted(9.9, 9.9, *both), base), name
 
 
 def test_what_is_contained_comes_first_where_nearly_as_good(
