@@ -73,7 +73,8 @@ def main(
         told = isinstance(error, KeyboardInterrupt) or _interrupt.asked()
         if not told or isinstance(error, SystemExit):
             raise
-        _stop(_interrupted(getattr(config, "out", None)), INTERRUPTED)
+        out = getattr(config, "out", None)
+        _stop(_interrupted(out, hasattr(config, "resume")), INTERRUPTED)
 
 
 def show_table(
@@ -243,9 +244,11 @@ def _text(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _interrupted(out: Path | str | None) -> str:
+def _interrupted(out: Path | str | None, resumable: bool) -> str:
     if out is None:
         return "interrupted"
+    if not resumable:
+        return f"interrupted; nothing was written to {out}, start the command again"
     kept = any(Path(out).glob("checkpoints/**/step_*"))
     if kept:
         return (

@@ -28,6 +28,8 @@ class Config:
     """Recipe of the search."""
     population: int = 300
     """Individuals per generation."""
+    resume: bool = False
+    """Go on."""
 
 
 def _call(run, *args):
@@ -113,6 +115,21 @@ def test_interrupt_says_what_is_kept(tmp_path, capsys, kept, said, number):
     assert said in err
     assert str(tmp_path) in err
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_interrupt_of_what_cannot_be_resumed(tmp_path, capsys):
+    @dataclasses.dataclass(frozen=True)
+    class Short:
+        """Takes seconds."""
+
+        out: Path = tmp_path
+        """Folder."""
+
+    with pytest.raises(SystemExit) as exit_:
+        main(Short, lambda _: os.kill(os.getpid(), signal.SIGINT), name="t", args=())
+    assert exit_.value.code == 130
+    err = capsys.readouterr().err
+    assert "nothing was written" in err and "resume" not in err
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
