@@ -44,7 +44,7 @@ MACHINES = {
         "quanser_cartpole",
         ("chirp_plus_*.csv", "chirp_minus_*.csv"),
         ("swingup_0?.csv",),
-        0.5,
+        0.2,
         (
             "payload_mass@cart|armature@slider",
             "coulomb_friction@slider|stribeck_friction@slider",
@@ -61,7 +61,7 @@ MACHINES = {
         "dfki_pendulum",
         ("sac.csv", "energy_0.5kg.csv"),
         ("swingup_ddp.csv",),
-        0.5,
+        0.2,
         ("coulomb_friction|stribeck_friction", "actuator_gain|payload_mass|armature"),
     ),
     "pendulum_1kg": Machine(

@@ -123,7 +123,7 @@ def without_odd_ends(
     if not odd:
         return out, []
     return out, [
-        f"rows left out of the fit, for the rows beside them do not follow from their "
+        f"rows left out, for the rows beside them do not follow from their "
         f"positions (a stale first reading?): {', '.join(odd)}"
     ]
 

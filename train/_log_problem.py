@@ -154,12 +154,12 @@ def read_runs(config: Any, mj_model: Any, horizon: float) -> MeasuredRuns:
     every = [*log.runs, *(held_log.runs if held_log else ())]
     runs, changed = to_common_step(every)
     notes += changed
-    fit, odd = without_odd_ends(runs[: len(log.runs)], noise)
+    runs, odd = without_odd_ends(runs, noise)
     notes += odd
+    fit, held = runs[: len(log.runs)], runs[len(log.runs) :]
     if held_log is None:
         fit, held, held_name = split_held_out(fit, horizon)
     else:
-        held = runs[len(log.runs) :]
         held_name = ", ".join(run.name for run in held)
     return MeasuredRuns(log.runs, noise, fit, held, held_name, notes)
 
