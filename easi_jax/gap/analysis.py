@@ -251,15 +251,32 @@ class Analysis:
             f"{self.fit_floor:.2g}"
         )
         base = self.refit(own)
-        stuck = [i for i in own if self._at_bound(base.fit.x, i)]
+        stuck = self._stuck(base)
         if stuck:
-            names = ", ".join(self.space.names[i] for i in stuck)
-            self.tell(f"{names}: refitted to a bound, so undone")
-            for i in stuck:
-                self._offer(self.space.parameters[i].addresses)
-            self.whiten(self.predictor.neutral)
-            base = self.refit([i for i in own if i not in stuck])
-        return self.measured(base, self.select(base), began)
+            base = self._undone(base, stuck)
+        model = self.select(base)
+        for _ in own:
+            stuck = self._stuck(model)
+            if not stuck:
+                break
+            base = self._undone(base, stuck)
+            x = model.fit.x.copy()
+            x[stuck] = self.predictor.neutral[stuck]
+            model = self.select(self.selector.fit(model.places, x))
+        return self.measured(base, model, began)
+
+    def _stuck(self, model: Model) -> list[int]:
+        """The model's own parameters that a refit moved to a bound."""
+        return [i for i in model.own if self._at_bound(model.fit.x, i)]
+
+    def _undone(self, base: Model, stuck: Sequence[int]) -> Model:
+        """A refit without some parameters, which are offered as effects instead."""
+        names = ", ".join(self.space.names[i] for i in stuck)
+        self.tell(f"{names}: refitted to a bound, so undone")
+        for i in stuck:
+            self._offer(self.space.parameters[i].addresses)
+        self.whiten(self.predictor.neutral)
+        return self.refit([i for i in base.own if i not in stuck])
 
     def _at_bound(self, x: np.ndarray, i: int) -> bool:
         low, high = self.bounds.low[i], self.bounds.high[i]
@@ -274,13 +291,13 @@ class Analysis:
                 if p.at == name and REFITTED.get(p.effect) == quantity
             ]
 
-    def select(self, base: Model) -> Model:
+    def select(self, start: Model) -> Model:
         """Adds effects while they help.
 
         The few best sets of effects go on side by side: two effects together may be
         what one alone, and wrong, does nearly as well.
         """
-        chosen, model, beam = self.selector, base, [base]
+        chosen, model, beam = self.selector, start, [start]
         for _ in range(_STAGES):
             if len(model.places) >= _MOST:
                 break

@@ -27,6 +27,7 @@ _SHORTLIST = 7  # names that are fitted in full at each stage
 _STARTS = 2  # of each
 _HOPELESS = 4.0  # times the best promise; beyond, only the first few are fitted
 _SURE = 1.7  # standard errors by which an effect has to help
+_LIKELY = 1.0  # by either measure
 _HELPS = 0.05  # share of the squared gap by which each of its numbers has to help
 _LARGE = 0.3
 _TINY = 1e-300
@@ -270,7 +271,21 @@ class Selector:
 
 
 def shortlist(screened: Sequence[tuple[float, Candidate]]) -> list[Candidate]:
-    """The most promising names, the best starts of each."""
+    """The most promising names with the best starts of each, and the special cases of
+    those names, which promise less but ask for less."""
+    chosen = _promising(screened)
+    general = [mine[0].place for mine in chosen.values()]
+    for _, c in screened:
+        if any(contains(g, c.place) for g in general):
+            mine = chosen.setdefault(c.place.key, [])
+            if c not in mine and len(mine) < _STARTS:
+                mine.append(c)
+    return [c for mine in chosen.values() for c in mine]
+
+
+def _promising(
+    screened: Sequence[tuple[float, Candidate]],
+) -> dict[str, list[Candidate]]:
     chosen: dict[str, list[Candidate]] = {}
     first = screened[0][0] if screened else 0.0
     for cost, c in screened:
@@ -282,7 +297,7 @@ def shortlist(screened: Sequence[tuple[float, Candidate]]) -> list[Candidate]:
             mine = chosen.setdefault(c.place.key, [])
         if len(mine) < _STARTS:
             mine.append(c)
-    return [c for mine in chosen.values() for c in mine]
+    return chosen
 
 
 def _promised(
@@ -315,11 +330,12 @@ def rank(model: Model) -> float:
 def better(model: Model, base: Model) -> bool:
     """Whether a model predicts better than a smaller one by more than chance.
 
-    Both in units of the noise and of the gap, and in one of them by a share that each
-    of its numbers has to earn; with an effect that machines rarely have in both, by
-    twice that share, since such effects mend a little of everything. A large gain may
-    also be sure by its ratios: where a few blocks hold most of the error, differences
-    scatter as much as they are large.
+    Losses are compared in units of the noise and of the gap. On average over both the
+    gain has to be sure, and in one of them as large as the share that each number of
+    the model has to earn. With an effect that machines rarely have, both have to be
+    sure, and twice as large, since such effects mend a little of everything. A large
+    gain may also be sure by its ratios: where a few blocks hold most of the error,
+    differences scatter as much as they are large.
     """
     helps = _HELPS * max(1, len(model.fit.active) - len(base.fit.active))
     known = {p.key for p in base.places}
@@ -332,9 +348,10 @@ def better(model: Model, base: Model) -> bool:
             max(s, advantage(np.log(a + _TINY), np.log(b + _TINY)))
             for s, (a, b) in zip(sure, both, strict=True)
         ]
-    if min(sure) <= _SURE or min(gain) <= 0:
-        return False
-    return min(gain) > 2 * helps if rare else max(gain) > helps
+    if rare:
+        return min(sure) > _SURE and min(gain) > 2 * helps
+    likely = min(sure) > _LIKELY and sum(sure) > 2 * _SURE
+    return likely and min(gain) > 0 and max(gain) > helps
 
 
 def size_of(model: Model) -> int:

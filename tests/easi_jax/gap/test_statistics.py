@@ -11,7 +11,14 @@ from easi_jax.gap.outcome import for_people
 from easi_jax.gap.predictor import Predictor, window_set
 from easi_jax.gap.residuals import make_residuals, start_sensitivity, step_groups
 from easi_jax.gap.scales import scales_of
-from easi_jax.gap.selection import Model, advantage, better, simplest
+from easi_jax.gap.selection import (
+    Candidate,
+    Model,
+    advantage,
+    better,
+    shortlist,
+    simplest,
+)
 from easi_jax.gap.table import EFFECTS, Layout, places, ripples
 from easi_jax.gap.velocities import velocity_lags
 from easi_jax.parameters import ParameterSpace
@@ -351,3 +358,20 @@ def test_what_is_contained_comes_first_where_nearly_as_good(
     far = fitted(6.0, "constant_force", "viscous_damping")
     assert simplest([best, near], base) is near
     assert simplest([best, far], base) is best
+
+
+def test_special_cases_of_the_promising_are_tried(
+    model: mujoco.MjModel, runs: list[Run]
+) -> None:
+    every = [p for p in places(model, scales_of(model, runs)) if p.kind != "model"]
+    keys = {p.effect: p for p in every if p.at == "hinge"}
+    order = [keys.pop("stribeck_friction"), *keys.values()]
+    last = [p for p in order if p.effect != "coulomb_friction"]
+    last.append(keys["coulomb_friction"])
+    screened = [(10.0 + i, Candidate(p, p.starts[0])) for i, p in enumerate(last)]
+    names = [c.place.effect for c in shortlist(screened)]
+    assert names[0] == "stribeck_friction" and names[-1] == "coulomb_friction"
+    assert len(names) < len(last)
+    assert "coulomb_friction" not in [
+        c.place.effect for c in shortlist([s for s in screened if s[0] > 10.0])
+    ]
