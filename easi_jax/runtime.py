@@ -14,6 +14,12 @@ from typing import Any
 _MIN_POOL = 8
 _EMITTERS = "xla_cpu_use_fusion_emitters"
 _LEVEL = "xla_backend_optimization_level"
+_WAIT = 10**7  # s
+_FLAGS = {
+    _EMITTERS: "false",
+    "xla_cpu_collective_call_warn_stuck_timeout_seconds": _WAIT,
+    "xla_cpu_collective_call_terminate_timeout_seconds": _WAIT,
+}
 _state: dict[str, object] = {}
 
 
@@ -55,6 +61,8 @@ def prepare() -> dict[str, object]:
     - one CPU device per core, so that a mesh over them uses all of them;
     - XLA's older loop emitters, which compile faster; what simulates for long asks for
       the newer ones by `fast_loops` (measured with jaxlib 0.10.2, benchmarks/speed.py);
+    - CPU devices wait for each other as long as it takes: XLA ends the process after a
+      minute, but a device without a seed of its own waits for a whole chunk of training;
     - persistent compilation cache;
     - full float32 products on GPUs that would use TF32;
     - quiet imports of mujoco.mjx where warp is missing.
@@ -68,7 +76,7 @@ def prepare() -> dict[str, object]:
 
     late = backend_started()
     if not late:
-        _quick_compile(jax.__version_info__)
+        _ready_flags(jax.__version_info__)
         flags = os.environ.get("XLA_FLAGS", "")
         own_count = (
             "JAX_NUM_CPU_DEVICES" in os.environ
@@ -86,10 +94,14 @@ def prepare() -> dict[str, object]:
     return _state
 
 
-def _quick_compile(version: tuple[int, ...]) -> None:
+def _ready_flags(version: tuple[int, ...]) -> None:
+    if not _has_emitters(version):
+        return
     flags = os.environ.get("XLA_FLAGS", "")
-    if _EMITTERS not in flags and _has_emitters(version):
-        os.environ["XLA_FLAGS"] = f"{flags} --{_EMITTERS}=false".strip()
+    for name, value in _FLAGS.items():
+        if name not in flags:
+            flags = f"{flags} --{name}={value}".strip()
+    os.environ["XLA_FLAGS"] = flags
 
 
 def fast_loops() -> dict[str, Any]:

@@ -1,7 +1,9 @@
 """Work spread over devices gives what one device gives; large batches end."""
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -93,3 +95,42 @@ def test_every_device_sees_its_slice_only(count: int) -> None:
 def test_mesh_takes_the_number_asked_for() -> None:
     assert make_mesh(1).size == 1
     assert make_mesh().size == len(jax.devices())
+
+
+@pytest.mark.slow
+def test_a_device_waits_for_another_longer_than_a_minute() -> None:
+    """XLA's default ends the process; a chunk of training takes longer."""
+    code = """
+import time, numpy as np
+import easi_jax
+import jax, jax.numpy as jnp
+from jax.sharding import PartitionSpec as P
+from easi_jax.mesh import AXIS, make_mesh
+
+def slow(x):
+    time.sleep(70)
+    return np.asarray(x)
+
+def local(x):
+    shape = jax.ShapeDtypeStruct(x.shape, x.dtype)
+    wait = lambda x: jax.pure_callback(slow, shape, x)
+    first = jax.lax.axis_index(AXIS) == 0
+    return jax.lax.psum(jax.lax.cond(first, wait, lambda x: x, x), AXIS)
+
+mesh = make_mesh()
+f = jax.shard_map(local, mesh=mesh, in_specs=P(AXIS), out_specs=P(), check_vma=False)
+print(float(jax.jit(f)(jnp.ones((mesh.size, 1)))[0, 0]) == mesh.size)
+"""
+    env = {**os.environ, "JAX_NUM_CPU_DEVICES": "2"}
+    env.pop("XLA_FLAGS", None)
+    got = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=Path(__file__).parents[2],
+        env=env,
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert got.returncode == 0, got.stderr
+    assert got.stdout.split() == ["True"]
+    assert "stuck" not in got.stderr

@@ -24,4 +24,7 @@ def test_the_answer_is_right(kind: str, seed: int, tmp_path: Path) -> None:
     draw_case(seed, kind, tmp_path / "case", cheap=True)
     row = solved(tmp_path / "case", tmp_path / "gap")
     assert row["right"], row
-    assert row["verdict"] in row["verdicts"], row
+    if kind in ("single", "pair"):
+        assert row["gap"]["after"] < 1.25 * row["gap"]["floor"], row
+    else:
+        assert row["verdict"] in row["verdicts"], row
