@@ -62,7 +62,7 @@ def prepare() -> dict[str, object]:
     - XLA's older loop emitters, which compile faster; what simulates for long asks for
       the newer ones by `fast_loops` (measured with jaxlib 0.10.2, benchmarks/speed.py);
     - CPU devices wait for each other as long as it takes: XLA ends the process after a
-      minute, but a device without a seed of its own waits for a whole chunk of training;
+      minute, but a device without a seed of its own waits for a chunk of training;
     - persistent compilation cache;
     - full float32 products on GPUs that would use TF32;
     - quiet imports of mujoco.mjx where warp is missing.
