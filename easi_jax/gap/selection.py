@@ -401,13 +401,16 @@ def simplest(models: Sequence[Model], base: Model) -> Model:
 def probability(model: Model, rival: Model) -> float:
     """That a model is better than a rival, by their cross-validated losses.
 
-    What fits as well with more numbers is less likely by a half standard error for
-    each; what only adds to the model hardly counts.
+    In units of the noise and of the gap, on average over both, as `better` asks. What
+    fits as well with more numbers is less likely by a half standard error for each;
+    what only adds to the model hardly counts.
     """
     extra = size_of(rival) - size_of(model)
-    d = rival.loss - model.loss
-    error = max(d.std(ddof=1) / sqrt(len(d)), _ALIKE * model.loss.mean())
-    t = float(d.mean()) / error + 0.5 * extra
+    t = 0.5 * extra
+    for mine, theirs in ((model.loss, rival.loss), (model.gap, rival.gap)):
+        d = theirs - mine
+        error = max(d.std(ddof=1) / sqrt(len(d)), _ALIKE * mine.mean())
+        t += 0.5 * float(d.mean()) / max(error, _TINY)
     if contains(rival.places[-1], model.places[-1]):
         t = max(t, 0.0) + 1.0
     return 0.5 * (1 + erf(t / sqrt(2)))

@@ -16,6 +16,7 @@ from easi_jax.gap.selection import (
     Model,
     advantage,
     better,
+    probability,
     shortlist,
     simplest,
 )
@@ -358,6 +359,29 @@ def test_what_is_contained_comes_first_where_nearly_as_good(
     far = fitted(6.0, "constant_force", "viscous_damping")
     assert simplest([best, near], base) is near
     assert simplest([best, far], base) is best
+
+
+def test_confidence_weighs_both_measures(
+    model: mujoco.MjModel, runs: list[Run]
+) -> None:
+    every = places(model, scales_of(model, runs))
+    found = {p.effect: p for p in every if p.kind == "joint"}
+    rng = np.random.default_rng(0)
+    scatter = 1 + 0.1 * rng.normal(size=10)
+
+    def fitted(loss: float, gap: float, name: str) -> Model:
+        fit = Fitted(np.zeros(1), np.arange(1), np.zeros(1), np.zeros(1), loss)
+        return Model([found[name]], fit, loss * scatter, gap * scatter)
+
+    mine = fitted(1.0, 1.0, "coulomb_friction")
+    same = probability(mine, fitted(1.0, 1.0, "viscous_damping"))
+    assert same == pytest.approx(0.5, abs=0.01)
+    assert probability(mine, fitted(2.0, 2.0, "viscous_damping")) > 0.99
+    assert probability(mine, fitted(0.5, 0.5, "viscous_damping")) < 0.01
+    mixed = probability(mine, fitted(0.9, 1.1, "viscous_damping"))
+    assert 0.3 < mixed < 0.7
+    # What contains the effect is no rival by being better.
+    assert probability(mine, fitted(0.9, 0.9, "stribeck_friction")) > 0.8
 
 
 def test_special_cases_of_the_promising_are_tried(
