@@ -12,8 +12,8 @@ from PIL import Image
 from easi_jax.errors import UserError
 from easi_jax.io.video import render
 from envs import make
+from tests.commands import command, refused
 from train import easi, evaluate, pipeline, udr
-from train._command import main
 
 # The whole chain is compiled here; on a busy machine that takes its time.
 pytestmark = pytest.mark.timeout(1500)
@@ -24,24 +24,11 @@ SETTINGS = ("--set", "segments=16", "real_batch=64", "discriminator_updates=2")
 TARGET = ("--target", "cart_kp*0.5")
 
 
-def _main(module, *args: object) -> None:
-    main(module.Config, module.run, name=module.__name__, args=[str(a) for a in args])
-
-
-def _refused(capsys, module, *args: object) -> str:
-    with pytest.raises(SystemExit) as stop:
-        _main(module, *args)
-    assert stop.value.code == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1 and lines[0].startswith("error: ")
-    return lines[0]
-
-
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("chain")
-    _main(udr, "--out", root / "udr", *SMALL, "--chunk", 12, *TARGET)
-    _main(
+    command(udr, "--out", root / "udr", *SMALL, "--chunk", 12, *TARGET)
+    command(
         easi,
         *("--udr", root / "udr", "--out", root / "easi", "--chunk", 12),
         *("--search-chunk", 2, *SEARCH, *SETTINGS, *TARGET, "--eval-episodes", 4),
@@ -84,7 +71,7 @@ def test_killed_training_goes_on_bit_equal(chain: Path, tmp_path: Path) -> None:
     # As a kill in the second chunk would have left it.
     shutil.rmtree(copy / "checkpoints" / "train" / "step_000000000024")
     (copy / "results.json").unlink()
-    _main(udr, "--out", copy, *SMALL, "--chunk", 12, *TARGET, "--resume")
+    command(udr, "--out", copy, *SMALL, "--chunk", 12, *TARGET, "--resume")
     again = _restored(copy, "train")
     assert again.step == whole.step == 24
     for a, b in zip(
@@ -102,7 +89,7 @@ def test_killed_search_goes_on_bit_equal(chain: Path, tmp_path: Path) -> None:
     shutil.rmtree(copy / "checkpoints" / "search" / "step_000000000004")
     for name in ("results.json", "distribution.json", "report.html"):
         (copy / name).unlink()
-    _main(
+    command(
         easi,
         *("--udr", chain / "udr", "--out", copy, "--chunk", 12, "--resume"),
         *("--search-chunk", 2, *SEARCH, *SETTINGS, *TARGET, "--eval-episodes", 4),
@@ -154,13 +141,13 @@ def test_refined_mean_predicts_better_than_nominal(chain: Path) -> None:
 def test_evaluate_tests_any_policy_in_any_target(chain: Path, tmp_path, capsys) -> None:
     out = tmp_path / "returns.json"
     args = ("--run", chain / "easi", "--target", "cart_kp*2", "--episodes", 3)
-    _main(evaluate, *args, "--out", out)
+    command(evaluate, *args, "--out", out)
     saved = json.loads(out.read_text())
     assert saved["method"] == "EASI" and len(saved["returns"]["0"]) == 3
     capsys.readouterr()
-    line = _refused(capsys, evaluate, "--run", chain / "easi", "--policy", "Oracl")
+    line = refused(capsys, evaluate, "--run", chain / "easi", "--policy", "Oracl")
     assert "Oracl" in line
-    line = _refused(capsys, evaluate, *args, "--render", tmp_path / "run.avi")
+    line = refused(capsys, evaluate, *args, "--render", tmp_path / "run.avi")
     assert ".gif" in line
 
 
@@ -170,7 +157,7 @@ def test_evaluate_draws_an_episode(chain: Path, tmp_path: Path) -> None:
     except UserError as error:
         pytest.skip(str(error))
     out = tmp_path / "run.gif"
-    _main(evaluate, "--run", chain / "easi", "--episodes", 2, "--render", out)
+    command(evaluate, "--run", chain / "easi", "--episodes", 2, "--render", out)
     with Image.open(out) as image:
         assert image.n_frames > 10
 
@@ -178,7 +165,7 @@ def test_evaluate_draws_an_episode(chain: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_pipeline_equals_the_two_commands(chain: Path, tmp_path: Path) -> None:
     out = tmp_path / "pipeline"
-    _main(pipeline, "--out", out, *SMALL, *SEARCH, *SETTINGS, *TARGET)
+    command(pipeline, "--out", out, *SMALL, *SEARCH, *SETTINGS, *TARGET)
     one = json.loads((out / "distribution.json").read_text())["seeds"]["0"]
     two = json.loads((chain / "easi" / "distribution.json").read_text())["seeds"]["0"]
     np.testing.assert_allclose(one["unit_mean"], two["unit_mean"], atol=2e-2)
@@ -207,12 +194,12 @@ def test_pipeline_equals_the_two_commands(chain: Path, tmp_path: Path) -> None:
 )
 def test_mistakes_end_with_one_line(module, args, said, tmp_path, capsys) -> None:
     out = () if module is evaluate else ("--out", tmp_path / "run")
-    assert said in _refused(capsys, module, *args, *out)
+    assert said in refused(capsys, module, *args, *out)
     assert not (tmp_path / "run").exists()
 
 
 def test_bad_settings_leave_the_earlier_run(chain: Path, capsys) -> None:
     before = (chain / "udr" / "results.json").read_bytes()
-    line = _refused(capsys, udr, "--out", chain / "udr", "--robot", "cartpole")
+    line = refused(capsys, udr, "--out", chain / "udr", "--robot", "cartpole")
     assert "--resume" in line and "--overwrite" in line
     assert (chain / "udr" / "results.json").read_bytes() == before

@@ -1,6 +1,5 @@
 """--effects and --target-effects of the commands, end to end and small."""
 
-import json
 from pathlib import Path
 
 import jax
@@ -10,8 +9,8 @@ import pytest
 
 from easi_jax.errors import UserError
 from envs import make
+from tests.commands import command, read, refused
 from train import easi, evaluate, pipeline, udr
-from train._command import main
 from train._retrain import check_robot, retrain
 from train._robots import load_policies
 
@@ -42,23 +41,6 @@ SEARCH = ("--generations", "2", "--population", "16", "--trajectories", "8")
 SETTINGS = ("--set", "segments=16", "real_batch=64", "discriminator_updates=2")
 
 
-def _main(module, *args: object) -> None:
-    main(module.Config, module.run, name=module.__name__, args=[str(a) for a in args])
-
-
-def _refused(capsys, module, *args: object) -> str:
-    with pytest.raises(SystemExit) as stop:
-        _main(module, *args)
-    assert stop.value.code == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1 and lines[0].startswith("error: ")
-    return lines[0]
-
-
-def _read(path: Path):
-    return json.loads(path.read_text())
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("effects")
@@ -70,16 +52,16 @@ def files(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def trained(files: Path) -> Path:
     out = files / "udr"
-    _main(udr, "--effects", files / "found.yaml", "--out", out, *SMALL, "--chunk", 24)
+    command(udr, "--effects", files / "found.yaml", "--out", out, *SMALL, "--chunk", 24)
     return out
 
 
 def test_the_run_says_what_it_was_trained_with(trained: Path) -> None:
-    results = _read(trained / "results.json")
+    results = read(trained / "results.json")
     assert results["effects"]["effects"][0]["columns"] == {"coulomb": 0.3}
     assert results["target"][NAMES[0]] == 0.3 and results["target"][NAMES[1]] == 0.03
     assert results["target"]["pole_damping"] == 0.003
-    assert _read(trained / "config.json")["config"]["effects"] == results["effects"]
+    assert read(trained / "config.json")["config"]["effects"] == results["effects"]
     assert "coulomb_friction@cart" in (trained / "report.html").read_text()
 
 
@@ -89,10 +71,10 @@ def test_evaluate_restores_the_effects_and_takes_others(
     got = []
     for k, more in enumerate(((), ("--effects", files / "hidden.yaml"))):
         out = files / f"evaluated{k}.json"
-        _main(evaluate, "--run", trained, "--episodes", 4, "--out", out, *more)
-        got.append(_read(out))
+        command(evaluate, "--run", trained, "--episodes", 4, "--out", out, *more)
+        got.append(read(out))
     assert set(NAMES) <= set(got[0]["target"])
-    assert got[0]["effects"] == _read(trained / "results.json")["effects"]
+    assert got[0]["effects"] == read(trained / "results.json")["effects"]
     assert NAMES[0] in got[1]["target"] and NAMES[1] not in got[1]["target"]
     assert got[0]["returns"] != got[1]["returns"]
     assert "coulomb_friction@cart, actuator_delay@cart" in capsys.readouterr().out
@@ -104,7 +86,7 @@ def test_training_goes_on_from_another_run(trained: Path, files: Path, capsys) -
     out = files / "tuned"
     short = ("--env-steps", 200, "--eval-episodes", 4)
     start = ("--start-from", trained, "--effects", files / "found.yaml")
-    _main(udr, *start, "--out", out, *short, "--seeds", 0, 7)
+    command(udr, *start, "--out", out, *short, "--seeds", 0, 7)
     first = load_policies(trained)["policies"]
     tuned = load_policies(out)["policies"]
     for a, b in zip(
@@ -112,7 +94,7 @@ def test_training_goes_on_from_another_run(trained: Path, files: Path, capsys) -
     ):
         for seed in (0, 1):
             np.testing.assert_array_equal(a[0], b[seed])
-    said = _refused(
+    said = refused(
         capsys, udr, *start, "--out", files / "no", *short, "--algorithm", "ppo"
     )
     assert "its algorithm is sac, this training's ppo" in said
@@ -120,13 +102,13 @@ def test_training_goes_on_from_another_run(trained: Path, files: Path, capsys) -
 
 
 def test_resume_needs_the_same_effects(trained: Path, files: Path, capsys) -> None:
-    before = _read(trained / "results.json")
+    before = read(trained / "results.json")
     again = ("--out", trained, *SMALL, "--chunk", 24, "--resume")
-    _main(udr, "--effects", files / "found.yaml", *again)
-    assert _read(trained / "results.json") == before
+    command(udr, "--effects", files / "found.yaml", *again)
+    assert read(trained / "results.json") == before
     other = files / "other.yaml"
     other.write_text(FOUND.replace("0.3}", "0.31}"))
-    assert "effects" in _refused(capsys, udr, "--effects", other, *again)
+    assert "effects" in refused(capsys, udr, "--effects", other, *again)
 
 
 @pytest.mark.parametrize(
@@ -143,9 +125,9 @@ def test_bad_files_leave_nothing_behind(text: str, said: str, tmp_path, capsys) 
     path.write_text(text)
     for option in ("--effects", "--target-effects"):
         out = tmp_path / "out"
-        assert said in _refused(capsys, udr, option, path, "--out", out)
+        assert said in refused(capsys, udr, option, path, "--out", out)
         assert not out.exists()
-    line = _refused(
+    line = refused(
         capsys, udr, "--effects", tmp_path / "none.yaml", "--out", tmp_path / "out"
     )
     assert "cannot be read" in line
@@ -154,31 +136,31 @@ def test_bad_files_leave_nothing_behind(text: str, said: str, tmp_path, capsys) 
 @pytest.mark.slow
 def test_the_chain_with_known_and_hidden_effects(trained: Path, files: Path) -> None:
     out = files / "easi"
-    _main(
+    command(
         easi,
         *("--udr", trained, "--out", out, *SEARCH, *SETTINGS, "--oracle"),
         *("--target-effects", files / "hidden.yaml", "--eval-episodes", 4),
     )
-    told = _read(out / "distribution.json")
+    told = read(out / "distribution.json")
     assert [p["name"] for p in told["parameters"]][-2:] == list(NAMES)
     assert told["truth"][NAMES[0]] == 0.33 and told["truth"][NAMES[1]] == 0.0
-    results = _read(out / "results.json")
+    results = read(out / "results.json")
     assert set(results["methods"]) == {"UDR", "EASI", "Oracle"}
     assert results["effects"] and results["target_effects"]
-    _main(evaluate, "--run", out, "--policy", "Oracle", "--episodes", 4)
+    command(evaluate, "--run", out, "--policy", "Oracle", "--episodes", 4)
 
 
 @pytest.mark.slow
 def test_the_whole_chain_in_one_program(files: Path) -> None:
     out = files / "pipeline"
-    _main(
+    command(
         pipeline,
         *("--effects", files / "found.yaml", "--out", out, *SMALL, *SEARCH),
         *("--target-effects", files / "hidden.yaml", *SETTINGS),
     )
-    results = _read(out / "results.json")
+    results = read(out / "results.json")
     assert results["effects"] and results["target_effects"]
-    assert _read(out / "distribution.json")["truth"][NAMES[0]] == 0.33
+    assert read(out / "distribution.json")["truth"][NAMES[0]] == 0.33
 
 
 @pytest.mark.slow
@@ -188,7 +170,7 @@ def test_retraining_tests_both_policies_with_the_effects(files: Path) -> None:
     assert told["env_steps"] == 2400 and told["robot"] == "cartpole"
     for which in ("with", "without"):
         assert set(told[which]) == {"0", "3"}
-        results = _read(out / f"retrain_{which}" / "results.json")
+        results = read(out / f"retrain_{which}" / "results.json")
         assert results["target"][NAMES[0]] == 0.3
         assert ("effects" in results) == (which == "with")
     assert told["with"] != told["without"]
@@ -226,12 +208,12 @@ def test_logs_are_fitted_with_effects_and_no_parameter_file(files: Path) -> None
         "- {effect: actuator_delay, at: x, kind: actuator, columns: {delay: 0.018}}\n"
     )
     out = files / "logs"
-    _main(
+    command(
         easi,
         *("--model", model, "--data", files / "log.csv", "--out", out),
         *("--effects", files / "mass.yaml", "--generations", 20, "--population", 40),
     )
-    told = _read(out / "distribution.json")
+    told = read(out / "distribution.json")
     mean = dict(
         zip(
             [p["name"] for p in told["parameters"]],
@@ -244,7 +226,7 @@ def test_logs_are_fitted_with_effects_and_no_parameter_file(files: Path) -> None
 
 
 def test_logs_bring_their_own_effects(files: Path, capsys) -> None:
-    line = _refused(
+    line = refused(
         capsys,
         easi,
         *("--data", "log.csv", "--robot", "cartpole"),

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.commands import command
 from train import easi, evaluate, pipeline, udr
-from train._command import main
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3000)]
 
@@ -20,10 +20,6 @@ TARGETS = {
     "ballbalance": "ball_mass*0.5",
     "go2": "thigh_kp*0.5",
 }
-
-
-def _main(module, *args: object) -> None:
-    main(module.Config, module.run, name=module.__name__, args=[str(a) for a in args])
 
 
 def _check(run: Path, robot: str) -> None:
@@ -49,21 +45,21 @@ def _check(run: Path, robot: str) -> None:
 def test_from_udr_to_evaluation(robot: str, tmp_path: Path) -> None:
     target = ("--target", TARGETS[robot])
     steps = ("--env-steps", 10_240, "--algorithm", "ppo", "--eval-episodes", 4)
-    _main(udr, "--robot", robot, "--out", tmp_path / "udr", *steps, *target)
-    _main(
+    command(udr, "--robot", robot, "--out", tmp_path / "udr", *steps, *target)
+    command(
         easi,
         *("--udr", tmp_path / "udr", "--out", tmp_path / "easi", *SEARCH, *target),
         *("--eval-episodes", 4),
     )
     _check(tmp_path / "easi", robot)
     out = tmp_path / "returns.json"
-    _main(evaluate, "--run", tmp_path / "easi", "--episodes", 2, "--out", out)
+    command(evaluate, "--run", tmp_path / "easi", "--episodes", 2, "--out", out)
     assert json.loads(out.read_text())["method"] == "EASI"
 
 
 @pytest.mark.parametrize("robot", list(TARGETS))
 def test_as_one_program(robot: str, tmp_path: Path) -> None:
-    _main(
+    command(
         pipeline,
         *("--robot", robot, "--out", tmp_path / "run", "--algorithm", "ppo"),
         *("--env-steps", 10_240, "--eval-episodes", 4, *SEARCH),
