@@ -98,6 +98,11 @@ def figures(folder: Path) -> dict[str, str]:
     }
 
 
+def _among(expected: str, names: set[str]) -> bool:
+    options = expected.split("|")
+    return any(n in options or n.split("@")[0] in options for n in names)
+
+
 def real(folder: Path) -> list[str]:
     """Recordings of real machines."""
     from easi_jax.io.files import read_json
@@ -112,7 +117,12 @@ def real(folder: Path) -> list[str]:
         named = ", ".join(
             f"{e['effect']}@{e['at']} ({e['confidence']:.2f})" for e in r["effects"]
         )
-        missing = [k for k, ok in r["found"].items() if not ok]
+        alike = {n for e in r["effects"] for n in e["indistinguishable"]}
+        missing = [
+            k.replace("|", " or ") + (" (listed as alike)" if _among(k, alike) else "")
+            for k, ok in r["found"].items()
+            if not ok
+        ]
         gap = r["gap"]
         lines.append(
             (

@@ -163,7 +163,7 @@ def _robots(folder: Path) -> list[str]:
         goal = SEARCH_GOALS.get(name)
         rows.append(
             (
-                name.rpartition("_")[0],
+                r["robot"],
                 f"{r['generations']} x {r['population']} x {r['steps']}",
                 f"{r['search_s']:.0f} s",
                 f"{goal} s, {_met(r['search_s'] < goal)}" if goal else "",
