@@ -354,10 +354,12 @@ def _recovery(folder: Path) -> list[str]:
 
 
 def _transfer(folder: Path) -> list[str]:
-    out, rows = ["## Transfer: return in a target with another drive"], []
+    out, rows = ["## Transfer: return in a target with one parameter changed"], []
     for factor in FACTORS:
         names = [f"transfer_kp_x{factor:g}"]
         names += sorted(p.stem for p in folder.glob(f"{names[0]}_joint*.json"))
+        others = [f"transfer_{robot}_x{factor:g}" for robot in ROBOTS]
+        names += [n for n in others if (folder / f"{n}.json").is_file()]
         for name in names:
             r = _read(folder, name)
             if r is None:
@@ -390,6 +392,9 @@ def _transfer(folder: Path) -> list[str]:
             "goal 0.9",
         )
         out.append(markdown_table(head, rows))
+    for robot in ROBOTS[:3]:
+        if not any(str(row[0]).startswith(robot) for row in rows):
+            out.append(f"Not run: `python -m benchmarks.transfer --robot {robot}`.")
     if any("_joint" in str(row[0]) for row in rows):
         out.append(
             "`_jointN`: the policy goes on training inside the search, N steps of all "

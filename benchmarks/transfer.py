@@ -1,10 +1,14 @@
-"""Return in targets whose cart drive differs: UDR, EASI and the Oracle, equal budgets.
+"""Return in targets with one parameter changed: UDR, EASI, Oracle, equal budgets.
 
     python -m benchmarks.transfer
+    python -m benchmarks.transfer --robot ant --seeds 0 1 2
 
-UDR's range stays centered on the nominal robot while the target's drive stiffness is
-multiplied; one UDR training serves all targets. Each target is written when it is done;
-those not run are absent. ``--joint`` adds a search that also trains the policy.
+UDR's range stays centered on the nominal robot while one parameter of the target is
+multiplied, as in the paper's Fig. 6: the drive's stiffness of Cartpole, the thighs' of
+Go2, Ant's torso, Ballbalance's ball. One UDR training serves all targets. Each target
+is written when it is done; those not run are absent. ``--joint`` adds a search that
+also trains the policy. Curves by training step, as in Fig. 5, are in the report of
+``train.easi --oracle``.
 """
 
 import dataclasses
@@ -17,14 +21,24 @@ from train._command import main, say, show_table
 class Config:
     """Trains and tests UDR, EASI and Oracle policies, paired by seed."""
 
+    robot: str = "cartpole"
+    """Built-in robot."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
     """Seeds, paired over methods."""
     factors: tuple[float, ...] = (0.25, 0.5, 2.0, 4.0)
-    """Targets: factors on the cart drive's stiffness."""
+    """Targets: factors on the robot's parameter that the paper changes."""
     env_steps: int | None = None
     """Control steps of each training; the preset where not given."""
     joint: int = 0
     """Policy updates per generation; 0 as in the paper."""
+    generations: int = 50
+    """Generations of the search."""
+    population: int = 300
+    """Individuals in a generation."""
+    trajectories: int = 200
+    """Demonstration trajectories."""
+    episodes: int = 100
+    """Episodes of each evaluation."""
 
 
 def run(config: Config) -> None:
@@ -33,7 +47,7 @@ def run(config: Config) -> None:
     import jax.numpy as jnp
     import numpy as np
 
-    from benchmarks._common import write_result
+    from benchmarks._common import command_of, write_result
     from easi_jax.pipeline import (
         Pipeline,
         PipelineConfig,
@@ -43,23 +57,34 @@ def run(config: Config) -> None:
     )
     from easi_jax.runtime import fast_loops
     from easi_jax.search_config import preset
-    from envs import make
+    from envs import open_env
     from train._robots import training_config
 
-    env = make("cartpole")
-    sac = dataclasses.replace(training_config(env, config.env_steps), evaluate_every=0)
+    env = open_env(config.robot)
+    changed = env.default_target[0].partition("*")[0]
+    training = training_config(env, config.env_steps)
+    training = dataclasses.replace(training, evaluate_every=0)
     pipe = Pipeline(
         env,
         PipelineConfig(
-            search=preset("default", policy_updates_per_generation=config.joint),
-            training=sac,
+            search=preset(
+                "default",
+                policy_updates_per_generation=config.joint,
+                generations=config.generations,
+                population=config.population,
+            ),
+            training=training,
+            trajectories=config.trajectories,
+            eval_episodes=config.episodes,
             refine=True,
         ),
     )
     keys = stage_keys(seed_keys(list(config.seeds)))
     count = len(config.seeds)
     train = jax.jit(
-        lambda s, dist, target: pipe.train_chunk(s, dist, target, sac.iterations)[0]
+        lambda s, dist, target: pipe.train_chunk(s, dist, target, training.iterations)[
+            0
+        ]
     )
     shorter = jax.jit(
         lambda s, dist, target: pipe.train_chunk(
@@ -90,11 +115,11 @@ def run(config: Config) -> None:
     say(f"UDR trained in {time.monotonic() - begin:.0f} s")
     for factor in config.factors:
         begin = time.monotonic()
-        theta = target_parameters(env.space, (f"cart_kp*{factor}",))
+        theta = target_parameters(env.space, (f"{changed}*{factor}",))
         target = jnp.asarray(theta, jnp.float32)
         demos = demonstrate(udr, target, keys["demonstrate"])
-        training = states if config.joint else ()
-        found, _ = search(keys["search"], demos, udr, training)
+        learner = states if config.joint else ()
+        found, _ = search(keys["search"], demos, udr, learner)
         result = estimate(found, demos)
         first = pipe.final_init(keys["final"], result.distribution, found)
         easi = shorter(first, result.distribution, target)
@@ -115,22 +140,26 @@ def run(config: Config) -> None:
         share = float(won.mean() / gap.mean())
         draws = np.random.default_rng(0).integers(0, count, (4000, count))
         boot = won[draws].mean(1) / gap[draws].mean(1)
-        name = f"transfer_kp_x{factor:g}" + (
+        label = "kp" if config.robot == "cartpole" else config.robot
+        name = f"transfer_{label}_x{factor:g}" + (
             f"_joint{config.joint}" * bool(config.joint)
         )
         path = write_result(
             name,
-            f"python -m benchmarks.transfer --factors {factor:g}"
-            + (f" --joint {config.joint}" if config.joint else ""),
+            command_of(
+                "benchmarks.transfer", dataclasses.replace(config, factors=(factor,))
+            ),
             config,
+            robot=config.robot,
+            changed=changed,
             target=dict(zip(env.space.names, theta.tolist(), strict=True)),
             returns={
                 m: dict(zip(map(str, config.seeds), v.tolist(), strict=True))
                 for m, v in scores.items()
             },
-            cart_kp_found=np.asarray(
+            changed_found=np.asarray(
                 jax.vmap(pipe.space.to_si)(result.distribution.mean)
-            )[:, env.space.names.index("cart_kp")].tolist(),
+            )[:, env.space.names.index(changed)].tolist(),
             oracle_minus_udr={
                 "mean": float(gap.mean()),
                 "standard_error": float(error),
@@ -142,7 +171,7 @@ def run(config: Config) -> None:
             seconds=time.monotonic() - begin,
         )
         show_table(
-            f"cart_kp x {factor:g}: return in the target; EASI closes {share:.2f} of "
+            f"{changed} x {factor:g}: return in the target; EASI closes {share:.2f} of "
             "the gap",
             ("method", "mean", *(f"seed {s}" for s in config.seeds)),
             [
