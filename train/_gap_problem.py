@@ -20,6 +20,7 @@ class GapProblem:
         noise: of positions and velocities, ``(2 nv,)``.
         late: joints whose measured velocity lags its position (`velocities.Lag`).
         notes: what the user should know of the data.
+        fixed: what a built-in robot has and MJCF cannot say, by address.
     """
 
     name: str
@@ -33,6 +34,7 @@ class GapProblem:
     noise: Any
     late: dict[str, Any]
     notes: list[str]
+    fixed: dict[str, float]
 
 
 def read_gap_problem(config: Any) -> GapProblem:
@@ -71,7 +73,20 @@ def read_gap_problem(config: Any) -> GapProblem:
         runs.noise,
         {joints[d]: lag for d, lag in late.items() if d in joints},
         [*runs.notes, *coverage_notes(mj_model, runs.fit, runs.held)],
+        beyond_mjcf(name) if path is None else {},
     )
+
+
+def beyond_mjcf(robot: str) -> dict[str, float]:
+    """Nominal values of a built-in robot's parameters that MJCF has no word for."""
+    from envs import make
+
+    return {
+        address: p.nominal
+        for p in make(robot).space.parameters
+        for address in p.addresses
+        if address.endswith(".speed_limit")
+    }
 
 
 def read_model(text: str) -> tuple[str, Path | None, Any]:

@@ -73,6 +73,7 @@ def run(config: Config) -> None:
         problem.noise,
         config.horizon,
         tell=say,
+        fixed=problem.fixed,
     )
     with RunFolder.open(
         config.out, config, command="train.gap", overwrite=config.overwrite

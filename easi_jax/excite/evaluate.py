@@ -28,6 +28,9 @@ def windows_of(
     Args:
         horizon: length of a window [s].
         longest: delay that predictions have to allow for [s].
+
+    Raises:
+        ValueError: a run that is shorter than a window.
     """
     out = []
     for i, run in enumerate(runs):

@@ -121,7 +121,8 @@ def propose(
     design.add(place, base + share * (x - base))
     for rival in rivals:
         design.add(rival)
-    every = [*runs, *(t.run for t in tests)]
+    given_runs = [r for r in runs if len(r) > predictor.steps]
+    every = [*given_runs, *(t.run for t in tests)]
     most = min(_WINDOWS, predictor.capacity)
     parts = ev.windows_of(every, horizon, scales.longest, most)
     found = []
@@ -132,8 +133,8 @@ def propose(
         found += ev.products_of(
             m, on, chosen, [every[k] for k in group], noise, scales, tell
         )
-    given = separation(design, np.sum(found[: len(runs)], 0))
-    tried = [separation(design, p) for p in found[len(runs) :]]
+    given = separation(design, np.sum(found[: len(given_runs)], 0))
+    tried = [separation(design, p) for p in found[len(given_runs) :]]
     known = alike([given, *tried])
     out = []
     for rival in rivals:

@@ -7,7 +7,7 @@ Held-out windows take part in none but the last.
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import mujoco
@@ -70,6 +70,7 @@ class Analysis:
         noise: np.ndarray,
         horizon: float,
         tell: Tell = lambda _: None,
+        fixed: Mapping[str, float] | None = None,
     ) -> None:
         self.m, self.space, self.tell = mj_model, space, tell
         self.runs = [*fit, *held]
@@ -105,6 +106,7 @@ class Analysis:
             layout,
             join([fitted.take(chosen[repeated]), kept]),
             dt,
+            fixed,
         )
         self.fit_blocks = np.arange(len(repeated) // BLOCK)
         self.held_blocks = np.arange(len(repeated) // BLOCK, self.predictor.blocks)

@@ -9,7 +9,7 @@ one size.
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -156,8 +156,10 @@ class Predictor:
         layout: Layout,
         windows: WindowSet,
         dt: float,
+        fixed: Mapping[str, float] | None = None,
     ) -> None:
-        self.machine = Machine(opened(mj_model), space, dt)
+        """``fixed``: what the machine has and MJCF cannot say, by address."""
+        self.machine = Machine(opened(mj_model), space, dt, fixed=fixed)
         # Centers of mass move.
         base = self.machine.base
         self.machine.base = base.replace(mjx=full_structure(base.mjx))

@@ -332,10 +332,10 @@ def better(model: Model, base: Model) -> bool:
 
     Losses are compared in units of the noise and of the gap. On average over both the
     gain has to be sure, and in one of them as large as the share that each number of
-    the model has to earn. With an effect that machines rarely have, both have to be
-    sure, and twice as large, since such effects mend a little of everything. A large
-    gain may also be sure by its ratios: where a few blocks hold most of the error,
-    differences scatter as much as they are large.
+    the model has to earn, in the other a third of that. With an effect that machines
+    rarely have, both have to be sure, and twice as large, since such effects mend a
+    little of everything. A large gain may also be sure by its ratios: where a few
+    blocks hold most of the error, differences scatter as much as they are large.
     """
     helps = _HELPS * max(1, len(model.fit.active) - len(base.fit.active))
     known = {p.key for p in base.places}
@@ -351,7 +351,7 @@ def better(model: Model, base: Model) -> bool:
     if rare:
         return min(sure) > _SURE and min(gain) > 2 * helps
     likely = min(sure) > _LIKELY and sum(sure) > 2 * _SURE
-    return likely and min(gain) > 0 and max(gain) > helps
+    return likely and max(gain) > helps and min(gain) > helps / 3
 
 
 def size_of(model: Model) -> int:

@@ -39,7 +39,7 @@ def _check(run: Path, robot: str) -> None:
         )
         if flag == "determined"
     ]
-    assert np.median(errors) < 0.2, errors
+    assert np.median(errors) < 0.5, errors
     report = (run / "report.html").read_text()
     assert "Return by method" in report and "An episode" in report
 

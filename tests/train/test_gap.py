@@ -4,15 +4,20 @@ import json
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from easi_jax.errors import UserError
 from easi_jax.io.effects_file import effects_of, read_effects
+from easi_jax.machine import Machine
+from easi_jax.parameters import ParameterSpace
+from envs import make
 from tests.gap_cases import Effect, make_case
 from train import gap
 from train._command import main
+from train._gap_problem import beyond_mjcf
 
 
 def run(*args: object) -> None:
@@ -168,3 +173,14 @@ def test_effects_files_are_checked(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(UserError, match=reason):
             read_effects(path)
+
+
+def test_a_built_in_robot_keeps_what_its_xml_cannot_say() -> None:
+    """Cartpole's cart has a speed limit; without it a gap would be found there."""
+    env = make("cartpole")
+    fixed = beyond_mjcf("cartpole")
+    assert fixed == {"joint.cart.speed_limit": 0.6}
+    assert beyond_mjcf("ant") == {}
+    machine = Machine(env.mj_model, ParameterSpace(()), env.dt, fixed=fixed)
+    model = machine.model(jnp.zeros(0))
+    np.testing.assert_allclose(model.speed_limit, env.model().speed_limit)

@@ -14,6 +14,7 @@ from easi_jax.gap.fit import bounds_of, least_squares, lockstep
 from easi_jax.gap.own import own_space
 from easi_jax.gap.residuals import make_residuals, start_sensitivity, velocity_slack
 from easi_jax.gap.scales import scales_of
+from easi_jax.log_data import rows_of
 from easi_jax.recording import Run
 
 XML = """
@@ -195,6 +196,7 @@ def test_distances_are_those_of_fits(case: Case) -> None:
 
 def test_a_proposal_beats_the_data_given(case: Case) -> None:
     slow = case.runs[2]
+    short = rows_of(slow, 0, 5)  # less than a window: says nothing
     x = case.predictor.neutral.copy()
     x[case.column("armature@hinge")] += case.bounds.size[case.column("armature@hinge")]
     (found,) = propose(
@@ -205,10 +207,10 @@ def test_a_proposal_beats_the_data_given(case: Case) -> None:
         [0],
         case.places["armature@hinge"],
         [case.places["coulomb_friction@hinge"]],
-        [slow],
+        [short, slow],
         case.noise,
         HORIZON,
-        quick_tests(case.m, [slow], 8.0),
+        quick_tests(case.m, [short, slow], 8.0),
     )
     assert found.test is not None and not found.twins
     assert found.apart > 4 * found.given
