@@ -98,6 +98,30 @@ def figures(folder: Path) -> dict[str, str]:
     }
 
 
+def loop(folder: Path) -> list[str]:
+    """Returns in a target with a hidden effect, before and after it is found."""
+    from easi_jax.io.files import read_json
+
+    out = ["## The loop closed: a hidden effect on Cartpole"]
+    lines, methods = [], []
+    for effect in ("friction", "delay"):
+        path = folder / f"loop_cartpole_{effect}.json"
+        if not path.is_file():
+            out.append(f"Not run: `python -m benchmarks.loop --effect {effect}`.")
+            continue
+        r = read_json(path)
+        methods = list(r["returns"])
+        named = ", ".join(f"{e['effect']}@{e['at']}" for e in r["found"]["effects"])
+        mean = [sum(v.values()) / len(v) for v in r["returns"].values()]
+        seeds = len(next(iter(r["returns"].values())))
+        lines.append((effect, named, seeds, *(f"{x:.1f}" for x in mean)))
+    if lines:
+        head = ("hidden", "named by train.gap", "seeds", *methods)
+        out.append(markdown_table(head, lines))
+        out.append("`python -m benchmarks.loop`: mean return in the target.")
+    return out
+
+
 def _among(expected: str, names: set[str]) -> bool:
     options = expected.split("|")
     return any(n in options or n.split("@")[0] in options for n in names)

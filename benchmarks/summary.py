@@ -37,7 +37,7 @@ def run(config: Config) -> None:
     parts = ["# Results", "Made by `python -m benchmarks.summary` from the files here."]
     for section in (
         *(_speed, _physics, _robots, _policies, _recovery, _transfer, _real),
-        *(gap_summary.generated, gap_summary.real),
+        *(gap_summary.generated, gap_summary.real, gap_summary.loop),
     ):
         parts += section(config.results)
     for name, text in gap_summary.figures(config.results).items():
@@ -354,7 +354,7 @@ def _recovery(folder: Path) -> list[str]:
 
 
 def _transfer(folder: Path) -> list[str]:
-    out, rows = ["## Transfer: return in a target with one parameter changed"], []
+    out, rows = ["## Transfer: return in a target unlike the model"], []
     for factor in FACTORS:
         names = [f"transfer_kp_x{factor:g}"]
         names += sorted(p.stem for p in folder.glob(f"{names[0]}_joint*.json"))

@@ -81,10 +81,10 @@ def test_evaluate_restores_the_effects_and_takes_others(
 
 
 def test_training_goes_on_from_another_run(trained: Path, files: Path, capsys) -> None:
-    """One iteration of random actions and no update: networks are those of the first
-    run, for a seed of its own and for one that the run lacks."""
+    """One iteration with updates: networks are nearly those of the first run, for a
+    seed of its own and for one that the run lacks."""
     out = files / "tuned"
-    short = ("--env-steps", 200, "--eval-episodes", 4)
+    short = ("--env-steps", 2100, "--eval-episodes", 4)
     start = ("--start-from", trained, "--effects", files / "found.yaml")
     command(udr, *start, "--out", out, *short, "--seeds", 0, 7)
     first = load_policies(trained)["policies"]
@@ -93,7 +93,7 @@ def test_training_goes_on_from_another_run(trained: Path, files: Path, capsys) -
         jax.tree.leaves(first.network), jax.tree.leaves(tuned.network), strict=True
     ):
         for seed in (0, 1):
-            np.testing.assert_array_equal(a[0], b[seed])
+            np.testing.assert_allclose(a[0], b[seed], atol=0.05)
     said = refused(
         capsys, udr, *start, "--out", files / "no", *short, "--algorithm", "ppo"
     )
