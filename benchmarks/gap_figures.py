@@ -4,7 +4,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from easi_jax.io.figure_style import BLUE, DASHED, FAINT, INK, grid, styled, svg
+from easi_jax.io.figure_style import (
+    BLUE,
+    DASHED,
+    FAINT,
+    grid,
+    labelled_map,
+    styled,
+    svg,
+)
 
 _LAST = ("right twin", "none")  # columns that are no effect's name
 
@@ -23,21 +31,13 @@ def confusion_matrix(counts: Mapping[str, Mapping[str, int]]) -> str:
     figure, (axis,) = grid(1, 1, 0.27 * len(rows) + 1.9)
     shares = table / np.maximum(table.sum(1, keepdims=True), 1)
     axis.imshow(shares, cmap="Blues", vmin=0, vmax=1, aspect="auto")
-    for i, j in np.argwhere(table > 0).tolist():
-        axis.text(
-            j,
-            i,
-            f"{table[i, j]:.0f}",
-            ha="center",
-            va="center",
-            fontsize="small",
-            color="white" if shares[i, j] > 0.6 else INK,
-        )
-    axis.set_xticks(range(len(columns)), columns, rotation=55, ha="right")
-    axis.set_yticks(range(len(rows)), rows)
+    labels = {
+        (i, j): (f"{table[i, j]:.0f}", bool(shares[i, j] > 0.6))
+        for i, j in np.argwhere(table > 0).tolist()
+    }
+    labelled_map(axis, labels, rows, columns)
     axis.set_xlabel("named first")
     axis.set_ylabel("true effect")
-    axis.grid(visible=False)
     return svg(figure)
 
 

@@ -11,6 +11,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from benchmarks.gap_score import is_among
 from train._command import main, say, show_table
 
 
@@ -131,15 +132,9 @@ def analysed(machine: Machine, data: Path, out: Path) -> dict[str, Any]:
     )
     told = json.loads((out / "gap.json").read_text())
     effects = told["effects"]
-
-    def there(expected: str) -> bool:
-        """Named, at its place where one is given."""
-        options = expected.split("|")
-        names = [f"{e['effect']}@{e['at']}" for e in effects]
-        return any(n == o or n.split("@")[0] == o for n in names for o in options)
-
+    names = {f"{e['effect']}@{e['at']}" for e in effects}
     return {
-        "found": {e: there(e) for e in machine.expected},
+        "found": {e: is_among(e, names) for e in machine.expected},
         "wrongly_named": [e["effect"] for e in effects if e["effect"] in machine.never],
         **{
             k: told[k]

@@ -140,3 +140,9 @@ def confusion(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:
         row = out.setdefault(truth, {})
         row[first] = row.get(first, 0) + 1
     return out
+
+
+def is_among(expected: str, names: set[str]) -> bool:
+    """Whether one of ``A|B`` is among names ``EFFECT@PLACE``, at its place if given."""
+    options = expected.split("|")
+    return any(n in options or n.split("@")[0] in options for n in names)

@@ -12,6 +12,7 @@ from benchmarks.gap_score import (
     brier,
     calibration,
     confusion,
+    is_among,
     judged,
     parameter_errors,
     ratios,
@@ -122,11 +123,6 @@ def loop(folder: Path) -> list[str]:
     return out
 
 
-def _among(expected: str, names: set[str]) -> bool:
-    options = expected.split("|")
-    return any(n in options or n.split("@")[0] in options for n in names)
-
-
 def real(folder: Path) -> list[str]:
     """Recordings of real machines."""
     from easi_jax.io.files import read_json
@@ -143,7 +139,8 @@ def real(folder: Path) -> list[str]:
         )
         alike = {n for e in r["effects"] for n in e["indistinguishable"]}
         missing = [
-            k.replace("|", " or ") + (" (listed as alike)" if _among(k, alike) else "")
+            k.replace("|", " or ")
+            + (" (listed as alike)" if is_among(k, alike) else "")
             for k, ok in r["found"].items()
             if not ok
         ]

@@ -133,10 +133,12 @@ def run(config: Config) -> None:
 def _recorded(run_folder: Path, hidden: Path, folder: Path) -> list[Path]:
     """Logs of the policies in the target, with noise."""
     import jax
+    import jax.numpy as jnp
     import numpy as np
 
     from easi_jax.io.files import atomic_write
     from easi_jax.rl.networks import act
+    from easi_jax.rollout import collect, measured
     from train import udr
     from train._effects import read_given, robots
     from train._robots import load_udr
@@ -144,20 +146,21 @@ def _recorded(run_folder: Path, hidden: Path, folder: Path) -> list[Path]:
     saved = load_udr(run_folder)
     given = read_given(udr.Config(target_effects=hidden))
     _, env = robots(saved["env"], given)
-    model = env.model()
-    rng = np.random.default_rng(0)
-    steps = env.episode_length
+    nv = env.mj_model.nv
+    noise = jnp.array([*NOISE, *[0.0] * nv])  # of positions; no velocities are logged
 
     @jax.jit
-    def episode(policy: Any, key: Any) -> Any:
-        first = env.reset(model, key)
-
-        def step(state: Any, k: Any) -> Any:
-            action = act(policy, state.obs, k, False)
-            row = (state.physics.qpos, env.control(state, action), state.terminated)
-            return env.step(model, state, action), row
-
-        return jax.lax.scan(step, first, jax.random.split(key, steps))[1]
+    def episodes(policy: Any, key: Any) -> Any:
+        run, sensors = jax.random.split(key)
+        trajectories = collect(
+            env,
+            env.model(),
+            lambda obs, k: act(policy, obs, k, False),
+            run,
+            EPISODES,
+            env.episode_length,
+        )
+        return measured(trajectories, noise, sensors)
 
     joints = [env.mj_model.joint(j).name for j in range(env.mj_model.njnt)]
     drives = [env.mj_model.actuator(i).name for i in range(env.mj_model.nu)]
@@ -165,13 +168,12 @@ def _recorded(run_folder: Path, hidden: Path, folder: Path) -> list[Path]:
     out = []
     for i, seed in enumerate(saved["seeds"]):
         policy = jax.tree.map(lambda x, i=i: x[i], saved["policies"])
+        logs = jax.tree.map(np.asarray, episodes(policy, jax.random.key(seed)))
         for k in range(EPISODES):
-            qpos, ctrl, over = map(
-                np.asarray, episode(policy, jax.random.key(1000 * seed + k))
-            )
-            alive = int(np.argmax(over > 0)) if (over > 0).any() else steps
-            qpos = qpos[:alive] + rng.normal(size=(alive, len(joints))) * NOISE
-            rows = np.c_[env.dt * np.arange(alive), qpos, ctrl[:alive]]
+            alive = int(logs.weight[k].sum())
+            rows = np.c_[
+                env.dt * np.arange(alive), logs.qpos[k, :alive], logs.ctrl[k, :alive, 0]
+            ]
             lines = [",".join(head), *(",".join(f"{x:.7g}" for x in r) for r in rows)]
             path = folder / f"seed{seed}_{k}.csv"
             atomic_write(path, "\n".join(lines) + "\n")

@@ -192,24 +192,17 @@ def _time(config: Config, env: Any, saved: Any, label: str) -> None:
 def _memory(config: Config, env: Any, saved: Any, label: str) -> None:
     import jax
 
-    from benchmarks._common import command_of, write_result
-
     population = 4096
     pipe = _pipe(config, env, population=population, generations=1)
     keys, policies, demos = _demonstrations(pipe, saved, config.seeds[:1])
     compiled, state, _ = _searched(pipe, demos, keys, policies)
     jax.block_until_ready(compiled(state, demos, policies))
-    say(f"{label}: a generation of {population}, peak {peak_gib():.2f} GiB")
-    path = write_result(
-        f"memory_{label}",
-        command_of("benchmarks.robots", config),
+    _write_peak(
         config,
-        robot=env.name,
-        what=f"search, population {population}",
-        peak_gib=peak_gib(),
-        goal_gib=8.0,
+        env,
+        f"memory_{label}",
+        f"search, population {population}",
     )
-    say(f"written: {path}")
 
 
 def _buffer(config: Config, env: Any, label: str) -> None:
@@ -218,7 +211,6 @@ def _buffer(config: Config, env: Any, label: str) -> None:
     import jax
     import jax.numpy as jnp
 
-    from benchmarks._common import command_of, write_result
     from easi_jax.io import checkpoints
     from easi_jax.pipeline import Pipeline, PipelineConfig, seed_keys, stage_keys
     from easi_jax.rl.presets import training_preset
@@ -237,17 +229,28 @@ def _buffer(config: Config, env: Any, label: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         checkpoints.save(Path(folder), count, states, config_hash="none")
     held = states.buffer.data.shape
-    say(f"{label}: a buffer of {held[-2]:,} transitions, peak {peak_gib():.2f} GiB")
-    path = write_result(
+    _write_peak(
+        config,
+        env,
         f"memory_{label}_buffer",
+        f"SAC, a buffer of {held[-2]:,} transitions of {held[-1]} numbers",
+    )
+
+
+def _write_peak(config: Config, env: Any, name: str, what: str) -> None:
+    from benchmarks._common import command_of, write_result
+
+    peak = peak_gib()
+    path = write_result(
+        name,
         command_of("benchmarks.robots", config),
         config,
         robot=env.name,
-        what=f"SAC, a buffer of {held[-2]:,} transitions of {held[-1]} numbers",
-        peak_gib=peak_gib(),
+        what=what,
+        peak_gib=peak,
         goal_gib=8.0,
     )
-    say(f"written: {path}")
+    say(f"{what}: peak {peak:.2f} GiB; written: {path}")
 
 
 def _recovery(config: Config, env: Any, saved: Any, label: str, start: str) -> None:

@@ -95,12 +95,13 @@ def _joint(
     low: Callable[[Any, int], float] | float = 0.0,
     neutral: float = 0.0,
     open: Callable[[Any, int], None] = lambda m, j: None,
+    refuse: Callable[[Any, int], str | None] = _scalar,
 ) -> EffectQuantity:
     return EffectQuantity(
         _dof(field),
         joint_unit(*units),
         low,
-        refuse=_scalar,
+        refuse=refuse,
         open=open,
         on="joint",
         word=word,
@@ -112,20 +113,6 @@ def _geared(m: Any, j: int) -> str | None:
     if _scalar(m, j) is None and int(m.jnt_dofadr[j]) in geared(m):
         return None
     return "only joints that an actuator turns directly have play"
-
-
-def _play(
-    field: str, word: str, units: tuple[str, str], low: float = 0.0
-) -> EffectQuantity:
-    return EffectQuantity(
-        _dof(field),
-        joint_unit(*units),
-        low,
-        refuse=_geared,
-        open=lambda m, j: None,
-        on="joint",
-        word=word,
-    )
 
 
 def _actuator(
@@ -182,8 +169,8 @@ EFFECT_TABLE: dict[str, EffectQuantity] = {
     "cycles": _joint("cycles", "cycles_per_rev", ("1", "1"), 1e-6, 1.0),
     "phase": _joint("phase", "phase", ("rad", "rad"), -_INF),
     "armature": _joint("armature", "armature", ("kg", "kg m2")),
-    "width": _play("width", "width", ("m", "rad")),
-    "rotor": _play("rotor", "rotor_inertia", ("kg", "kg m2"), 1e-9),
+    "width": _joint("width", "width", ("m", "rad"), refuse=_geared),
+    "rotor": _joint("rotor", "rotor_inertia", ("kg", "kg m2"), 1e-9, refuse=_geared),
     "gain": _actuator("gain", "gain", _unit("1"), 1e-3, neutral=1.0),
     "delay": _actuator("delay", "delay", _unit("s"), high=_LONG),
     "lag": _actuator("lag", "time_constant", _unit("s"), high=_LONG),

@@ -17,6 +17,7 @@ from easi_jax.errors import UserError
 from easi_jax.model import Model, Sense, put_model, with_parameters
 from easi_jax.parameters import ParameterSpace
 from easi_jax.physics import WRITTEN_OUT, Physics, at_rest, control_step
+from easi_jax.quantities import joint_name
 from easi_jax.recording import physics_steps
 
 _BATCH = 2048  # benchmarks/speed.py
@@ -147,7 +148,7 @@ class Machine:
         m = self.mj_model
         pos, vel = [], []
         for j in range(m.njnt):
-            name = m.joint(j).name or f"joint{j}"
+            name = joint_name(m, j)
             n = {0: 6, 1: 3}.get(int(m.jnt_type[j]), 1)
             ends = [""] if n == 1 else [f".{i}" for i in range(n)]
             pos += [f"qpos.{name}{e}" for e in ends]

@@ -115,6 +115,11 @@ def is_scalar(m: Any, j: int) -> bool:
     return int(m.jnt_type[j]) in (int(_Joint.mjJNT_HINGE), int(_Joint.mjJNT_SLIDE))
 
 
+def joint_name(m: Any, j: int) -> str:
+    """A joint's name, or its number."""
+    return m.joint(j).name or f"joint{j}"
+
+
 def joint_unit(linear: str, angular: str) -> Callable[[Any, int], str]:
     """The unit of a quantity of slides and of other joints."""
 

@@ -95,7 +95,7 @@ def prepare() -> dict[str, object]:
 
 
 def _ready_flags(version: tuple[int, ...]) -> None:
-    if not _has_emitters(version):
+    if not _knows_flags(version):
         return
     flags = os.environ.get("XLA_FLAGS", "")
     for name, value in _FLAGS.items():
@@ -111,7 +111,7 @@ def fast_loops() -> dict[str, Any]:
     """
     import jax
 
-    return {_EMITTERS: True} if _has_emitters(jax.__version_info__) else {}
+    return {_EMITTERS: True} if _knows_flags(jax.__version_info__) else {}
 
 
 def quick_compile() -> dict[str, Any]:
@@ -126,7 +126,7 @@ def quick_compile() -> dict[str, Any]:
     return {_LEVEL: 1} if jax.default_backend() == "cpu" else {}
 
 
-def _has_emitters(version: tuple[int, ...]) -> bool:
+def _knows_flags(version: tuple[int, ...]) -> bool:
     # An unknown flag ends the process: only where it is known to exist.
     return (0, 10) <= version < (0, 11)
 

@@ -50,9 +50,10 @@ def read_excite_problem(config: Any) -> ExciteProblem:
     from easi_jax.errors import UserError
     from easi_jax.excite.candidates import LEAD, make_bench
     from easi_jax.excite.choose import check_names
-    from easi_jax.excite.drives import joint_name, limits_of, scalar_dofs
+    from easi_jax.excite.drives import limits_of, scalar_dofs
     from easi_jax.gap.own import own_space
     from easi_jax.io.parameter_file import read_parameter_file
+    from easi_jax.quantities import joint_name
     from train._gap_problem import read_model
 
     if not config.model:
@@ -60,7 +61,8 @@ def read_excite_problem(config: Any) -> ExciteProblem:
     _check_numbers(config, LEAD)
     check_names(config.effects)
     _check_out(config)
-    name, _, m = read_model(config.model)
+    model = read_model(config.model)
+    m = model.mj_model
     if not m.nu:
         raise UserError(f"{config.model}: the model has no actuator to excite")
     for kind, count, named in (
@@ -84,7 +86,7 @@ def read_excite_problem(config: Any) -> ExciteProblem:
     if config.rate is not None:
         dt = 1.0 / config.rate
     if dt is None:
-        dt = _built_in_step(config.model) or 1.0 / _RATE
+        dt = 1.0 / _RATE if model.env is None else float(model.env.dt)
     noise = _numbers("--noise", config.noise, of_joint, noise)
     speed = _numbers("--max-speed", config.max_speed, of_joint, np.full(m.nv, np.inf))
     default = np.full(m.nv, _TRAVEL[3])
@@ -108,7 +110,7 @@ def read_excite_problem(config: Any) -> ExciteProblem:
     bench, more = make_bench(m, limits, dt, rows, config.play)
     pairs, strengths = _from_gap(config, m, notes)
     return ExciteProblem(
-        name,
+        model.name,
         m,
         space,
         bench,
@@ -192,12 +194,6 @@ def _numbers(
     return out
 
 
-def _built_in_step(model: str) -> float | None:
-    from envs import REGISTRY, make
-
-    return float(make(model).dt) if model in REGISTRY else None
-
-
 def _from_data(config: Any, m: Any, notes: list[str]) -> tuple[Any, Any, Any]:
     """Control step, noise ``(nv,)`` and scales of earlier logs."""
     import numpy as np
@@ -231,6 +227,12 @@ def _from_gap(config: Any, m: Any, notes: list[str]) -> tuple[list[Any], Any]:
         raise UserError(f"{path}: not a gap.json of train.gap")
     pairs = []
     for effect in told["effects"]:
+        if not isinstance(effect, dict) or not {
+            "effect",
+            "at",
+            "indistinguishable",
+        } <= set(effect):
+            raise UserError(f"{path}: not a gap.json of train.gap")
         key = f"{effect['effect']}@{effect['at']}"
         pairs += [(key, other) for other in effect["indistinguishable"]]
     if not pairs:

@@ -66,7 +66,8 @@ def _keys(choice: Any) -> tuple[str, ...]:
 
 
 def _named(problem: Any, kind: str, values: Any) -> dict[str, float]:
-    from easi_jax.excite.drives import joint_name, scalar_dofs
+    from easi_jax.excite.drives import scalar_dofs
+    from easi_jax.quantities import joint_name
 
     m = problem.mj_model
     if kind == "actuator":
@@ -75,7 +76,8 @@ def _named(problem: Any, kind: str, values: Any) -> dict[str, float]:
 
 
 def _start(problem: Any) -> dict[str, float]:
-    from easi_jax.excite.drives import joint_name, scalar_dofs
+    from easi_jax.excite.drives import scalar_dofs
+    from easi_jax.quantities import joint_name
 
     m, start = problem.mj_model, problem.bench.start
     return {joint_name(m, j): float(start[q]) for j, (q, _) in scalar_dofs(m).items()}
@@ -94,7 +96,8 @@ def _limits(config: Any, problem: Any, best: Any) -> dict[str, Any]:
     """What was allowed, and what the model and the wrong ones reach."""
     import numpy as np
 
-    from easi_jax.excite.drives import joint_name, scalar_dofs
+    from easi_jax.excite.drives import scalar_dofs
+    from easi_jax.quantities import joint_name
 
     m, lim = problem.mj_model, problem.bench.limits
     q_all = np.concatenate([x.qpos for x in best.motions])

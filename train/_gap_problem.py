@@ -52,7 +52,8 @@ def read_gap_problem(config: Any) -> GapProblem:
 
     if not (math.isfinite(config.horizon) and config.horizon > 0):
         raise UserError(f"--horizon is {config.horizon:g}: give seconds above 0")
-    name, path, mj_model = read_model(config.model)
+    model = read_model(config.model)
+    mj_model = model.mj_model
     space = (
         own_space(mj_model)
         if config.parameters is None
@@ -62,8 +63,8 @@ def read_gap_problem(config: Any) -> GapProblem:
     late = velocity_lags(runs.recorded)
     joints = {int(d): mj_model.joint(j).name for j, d in enumerate(mj_model.jnt_dofadr)}
     return GapProblem(
-        name,
-        path,
+        model.name,
+        model.path,
         mj_model,
         space,
         runs.fit,
@@ -73,24 +74,39 @@ def read_gap_problem(config: Any) -> GapProblem:
         runs.noise,
         {joints[d]: lag for d, lag in late.items() if d in joints},
         [*runs.notes, *coverage_notes(mj_model, runs.fit, runs.held)],
-        beyond_mjcf(name) if path is None else {},
+        {} if model.env is None else beyond_mjcf(model.env.space),
     )
 
 
-def beyond_mjcf(robot: str) -> dict[str, float]:
+def beyond_mjcf(space: Any) -> dict[str, float]:
     """Nominal values of a built-in robot's parameters that MJCF has no word for."""
-    from envs import make
-
     return {
         address: p.nominal
-        for p in make(robot).space.parameters
+        for p in space.parameters
         for address in p.addresses
         if address.endswith(".speed_limit")
     }
 
 
-def read_model(text: str) -> tuple[str, Path | None, Any]:
-    """Name, path (None for a built-in robot) and compiled model.
+@dataclasses.dataclass(frozen=True)
+class GivenModel:
+    """What --model names.
+
+    Attributes:
+        name: of the model.
+        path: of its MJCF; None for a built-in robot.
+        mj_model: compiled.
+        env: the built-in robot; None for a file.
+    """
+
+    name: str
+    path: Path | None
+    mj_model: Any
+    env: Any
+
+
+def read_model(text: str) -> GivenModel:
+    """A built-in robot by its name, or an MJCF file.
 
     Raises:
         UserError: no such model.
@@ -100,9 +116,9 @@ def read_model(text: str) -> tuple[str, Path | None, Any]:
 
     if text in REGISTRY:
         env = make(text)
-        return text, None, env.mj_model
+        return GivenModel(text, None, env.mj_model, env)
     path = Path(text)
     mj_model = load_model(path)
     # The first of the model's names is its own.
     name = mj_model.names.split(b"\0", 1)[0].decode()
-    return name or path.stem, path, mj_model
+    return GivenModel(name or path.stem, path, mj_model, None)

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.errors import UserError
-from easi_jax.quantities import is_position_servo, is_velocity_servo
+from easi_jax.quantities import is_position_servo, is_velocity_servo, joint_name
 
 _ROOM = 0.15  # of a joint's range that a start needs on both sides
 _SLOWEST = 0.3  # Hz, what a velocity drive has to be able to sweep its travel with
@@ -57,11 +57,6 @@ def driven(m: mujoco.MjModel) -> dict[int, tuple[int, ...]]:
         if int(m.actuator_trntype[a]) in at_joint and m.jnt_type[j] >= 2:
             out[j] = (*out.get(j, ()), a)
     return out
-
-
-def joint_name(m: mujoco.MjModel, j: int) -> str:
-    """A joint's name, or its number."""
-    return m.joint(j).name or f"joint{j}"
 
 
 def limits_of(

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from easi_jax.quantities import is_scalar, joint_name, joint_unit
 from easi_jax.recording import Run
 from easi_jax.windows import fitted_velocity
 
@@ -33,10 +34,10 @@ def coverage_notes(
         for part in (fit, held)
     ]
     for j in range(m.njnt):
-        if m.jnt_type[j] < int(mujoco.mjtJoint.mjJNT_SLIDE):
+        if not is_scalar(m, j):
             continue
-        name, dof = m.joint(j).name or f"joint{j}", int(m.jnt_dofadr[j])
-        unit = "m/s" if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE else "rad/s"
+        name, dof = joint_name(m, j), int(m.jnt_dofadr[j])
+        unit = joint_unit("m/s", "rad/s")(m, j)
         mine, theirs = (np.concatenate([v[:, dof] for v in part]) for part in speeds)
         forth, back = np.maximum(mine, 0).sum(), np.maximum(-mine, 0).sum()
         if forth + back > 0 and min(forth, back) < _ONE_WAY * (forth + back):

@@ -8,6 +8,7 @@ import numpy as np
 
 from easi_jax.gap.predictor import WindowSet
 from easi_jax.gap.residuals import noise_rows
+from easi_jax.quantities import joint_name
 from easi_jax.recording import Run
 
 _VISIBLE = 5.0  # times the noise
@@ -62,7 +63,7 @@ def channels(
     joints, units, unbounded = [], [], np.zeros(nv, bool)
     for j in range(m.njnt):
         kind, d = int(m.jnt_type[j]), int(m.jnt_dofadr[j])
-        name = m.joint(j).name or f"joint{j}"
+        name = joint_name(m, j)
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             joints += [name] * 6
             units += ["m"] * 3 + ["rad"] * 3

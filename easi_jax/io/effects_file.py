@@ -16,15 +16,12 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import mujoco
-import numpy as np
 import yaml
 
-from easi_jax import effects
 from easi_jax.effects import Effects
 from easi_jax.errors import UserError, nearest
 from easi_jax.found_effects import EffectEntry, FoundEffects
-from easi_jax.gap.table import EFFECTS, object_id
+from easi_jax.gap.table import EFFECTS
 from easi_jax.io.files import atomic_write, to_plain
 from easi_jax.io.strict_yaml import read_yaml
 
@@ -150,31 +147,3 @@ def _number(path: str, where: str, value: Any) -> float:
     if not math.isfinite(value):
         raise UserError(f"{path}, {where}: {value} is not finite")
     return float(value)
-
-
-def effects_of(m: mujoco.MjModel, entries: Sequence[EffectEntry]) -> Effects:
-    """The effects of some entries in a model.
-
-    Raises:
-        UserError: a joint, actuator or body that the model lacks.
-    """
-    leaves: dict[str, np.ndarray] = {}
-    start = effects.none(m)
-    for e in entries:
-        for column, value in e.columns.items():
-            name, _, part = column.partition(".")
-            leaf = leaves.setdefault(name, np.array(getattr(start, name), float))
-            index: tuple[int, ...] = ()
-            if e.kind in _SIZED:
-                i = object_id(m, e.kind, e.at)
-                index = (int(m.jnt_dofadr[i]) if e.kind == "joint" else i,)
-            if part:
-                index = (*index, int(part))
-            if len(index) != leaf.ndim:
-                raise UserError(f'effect {e.effect} at "{e.at}": no column "{column}"')
-            leaf[index] = value
-    import jax.numpy as jnp
-
-    return start.replace(  # type: ignore[attr-defined]
-        **{k: jnp.asarray(v, jnp.float32) for k, v in leaves.items()}
-    )

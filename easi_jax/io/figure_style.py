@@ -7,7 +7,7 @@ of the common color vision deficiencies can tell apart.
 import io
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from typing import Any, ParamSpec
 
@@ -109,6 +109,32 @@ def _log_ticks(low: float, high: float) -> list[float]:
         if len(found) >= 3:
             return found[:: math.ceil(len(found) / 5)]
     return found if len(found) == 2 else np.linspace(low, high, 5)[1:-1:2].tolist()
+
+
+def labelled_map(
+    axis: Axes,
+    labels: Mapping[tuple[int, int], tuple[str, bool]],
+    rows: Sequence[str],
+    columns: Sequence[str],
+) -> None:
+    """Writes into an image what its cells hold.
+
+    Args:
+        labels: text and whether the cell is dark, by row and column.
+    """
+    for (i, j), (text, dark) in labels.items():
+        axis.text(
+            j,
+            i,
+            text,
+            ha="center",
+            va="center",
+            fontsize="small",
+            color="white" if dark else INK,
+        )
+    axis.set_xticks(range(len(columns)), columns, rotation=55, ha="right")
+    axis.set_yticks(range(len(rows)), rows)
+    axis.grid(visible=False)
 
 
 def legend_above(figure: Figure, handles: list[Any]) -> None:

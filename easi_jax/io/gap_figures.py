@@ -11,6 +11,7 @@ from easi_jax.io.figure_style import (
     INK,
     VERMILION,
     grid,
+    labelled_map,
     legend_above,
     styled,
     svg,
@@ -102,19 +103,11 @@ def residual_maps(
         axis.imshow(
             np.log10(shown), cmap="YlOrRd", vmin=0.0, vmax=np.log10(most), aspect="auto"
         )
-        for i, j in np.argwhere(np.isfinite(shown)).tolist():
-            dark = np.log10(shown[i, j]) > 0.6 * np.log10(most)
-            axis.text(
-                j,
-                i,
-                f"{shown[i, j]:.2g}",
-                ha="center",
-                va="center",
-                fontsize="small",
-                color="white" if dark else INK,
-            )
-        axis.set_xticks(range(len(conditions)), conditions, rotation=55, ha="right")
-        axis.set_yticks(range(len(joints)), list(joints))
+        dark = np.log10(shown) > 0.6 * np.log10(most)
+        labels = {
+            (i, j): (f"{shown[i, j]:.2g}", bool(dark[i, j]))
+            for i, j in np.argwhere(np.isfinite(shown)).tolist()
+        }
+        labelled_map(axis, labels, joints, conditions)
         axis.set_title(title)
-        axis.grid(visible=False)
     return svg(figure)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from easi_jax.errors import UserError
-from easi_jax.io.effects_file import effects_of, read_effects
+from easi_jax.found_effects import FoundEffects, machine_with
+from easi_jax.io.effects_file import read_effects
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
 from envs import make
@@ -77,7 +78,10 @@ def test_the_repaired_model_loads_and_has_it(case: Any, results: Path) -> None:
     added = m.dof_frictionloss[0] - old.dof_frictionloss[0]
     assert added == pytest.approx(torque, rel=1e-3)
     entries, own = read_effects(results / "effects.yaml")
-    np.testing.assert_allclose(effects_of(old, entries).coulomb, [torque], rtol=1e-5)
+    bare = Machine(old, ParameterSpace(()), 0.01)
+    machine = machine_with(bare, FoundEffects(tuple(entries)))
+    added = machine.model(jnp.asarray(machine.space.nominal)).effects.coulomb
+    np.testing.assert_allclose(added, [torque], rtol=1e-5)
     assert set(own) == {r["address"] for r in told["refitted"]}
 
 
@@ -178,9 +182,9 @@ def test_effects_files_are_checked(tmp_path: Path) -> None:
 def test_a_built_in_robot_keeps_what_its_xml_cannot_say() -> None:
     """Cartpole's cart has a speed limit; without it a gap would be found there."""
     env = make("cartpole")
-    fixed = beyond_mjcf("cartpole")
+    fixed = beyond_mjcf(make("cartpole").space)
     assert fixed == {"joint.cart.speed_limit": 0.6}
-    assert beyond_mjcf("ant") == {}
+    assert beyond_mjcf(make("ant").space) == {}
     machine = Machine(env.mj_model, ParameterSpace(()), env.dt, fixed=fixed)
     model = machine.model(jnp.zeros(0))
     np.testing.assert_allclose(model.speed_limit, env.model().speed_limit)
