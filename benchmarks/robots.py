@@ -47,6 +47,8 @@ class Config:
     """Demonstration trajectories."""
     segments: int = 32
     """Pieces that each individual replays in a recovery."""
+    pieces: int | None = None
+    """Pieces that the finish of a recovery fits; as in train.easi where not given."""
     population: int = 300
     """Individuals."""
     generations: int = 50
@@ -96,6 +98,7 @@ def _pipe(config: Config, env: Any, start: str = "within", **search: Any) -> Any
             search=preset("default", **search),
             trajectories=config.trajectories,
             refine=True,
+            refine_pieces=config.pieces,
         ),
         start=STARTS[start],
     )
