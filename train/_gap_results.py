@@ -56,13 +56,11 @@ def disagreement(run: str, times: float) -> str:
 
 def gap_json(problem: Any, analysis: Any, outcome: Any) -> dict[str, Any]:
     """The content of ``gap.json``, as the log format describes it."""
-    from easi_jax import effects
-    from easi_jax.gap.where import where
+    from easi_jax.gap.where import Conditions, where
 
-    c = outcome.channels
-    scalar = effects.scalar_joints(problem.mj_model)
+    c, m = outcome.channels, problem.mj_model
     last = outcome.after if outcome.found else outcome.refit
-    places = where(last.errors, outcome.held, analysis.runs, c, scalar)
+    places = where(last.errors, Conditions(m, outcome.held, analysis.runs), m, c)
     listed = [
         {
             "effect": f.place.effect,
@@ -361,20 +359,19 @@ def _residual_map(problem: Any, analysis: Any, o: Any) -> list[Any]:
     """A picture of where errors sit; none where no hinge or slide is compared."""
     import numpy as np
 
-    from easi_jax import effects
-    from easi_jax.gap.where import condition_errors
+    from easi_jax.gap.where import Conditions, condition_errors
     from easi_jax.io.gap_figures import residual_maps
     from easi_jax.io.report import Picture
+    from easi_jax.quantities import is_scalar
 
-    c = o.channels
-    scalar = effects.scalar_joints(problem.mj_model)
-    joints, names, before = condition_errors(
-        o.before.errors, o.held, analysis.runs, c, scalar
-    )
+    c, m = o.channels, problem.mj_model
+    found = Conditions(m, o.held, analysis.runs)
+    joints, names, before = condition_errors(o.before.errors, found, m, c)
     if not joints:
         return []
-    *_, after = condition_errors(o.after.errors, o.held, analysis.runs, c, scalar)
-    used = [d for _, d in scalar if np.isfinite(c.scale[d])]
+    *_, after = condition_errors(o.after.errors, found, m, c)
+    dofs = m.jnt_dofadr[[is_scalar(m, j) for j in range(m.njnt)]]
+    used = dofs[np.isfinite(c.scale[dofs])]
     floor = np.maximum(o.floor_si[used] / c.scale[used], 1e-12)
     return [
         Picture(

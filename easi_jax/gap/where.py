@@ -1,17 +1,21 @@
-"""Where and when a prediction error sits: which joint, and what it was doing."""
+"""Where and when a prediction error sits: which joint, and what was going on."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
+import mujoco
 import numpy as np
 
 from easi_jax.gap.measure import Channels
 from easi_jax.gap.predictor import WindowSet
+from easi_jax.quantities import is_scalar
 from easi_jax.recording import Run
 from easi_jax.windows import fitted_velocity
 
 _TELLING = 1.3  # times as much error as elsewhere
 _FEW = 8  # windows that a condition needs
+_NEAR = 0.05  # of a joint's range
 
 
 @dataclass(frozen=True)
@@ -31,51 +35,126 @@ class Where:
     ratio: float
 
 
-def conditions(
-    windows: WindowSet, runs: Sequence[Run], dof: int, qpos: int
-) -> dict[str, np.ndarray]:
-    """Windows in which something holds at a hinge or slide, ``(W,)`` bool each."""
-    speed = [fitted_velocity(r.qpos, r.dt, r.configuration)[:, dof] for r in runs]
-    steps = windows.ctrl.shape[1]
-    span = np.arange(steps + 1)
-    v = np.array(
-        [speed[r][row + span] for r, row in zip(windows.run, windows.row, strict=True)]
-    )
-    q = np.array(
-        [
-            runs[r].qpos[row + span, qpos]
-            for r, row in zip(windows.run, windows.row, strict=True)
-        ]
-    )
-    typical = np.sqrt(np.mean(v**2)) + 1e-12
-    fast, slow = v.max(1) > 0.1 * typical, v.min(1) < -0.1 * typical
-    mean = np.abs(v).mean(1)
-    middle = q.mean(1)
-    jump = np.abs(np.diff(windows.ctrl, axis=1)).max((1, 2))
-    return {
-        "speed changes sign": fast & slow,
-        "at high speed": mean > np.quantile(mean, 0.75),
-        "at low speed": mean < np.quantile(mean, 0.25),
-        "moving up": ~slow & fast,
-        "moving down": slow & ~fast,
-        "at large positions": middle > np.quantile(middle, 0.75),
-        "at small positions": middle < np.quantile(middle, 0.25),
-        "when the command jumps": jump > np.quantile(jump, 0.75),
-    }
+class Conditions:
+    """What was going on in windows: masks ``(W,)`` of bool by a condition in words.
+
+    Args:
+        m: the model that was recorded.
+        windows: of ``runs``.
+    """
+
+    def __init__(
+        self, m: mujoco.MjModel, windows: WindowSet, runs: Sequence[Run]
+    ) -> None:
+        self._m = m
+        self._windows = windows
+        self._runs = runs
+        self._at = windows.row[:, None] + np.arange(windows.ctrl.shape[1] + 1)
+
+    @cached_property
+    def _qpos(self) -> np.ndarray:
+        run = self._windows.run
+        return np.array(
+            [self._runs[r].qpos[at] for r, at in zip(run, self._at, strict=True)]
+        )
+
+    @cached_property
+    def _qvel(self) -> np.ndarray:
+        speed = [fitted_velocity(r.qpos, r.dt, r.configuration) for r in self._runs]
+        run = self._windows.run
+        return np.array([speed[r][at] for r, at in zip(run, self._at, strict=True)])
+
+    @cached_property
+    def general(self) -> dict[str, np.ndarray]:
+        """Those that hold for the whole machine."""
+        w = self._windows
+        length = np.array([len(self._runs[r]) for r in w.run])
+        out = {
+            "late in the recordings": w.row > length * (2 / 3),
+            "when the command jumps": _largest(self._jumps.max(1)),
+        }
+        if self._touching:
+            out["in contact"] = np.any([*self._touching.values()], axis=0)
+        return out
+
+    @cached_property
+    def named(self) -> dict[str, np.ndarray]:
+        """Those of one actuator or body."""
+        size = np.abs(self._windows.ctrl).mean(1)
+        out = {}
+        for a in range(self._m.nu):
+            name = self._m.actuator(a).name or f"actuator{a}"
+            out[f"when the command of {name} jumps"] = _largest(self._jumps[:, a])
+            out[f"at large commands of {name}"] = _largest(size[:, a])
+        for b, mask in self._touching.items():
+            out[f"with {self._m.body(b).name or f'body{b}'} in contact"] = mask
+        return out
+
+    def of_joint(self, j: int) -> dict[str, np.ndarray]:
+        """Those of a hinge or slide."""
+        m = self._m
+        q = self._qpos[..., m.jnt_qposadr[j]]
+        v = self._qvel[..., m.jnt_dofadr[j]]
+        typical = np.sqrt(np.mean(v**2)) + 1e-12
+        up, down = v.max(1) > 0.1 * typical, v.min(1) < -0.1 * typical
+        speed, middle = np.abs(v).mean(1), q.mean(1)
+        out = {
+            "speed changes sign": up & down,
+            "at high speed": _largest(speed),
+            "at low speed": _largest(-speed),
+            "moving up": up & ~down,
+            "moving down": down & ~up,
+            "at large positions": _largest(middle),
+            "at small positions": _largest(-middle),
+        }
+        if m.jnt_limited[j]:
+            low, high = m.jnt_range[j]
+            near = np.minimum(q - low, high - q).min(1) < _NEAR * (high - low)
+            out["near a limit"] = near
+        return out
+
+    @cached_property
+    def _jumps(self) -> np.ndarray:
+        """Largest change of each command, ``(W, nu)``."""
+        ctrl = self._windows.ctrl
+        if ctrl.shape[1] < 2:
+            return np.zeros((len(ctrl), ctrl.shape[2]))
+        return np.abs(np.diff(ctrl, axis=1)).max(1)
+
+    @cached_property
+    def _touching(self) -> dict[int, np.ndarray]:
+        """Windows in which a body touches something, by body."""
+        m, data = self._m, mujoco.MjData(self._m)
+        steps = self._at.shape[1] - 1
+        out: dict[int, np.ndarray] = {}
+        for w, positions in enumerate(self._qpos):
+            for k in sorted({0, steps // 2, steps}):
+                data.qpos[:] = positions[k]
+                mujoco.mj_fwdPosition(m, data)
+                geoms = data.contact.geom[data.contact.dist < 0]
+                for body in np.unique(m.geom_bodyid[geoms]).tolist():
+                    if m.body_weldid[body]:  # not the world
+                        mask = out.setdefault(body, np.zeros(len(self._qpos), bool))
+                        mask[w] = True
+        return dict(sorted(out.items()))
+
+
+def _largest(values: np.ndarray) -> np.ndarray:
+    """The largest quarter."""
+    return values > np.quantile(values, 0.75)
 
 
 def where(
-    errors: np.ndarray,
-    windows: WindowSet,
-    runs: Sequence[Run],
-    channels: Channels,
-    scalar: Sequence[tuple[int, int]],
+    errors: np.ndarray, found: Conditions, m: mujoco.MjModel, channels: Channels
 ) -> list[Where]:
     """Joints by their share of the squared gap, largest first.
 
+    Of the conditions under which a joint's error is much larger, the one is told that
+    is least likely chance (Welch's t).
+
     Args:
         errors: ``(W, H, nv)``.
-        scalar: places in qpos and qvel of hinges and slides.
+        found: conditions of these windows.
     """
     used = np.isfinite(channels.scale)
     square = np.mean(errors.astype(float) ** 2, 1)
@@ -83,54 +162,58 @@ def where(
     square[:, ~used] = 0.0
     total = max(square.sum(), 1e-300)
     out = []
-    place = {dof: q for q, dof in scalar}
+    scalar = {int(m.jnt_dofadr[j]): j for j in range(m.njnt) if is_scalar(m, j)}
     for joint in dict.fromkeys(channels.joints):
         dofs = [d for d, name in enumerate(channels.joints) if name == joint]
         mine = square[:, dofs].sum(1)
-        when, ratio = "throughout", 1.0
-        if len(dofs) == 1 and dofs[0] in place and mine.sum() > 0:
-            found = conditions(windows, runs, dofs[0], place[dofs[0]])
-            best = []
-            for text, mask in found.items():
-                if min(mask.sum(), (~mask).sum()) >= _FEW:
-                    best.append(
-                        (mine[mask].mean() / max(mine[~mask].mean(), 1e-300), text)
-                    )
-            if best and max(best)[0] > _TELLING:
-                ratio, when = max(best)
-        out.append(Where(joint, float(mine.sum() / total), when, float(ratio)))
+        when, ratio, surest = "throughout", 1.0, 0.0
+        masks = {**found.general, **found.named}
+        if dofs[0] in scalar:
+            masks = {**found.of_joint(scalar[dofs[0]]), **masks}
+        for text, mask in masks.items():
+            if min(mask.sum(), (~mask).sum()) < _FEW:
+                continue
+            there, elsewhere = mine[mask], mine[~mask]
+            times = there.mean() / max(elsewhere.mean(), 1e-300)
+            sure = _welch(there, elsewhere)
+            if times > _TELLING and sure > surest:
+                when, ratio, surest = text, float(times), sure
+        out.append(Where(joint, float(mine.sum() / total), when, ratio))
     return sorted(out, key=lambda w: -w.share)
 
 
+def _welch(a: np.ndarray, b: np.ndarray) -> float:
+    spread = a.var() / len(a) + b.var() / len(b)
+    return float((a.mean() - b.mean()) / np.sqrt(max(spread, 1e-300)))
+
+
 def condition_errors(
-    errors: np.ndarray,
-    windows: WindowSet,
-    runs: Sequence[Run],
-    channels: Channels,
-    scalar: Sequence[tuple[int, int]],
+    errors: np.ndarray, found: Conditions, m: mujoco.MjModel, channels: Channels
 ) -> tuple[list[str], list[str], np.ndarray]:
-    """RMS errors of joints under each condition, as shares of their motion.
+    """RMS errors of hinges and slides by condition, as shares of their motion.
 
     Args:
         errors: ``(W, H, nv)``.
-        scalar: places in qpos and qvel of hinges and slides.
+        found: conditions of these windows.
 
     Returns:
         Joints, conditions, and errors ``(joints, conditions)``, NaN where a condition
         holds in too few windows.
     """
     square = np.mean(errors.astype(float) ** 2, 1)
-    joints, rows = [], []
-    names = ["throughout"]
-    for q, dof in scalar:
-        if not np.isfinite(channels.scale[dof]):
+    joints: list[str] = []
+    rows: list[dict[str, float]] = []
+    for j in range(m.njnt):
+        dof = int(m.jnt_dofadr[j])
+        if not is_scalar(m, j) or not np.isfinite(channels.scale[dof]):
             continue
         mine = square[:, dof] / channels.scale[dof] ** 2
-        found = conditions(windows, runs, dof, q)
-        names = ["throughout", *found]
-        means = [mine.mean()]
-        for mask in found.values():
-            means.append(mine[mask].mean() if mask.sum() >= _FEW else np.nan)
+        everywhere = {"throughout": np.ones(len(mine), bool)}
+        masks = {**everywhere, **found.of_joint(j), **found.general}
         joints.append(channels.joints[dof])
-        rows.append(np.sqrt(means))
-    return joints, names, np.array(rows).reshape(len(joints), -1)
+        rows.append(
+            {t: float(mine[k].mean()) for t, k in masks.items() if k.sum() >= _FEW}
+        )
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    table = [[row.get(name, np.nan) for name in names] for row in rows]
+    return joints, names, np.sqrt(np.array(table).reshape(len(joints), -1))
