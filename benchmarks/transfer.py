@@ -13,7 +13,9 @@ also trains the policy. Curves by training step, as in Fig. 5, are in the report
 
 import dataclasses
 import time
+from pathlib import Path
 
+from benchmarks._common import RESULTS
 from train._command import main, say, show_table
 
 
@@ -39,6 +41,8 @@ class Config:
     """Demonstration trajectories."""
     episodes: int = 100
     """Episodes of each evaluation."""
+    folder: Path = RESULTS
+    """Where results are written."""
 
 
 def run(config: Config) -> None:
@@ -149,7 +153,8 @@ def run(config: Config) -> None:
             command_of(
                 "benchmarks.transfer", dataclasses.replace(config, factors=(factor,))
             ),
-            config,
+            {k: v for k, v in dataclasses.asdict(config).items() if k != "folder"},
+            folder=config.folder,
             robot=config.robot,
             changed=changed,
             target=dict(zip(env.space.names, theta.tolist(), strict=True)),

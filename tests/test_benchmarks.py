@@ -5,10 +5,12 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from benchmarks import gap_score, summary
+from benchmarks import gap_score, summary, transfer
 from benchmarks._common import RESULTS
+from envs import make
 from train._command import main
 
 
@@ -96,3 +98,30 @@ def test_wilson_interval() -> None:
     # R. G. Newcombe, Stat. Med. 17 (1998), table I
     assert gap_score.wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
     assert gap_score.wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3000)
+@pytest.mark.parametrize("robot", ["ant", "ballbalance", "go2"])
+def test_transfer_of_every_robot(robot: str, tmp_path: Path) -> None:
+    """Fig. 6 at its smallest: one target, two seeds, hardly any training."""
+    main(
+        transfer.Config,
+        transfer.run,
+        args=[
+            *("--robot", robot, "--seeds", "0", "1", "--factors", "0.5"),
+            *("--env-steps", "10240", "--generations", "2", "--population", "16"),
+            *("--trajectories", "4", "--episodes", "4", "--folder", str(tmp_path)),
+        ],
+        name="transfer",
+    )
+    (path,) = tmp_path.glob("transfer_*.json")
+    got = json.loads(path.read_text())
+    assert got["robot"] == robot and set(got["returns"]) == {"UDR", "EASI", "Oracle"}
+    for returns in got["returns"].values():
+        assert np.isfinite([*returns.values()]).all() and len(returns) == 2
+    nominal = make(robot).space.nominal
+    names = make(robot).space.names
+    half = 0.5 * nominal[names.index(got["changed"])]
+    assert got["target"][got["changed"]] == pytest.approx(half)
+    assert np.isfinite(got["changed_found"]).all()
