@@ -25,6 +25,8 @@ from easi_jax.gap.residuals import (
 )
 from easi_jax.gap.scales import scales_of
 from easi_jax.gap.selection import (
+    GOAL,
+    HELPS,
     Candidate,
     Model,
     Selector,
@@ -45,8 +47,8 @@ _MOST = 5  # effects
 _STAGES = 8  # of adding one and taking out what has become needless
 _RIPPLES = [0.75 * k for k in range(3, 27)]  # cycles over the range of a joint
 _CLOSED = 1.1  # times the floor: nothing left to explain
-_GOAL = 1.25
 _RIVALS = 8
+_UNLIKELY = 0.3  # probability of an effect beside which a rival replaces it
 _ROUNDING = 0.005  # of the gap
 _BEAM = 3  # sets of effects that are followed
 _DRAWS = 8  # of the noise of each held-out window
@@ -160,12 +162,9 @@ class Analysis:
             0.05 * rms,
             self.channels.scale,
         )
-        self.fit_floor = measure.gap(
-            measure.floor_squares(self.fit_windows, self.runs, slope, self.noise).mean(
-                0
-            ),
-            self.channels.scale,
-        )
+        floor = measure.floor_squares(self.fit_windows, self.runs, slope, self.noise)
+        self.fit_floor = float(measure.gap(floor.mean(0), self.channels.scale))
+        chosen.floor = self.fit_floor
         self.fit_gap = float(
             measure.gap(measure.squares(errors).mean(0), self.channels.scale)
         )
@@ -265,7 +264,8 @@ class Analysis:
             x = model.fit.x.copy()
             x[stuck] = self.predictor.neutral[stuck]
             model = self.select(self.selector.fit(model.places, x))
-        return self.measured(base, model, began)
+        model, rivals = self.exchanged(model)
+        return self.measured(base, model, rivals, began)
 
     def _stuck(self, model: Model) -> list[int]:
         """The model's own parameters that a refit moved to a bound."""
@@ -317,13 +317,13 @@ class Analysis:
                 if parent is not beam[0]:
                     parent = chosen.fit(parent.places, parent.fit.x)
                 for m in chosen.expanded(parent, self.candidates(parent.places)):
-                    key = frozenset(p.key for p in m.places)
+                    key = _keys(m)
                     if key not in found or m.loss.mean() < found[key].loss.mean():
                         found[key] = m
             tried = sorted(found.values(), key=rank)
             for m in tried[:4]:
                 self.tell(f"  {_named(m)} (without {_figures(model)})")
-            good = [m for m in tried if better(m, model)]
+            good = [m for m in tried if better(m, model, chosen.floor)]
             if not good:
                 break
             best = simplest(good, model)
@@ -351,7 +351,40 @@ class Analysis:
         out = chosen.fitted(kept, without.fit.x, short)
         return sorted(out, key=lambda m: m.loss.mean())
 
-    def measured(self, base: Model, model: Model, began: float) -> Outcome:
+    def exchanged(self, model: Model) -> tuple[Model, dict[str, list[Model]]]:
+        """The model with effects replaced by what does better in their place, and the
+        rivals of each effect, best first.
+
+        What was the best alone may not be the best beside what came later.
+        """
+        seen = {_keys(model)}
+        while True:
+            rivals = {p.key: self.rivals(model, p) for p in model.places}
+            swaps = []
+            for place in model.places:
+                mine = _last(model, place)
+                for rival in rivals[place.key][:_RIVALS]:
+                    p = probability(mine, rival)
+                    close = rank(rival) <= (1 + HELPS) * rank(mine)
+                    if p < _UNLIKELY and close and _keys(rival) not in seen:
+                        swaps.append((p, place, rival))
+            if not swaps:
+                return model, rivals
+            _, place, rival = min(swaps, key=lambda swap: swap[0])
+            new = rival.places[-1]
+            order = [new if p is place else p for p in model.places]
+            self.tell(f"{place.key} -> {new.key}: {_figures(rival)}")
+            self.whiten(rival.fit.x)
+            model = self.selector.fit(order, rival.fit.x)
+            seen.add(_keys(model))
+
+    def measured(
+        self,
+        base: Model,
+        model: Model,
+        rivals: Mapping[str, Sequence[Model]],
+        began: float,
+    ) -> Outcome:
         """Looks at the held-out data, once."""
         scale = self.channels.scale
         before = self.figures(self.predictor.neutral)
@@ -369,13 +402,10 @@ class Analysis:
                 for other in model.places[k + 1 :]:
                     x = self.selector.without(x, other, part)
                 figures = self.figures(self.selector.fit(part, x).fit.x)
-            rivals = self.rivals(model, place)
-            mine = replace(
-                model, places=[*[p for p in model.places if p is not place], place]
-            )
+            mine = _last(model, place)
             odds = 0.0
             same = []
-            for rival in rivals[:_RIVALS]:
+            for rival in rivals[place.key][:_RIVALS]:
                 p = probability(mine, rival)
                 odds += (1 - p) / max(p, 1e-6)
                 theirs = self.figures(rival.fit.x)
@@ -392,7 +422,7 @@ class Analysis:
                 )
             )
         floor_gap = float(measure.gap(floor, scale))
-        goal = _GOAL * floor_gap
+        goal = GOAL * floor_gap
         if refit.gap <= goal:
             verdict = "no_gap"
         elif found and after.interval[1] <= goal:
@@ -497,6 +527,15 @@ def _spread(count: int, most: int) -> np.ndarray:
     if count <= most:
         return np.arange(count)
     return np.unique(np.linspace(0, count - 1, most).round().astype(int))
+
+
+def _keys(model: Model) -> frozenset[str]:
+    return frozenset(p.key for p in model.places)
+
+
+def _last(model: Model, place: Place) -> Model:
+    """The model with one of its effects as the last."""
+    return replace(model, places=[*[p for p in model.places if p is not place], place])
 
 
 def _figures(model: Model) -> str:

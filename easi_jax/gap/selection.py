@@ -28,8 +28,10 @@ _STARTS = 2  # of each
 _HOPELESS = 4.0  # times the best promise; beyond, only the first few are fitted
 _SURE = 1.7  # standard errors by which an effect has to help
 _LIKELY = 1.0  # by either measure
-_HELPS = 0.05  # share of the squared gap by which each of its numbers has to help
+HELPS = 0.05  # share of the squared gap by which each of its numbers has to help
 _LARGE = 0.3
+GOAL = 1.25  # times the floor: a gap that is as good as closed
+_CLOSER = 3.0  # times as much has to be gained where it is
 _TINY = 1e-300
 _RARE = 0.1  # relative loss by which a rare effect has to be better than others
 _ALIKE = 0.02  # relative difference of losses that says nothing
@@ -72,7 +74,8 @@ class Model:
 class Selector:
     """Fits sets of effects to some windows.
 
-    Its ``residuals`` have to be set before it fits.
+    Its ``residuals`` have to be set before it fits, and ``floor``, the gap of a perfect
+    model, before it chooses.
 
     Args:
         predictor: predictions.
@@ -94,6 +97,7 @@ class Selector:
     ) -> None:
         self.predictor = predictor
         self.residuals: Residuals
+        self.floor = 0.0
         self.blocks, self.count, self.bounds = blocks, count, bounds
         self.group, self.own = group, tuple(own)
         self.weight = np.ones(count)
@@ -251,7 +255,7 @@ class Selector:
             kept = [p for p in model.places if p is not place]
             found = self.fitted(kept, model.fit.x, more)
             best = min(found, key=lambda m: m.loss.mean())
-            if better(best, model):
+            if better(best, model, self.floor):
                 order = [best.places[-1] if p is place else p for p in model.places]
                 model = replace(best, places=order)
         return model
@@ -264,7 +268,7 @@ class Selector:
                 kept = [p for p in model.places if p is not place]
                 shorter.append(self.fit(kept, self.without(model.fit.x, place, kept)))
             best = min(shorter, key=lambda m: m.loss.mean())
-            if better(model, best):
+            if better(model, best, self.floor):
                 break
             model = best
         return model
@@ -327,7 +331,7 @@ def rank(model: Model) -> float:
     return float(model.loss.mean()) * (1.0 + _RARE * rare)
 
 
-def better(model: Model, base: Model) -> bool:
+def better(model: Model, base: Model, floor: float) -> bool:
     """Whether a model predicts better than a smaller one by more than chance.
 
     Losses are compared in units of the noise and of the gap. On average over both the
@@ -336,8 +340,15 @@ def better(model: Model, base: Model) -> bool:
     rarely have, both have to be sure, and twice as large, since such effects mend a
     little of everything. A large gain may also be sure by its ratios: where a few
     blocks hold most of the error, differences scatter as much as they are large.
+    Where the gap is all but closed, small gains count for nothing: no machine quite
+    follows any physics.
+
+    Args:
+        floor: the gap of a perfect model.
     """
-    helps = _HELPS * max(1, len(model.fit.active) - len(base.fit.active))
+    helps = HELPS * max(1, len(model.fit.active) - len(base.fit.active))
+    if base.gap.mean() < (GOAL * floor) ** 2:
+        helps *= _CLOSER
     known = {p.key for p in base.places}
     rare = any(p.effect in RARE for p in model.places if p.key not in known)
     both = ((model.loss, base.loss), (model.gap, base.gap))
@@ -392,7 +403,7 @@ def simplest(models: Sequence[Model], base: Model) -> Model:
             if base.loss.mean() - m.loss.mean() > _NEARLY * whole:
                 best = m
         elif len(m.fit.active) < len(best.fit.active):
-            close = m.loss.mean() < (1 + _HELPS) * best.loss.mean()
+            close = m.loss.mean() < (1 + HELPS) * best.loss.mean()
             if close and advantage(best.loss, m.loss) < _AS_GOOD:
                 best = m
     return best

@@ -335,10 +335,15 @@ def test_rare_effects_have_to_help_by_either_measure(
     base = fitted(10.0, 10.0, "coulomb_friction")
     for name, usual in (("viscous_damping", True), ("quadratic_drag", False)):
         both = ("coulomb_friction", name)
-        assert better(fitted(6.0, 9.8, *both), base) == usual, name
-        assert better(fitted(6.0, 6.0, *both), base), name
-        assert not better(fitted(6.0, 10.2, *both), base), name
-        assert not better(fitted(9.9, 9.9, *both), base), name
+        assert better(fitted(6.0, 9.8, *both), base, 0.1) == usual, name
+        assert better(fitted(6.0, 6.0, *both), base, 0.1), name
+        assert not better(fitted(6.0, 10.2, *both), base, 0.1), name
+        assert not better(fitted(9.9, 9.9, *both), base, 0.1), name
+    # A gap of sqrt(10) is 3.16.
+    both = ("coulomb_friction", "viscous_damping")
+    small, large = fitted(9.8, 9.0, *both), fitted(9.0, 8.0, *both)
+    assert better(small, base, 2.0) and not better(small, base, 3.0)
+    assert better(large, base, 3.0)
 
 
 def test_what_is_contained_comes_first_where_nearly_as_good(
