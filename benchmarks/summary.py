@@ -144,6 +144,30 @@ def _physics(folder: Path) -> list[str]:
         ),
         "Other ways to run a step that were tried (ratio to native):",
         markdown_table(("robot", "step", "ratio", "trace and compile"), tried),
+        *_accuracy(folder),
+    ]
+
+
+def _accuracy(folder: Path) -> list[str]:
+    """What solver and time step of each robot cost in accuracy."""
+    rows, head = [], ()
+    for name in GOALS:
+        r = _read(folder, f"accuracy_{name}")
+        if r is None:
+            continue
+        head = ("robot", "compared", *(f"{s} % of models" for s in r["percentiles"]))
+        used = f"{r['used']} Newton steps"
+        for what, by_time in r["difference"].items():
+            label = f"**{what}**, as used" if what == used else what
+            rows.append((name, label, *(f"{x:.1e}" for x in by_time[-1])))
+    if not rows:
+        return []
+    return [
+        "`python -m benchmarks.accuracy`: largest difference of a position [m, rad] "
+        "after 0.2 s of random commands, over random models: Newton steps of the "
+        "contact solver against a converged one, and beside it what a quarter of the "
+        "time step would change:",
+        markdown_table(head, rows),
     ]
 
 
