@@ -36,7 +36,16 @@ def run(config: Config) -> None:
 
     parts = ["# Results", "Made by `python -m benchmarks.summary` from the files here."]
     for section in (
-        *(_speed, _physics, _robots, _policies, _recovery, _transfer, _real),
+        *(
+            _speed,
+            _physics,
+            _robots,
+            _own_robot,
+            _policies,
+            _recovery,
+            _transfer,
+            _real,
+        ),
         *(gap_summary.generated, gap_summary.real, gap_summary.loop),
     ):
         parts += section(config.results)
@@ -264,6 +273,24 @@ def _robots(folder: Path) -> list[str]:
     if missing:
         out.append(f"Not run: {', '.join(missing)}.")
     return out
+
+
+def _own_robot(folder: Path) -> list[str]:
+    """The README's example of a robot of one's own."""
+    r = _read(folder, "own_robot")
+    if r is None:
+        return []
+    errors = [abs(r["found"][k] / r["truth"][k] - 1) for k in r["truth"]]
+    held = r["held_out"]
+    after = " and ".join(f"{x:.5f}" for x in held["after"]["0"])
+    before = " and ".join(f"{x:.3f}" for x in held["before"])
+    return [
+        "## A robot of one's own",
+        f"`{r['command']}`, the README's arm with nothing cached: {r['seconds']:.0f} s "
+        f"(goal {r['goal_s']} s, {_met(r['seconds'] < r['goal_s'])}). "
+        f"{len(errors)} parameters within {100 * max(errors):.1f} % of the truth; "
+        f"held-out error {after} rad, {before} rad in the model as given.",
+    ]
 
 
 def _policies(folder: Path) -> list[str]:

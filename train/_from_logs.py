@@ -121,6 +121,7 @@ def _finish(
     from easi_jax.information import shift_start
     from easi_jax.log_data import misfit_of, outlier_weights, segments_from_runs
     from easi_jax.segments import to_device
+    from train._stages import placed
 
     machine, space = problem.machine, search.space
     steps = max(problem.steps, round(FINISH / machine.dt))
@@ -160,7 +161,8 @@ def _finish(
         misfit, weighed, center = hidden, pieces, mean
         for k in range(_PASSES):
             robust = 0 if k else _ROBUST
-            found, error = finish(center, cov, weighed, misfit, robust)
+            given = placed((center, cov, weighed, misfit, robust))
+            found, error = finish(*given)
             misfit = jnp.maximum(misfit_of(error, assumed, weighed.weight), hidden)
             weight = outlier_weights(error, assumed, misfit, _OUTLIER)
             weighed = replace(pieces, weight=pieces.weight * weight)

@@ -39,14 +39,9 @@ def run_stage(
             before the checkpoint is written.
     """
     import jax
-    from jax.sharding import NamedSharding, PartitionSpec
 
     from easi_jax.io import checkpoints
-    from easi_jax.mesh import make_mesh
 
-    # One placement whether a state is fresh, restored or came out of a chunk: every
-    # chunk runs the same compiled program, so a resumed run ends bit-equal.
-    everywhere = NamedSharding(make_mesh(), PartitionSpec())
     folder = run.checkpoints / name
     found = checkpoints.restore(
         folder, jax.eval_shape(init), config_hash=run.config_hash
@@ -58,14 +53,15 @@ def run_stage(
         if notes is not None:
             notes.extend(found.notes)
             notes.append(f"{name}: went on after step {done}")
-    state = jax.device_put(state, everywhere)
+    # Every chunk runs the same compiled program, so a resumed run ends bit-equal.
+    state = placed(state)
     if run.resumed:
         run.rewind(name, done)
     with progress(name, total, done) as meter:
         while done < total:
             n = min(chunk, total - done)
             state, info = advance(state, n)
-            state = jax.device_put(state, everywhere)
+            state = placed(state)
             info = jax.device_get(info)
             if check is not None:
                 check(done, info)
@@ -78,6 +74,26 @@ def run_stage(
             shown = {k: v for k, v in last.items() if "/" not in k}
             meter.advance(n, **shown)
     return state
+
+
+def placed(tree: Any) -> Any:
+    """Arrays on every device, of types of their own, wherever they came from.
+
+    A compiled program is found again only where both are the same, so without this the
+    second call of a loop that feeds on its results compiles anew.
+    """
+    import jax
+    import jax.numpy as jnp
+    from jax.sharding import NamedSharding, PartitionSpec
+
+    from easi_jax.mesh import make_mesh
+
+    def strong(x: Any) -> Any:
+        x = jnp.asarray(x)
+        return x.astype(x.dtype) if jnp.issubdtype(x.dtype, jnp.number) else x
+
+    everywhere = NamedSharding(make_mesh(), PartitionSpec())
+    return jax.device_put(jax.tree.map(strong, tree), everywhere)
 
 
 def training_rows(seeds: Sequence[int], per_step: int) -> Callable[[int, Any], Rows]:
@@ -190,7 +206,11 @@ def jit_chunks(fun: Callable[..., Any], fast: bool = False) -> Callable[..., Any
     def call(*args: Any) -> Any:
         *arrays, n = args
         if n not in compiled:
-            compiled[n] = jax.jit(lambda *a: fun(*a, n), compiler_options=options)
+
+            def advance(*a: Any) -> Any:
+                return fun(*a, n)
+
+            compiled[n] = jax.jit(advance, compiler_options=options)
         return compiled[n](*arrays)
 
     return call

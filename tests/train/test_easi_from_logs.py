@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -76,11 +77,23 @@ def edit(path: Path, old: str, new: str) -> None:
 # -- the example ------------------------------------------------------------------
 
 
+COMPILED: list[str] = []
+
+
+def note_compilation(event: str, duration_secs: float, **more: object) -> None:
+    if event.endswith("backend_compile_duration"):
+        COMPILED.append(str(more.get("fun_name")))
+
+
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The example's command, with a small search."""
+    """The example's command, with a small search in two chunks."""
     out = tmp_path_factory.mktemp("arm") / "run"
+    jax.monitoring.register_event_duration_secs_listener(note_compilation)
+    COMPILED.clear()
     call(
+        "--search-chunk",
+        1,
         "--model",
         EXAMPLE / "model.xml",
         "--parameters",
@@ -115,6 +128,11 @@ def test_example_finds_its_truth(arm):
         # The model's timestep alone moves the rotor inertia by 7 % (README).
         tolerance = 0.09 if name == "rotor_inertia" else 0.05
         assert mean == pytest.approx(wanted[name], rel=tolerance), name
+
+
+def test_every_program_is_compiled_once(arm):
+    assert COMPILED.count("jit(finish)") == 1
+    assert COMPILED.count("jit(advance)") == 1
 
 
 def test_example_reports_held_out_error(arm):

@@ -80,8 +80,9 @@ def test_the_repaired_model_loads_and_has_it(case: Any, results: Path) -> None:
     entries, own = read_effects(results / "effects.yaml")
     bare = Machine(old, ParameterSpace(()), 0.01)
     machine = machine_with(bare, FoundEffects(tuple(entries)))
-    added = machine.model(jnp.asarray(machine.space.nominal)).effects.coulomb
-    np.testing.assert_allclose(added, [torque], rtol=1e-5)
+    effects = machine.model(jnp.asarray(machine.space.nominal)).effects
+    assert effects is not None
+    np.testing.assert_allclose(effects.coulomb, [torque], rtol=1e-5)
     assert set(own) == {r["address"] for r in told["refitted"]}
 
 

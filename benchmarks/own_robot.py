@@ -1,0 +1,84 @@
+"""The README's robot of the user's own: the command as it stands, nothing cached.
+
+python -m benchmarks.own_robot
+"""
+
+import dataclasses
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from train._command import main, say
+
+EXAMPLE = Path("examples/lift_arm")
+ROOT = Path(__file__).parents[1]
+GOAL = 120  # s
+_LIMIT = 1200  # s
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Times the identification of the example arm from a first start."""
+
+
+def run(config: Config) -> None:
+    """Runs the command in a process and a compilation cache of its own."""
+    from benchmarks._common import command_of, write_result
+
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        words = [
+            *(sys.executable, "-m", "train.easi"),
+            *("--model", str(EXAMPLE / "model.xml")),
+            *("--parameters", str(EXAMPLE / "parameters.yaml")),
+            *("--data", str(EXAMPLE / "sweep.csv")),
+            *("--held-out", str(EXAMPLE / "moves.csv")),
+            *("--out", str(out)),
+        ]
+        begin = time.monotonic()
+        subprocess.run(
+            words,
+            cwd=ROOT,
+            env={**os.environ, "JAX_COMPILATION_CACHE_DIR": f"{folder}/cache"},
+            stdout=subprocess.DEVNULL,
+            timeout=_LIMIT,
+            check=True,
+        )
+        seconds = time.monotonic() - begin
+        found = json.loads((out / "distribution.json").read_text())
+    truth = _truth()
+    first = found["seeds"]["0"]
+    names = [p["name"] for p in found["parameters"]]
+    values = dict(zip(names, first["mean"], strict=True))
+    path = write_result(
+        "own_robot",
+        command_of("benchmarks.own_robot", config),
+        config,
+        seconds=seconds,
+        goal_s=GOAL,
+        found=values,
+        truth=truth,
+        flags=dict(zip(names, first["flags"], strict=True)),
+        held_out=found["held_out"],
+    )
+    say(f"{seconds:.0f} s; written: {path}")
+
+
+def _truth() -> dict[str, float]:
+    spec = importlib.util.spec_from_file_location(
+        "make_log", ROOT / EXAMPLE / "make_log.py"
+    )
+    assert spec is not None and spec.loader is not None
+    module: Any = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return dict(module.TRUTH)
+
+
+if __name__ == "__main__":
+    main(Config, run, name="benchmarks.own_robot")
