@@ -12,7 +12,8 @@ pytestmark = pytest.mark.timeout(900)
 USUAL = (("single", 1), ("none", 1))
 MORE = (
     *(("single", 2), ("single", 3), ("none", 2)),
-    *(("pair", 1), ("wrong_own", 1), ("outside", 1)),
+    # In the second pair the mass looks like a center of mass until the spring is in.
+    *(("pair", 1), ("pair", 2001), ("wrong_own", 1), ("outside", 1)),
 )
 
 
