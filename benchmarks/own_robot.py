@@ -1,18 +1,19 @@
 """The README's robot of the user's own: the command as it stands, nothing cached.
 
-python -m benchmarks.own_robot
+    python -m benchmarks.own_robot
+
+Minutes; results go to ``benchmarks/results/own_robot.json``.
 """
 
 import dataclasses
-import importlib.util
 import json
 import os
+import runpy
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 from train._command import main, say
 
@@ -52,7 +53,7 @@ def run(config: Config) -> None:
         )
         seconds = time.monotonic() - begin
         found = json.loads((out / "distribution.json").read_text())
-    truth = _truth()
+    truth = runpy.run_path(str(ROOT / EXAMPLE / "make_log.py"))["TRUTH"]
     first = found["seeds"]["0"]
     names = [p["name"] for p in found["parameters"]]
     values = dict(zip(names, first["mean"], strict=True))
@@ -68,16 +69,6 @@ def run(config: Config) -> None:
         held_out=found["held_out"],
     )
     say(f"{seconds:.0f} s; written: {path}")
-
-
-def _truth() -> dict[str, float]:
-    spec = importlib.util.spec_from_file_location(
-        "make_log", ROOT / EXAMPLE / "make_log.py"
-    )
-    assert spec is not None and spec.loader is not None
-    module: Any = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return dict(module.TRUTH)
 
 
 if __name__ == "__main__":

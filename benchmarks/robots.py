@@ -200,12 +200,7 @@ def _memory(config: Config, env: Any, saved: Any, label: str) -> None:
     keys, policies, demos = _demonstrations(pipe, saved, config.seeds[:1])
     compiled, state, _ = _searched(pipe, demos, keys, policies)
     jax.block_until_ready(compiled(state, demos, policies))
-    _write_peak(
-        config,
-        env,
-        f"memory_{label}",
-        f"search, population {population}",
-    )
+    _write_peak(config, env, f"memory_{label}", f"search, population {population}")
 
 
 def _buffer(config: Config, env: Any, label: str) -> None:

@@ -23,6 +23,7 @@ from easi_jax.quantities import (
     joint_unit,
     linear_drive,
     open_force_limit,
+    scalar_only,
 )
 
 _INF = float("inf")
@@ -59,10 +60,6 @@ def _whole(field: str, *index: int) -> Callable[[Any, int], tuple[Entry, ...]]:
     return lambda m, i: (Entry(f"effects.{field}", index),)
 
 
-def _scalar(m: Any, j: int) -> str | None:
-    return None if is_scalar(m, j) else "only hinge and slide joints have one"
-
-
 def _seed_dry(m: Any, j: int) -> None:
     d = int(m.jnt_dofadr[j])
     m.dof_frictionloss[d] = max(m.dof_frictionloss[d], SEED)
@@ -95,7 +92,7 @@ def _joint(
     low: Callable[[Any, int], float] | float = 0.0,
     neutral: float = 0.0,
     open: Callable[[Any, int], None] = lambda m, j: None,
-    refuse: Callable[[Any, int], str | None] = _scalar,
+    refuse: Callable[[Any, int], str | None] = scalar_only,
 ) -> EffectQuantity:
     return EffectQuantity(
         _dof(field),
@@ -110,7 +107,7 @@ def _joint(
 
 
 def _geared(m: Any, j: int) -> str | None:
-    if _scalar(m, j) is None and int(m.jnt_dofadr[j]) in geared(m):
+    if is_scalar(m, j) and int(m.jnt_dofadr[j]) in geared(m):
         return None
     return "only joints that an actuator turns directly have play"
 

@@ -439,12 +439,3 @@ def reading(
     between = (2 * s3 - 3 * s2 + 1) * a + (s3 - 2 * s2 + s) * va
     between += (3 * s2 - 2 * s3) * b + (s3 - s2) * vb
     return jnp.where(when < 0, before[1:], between + e.bias)
-
-
-def scalar_joints(m: Any) -> tuple[tuple[int, int], ...]:
-    """(place in qpos, place in qvel) of every hinge and slide."""
-    return tuple(
-        (int(q), int(v))
-        for kind, q, v in zip(m.jnt_type, m.jnt_qposadr, m.jnt_dofadr, strict=True)
-        if kind >= 2
-    )

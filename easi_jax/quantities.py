@@ -115,9 +115,28 @@ def is_scalar(m: Any, j: int) -> bool:
     return int(m.jnt_type[j]) in (int(_Joint.mjJNT_HINGE), int(_Joint.mjJNT_SLIDE))
 
 
+def scalar_dofs(m: Any) -> dict[int, tuple[int, int]]:
+    """(place in qpos, place in qvel) of hinges and slides, by joint."""
+    return {
+        j: (int(m.jnt_qposadr[j]), int(m.jnt_dofadr[j]))
+        for j in range(m.njnt)
+        if is_scalar(m, j)
+    }
+
+
 def joint_name(m: Any, j: int) -> str:
     """A joint's name, or its number."""
     return m.joint(j).name or f"joint{j}"
+
+
+def actuator_name(m: Any, a: int) -> str:
+    """An actuator's name, or its number."""
+    return m.actuator(a).name or f"actuator{a}"
+
+
+def body_name(m: Any, b: int) -> str:
+    """A body's name, or its number."""
+    return m.body(b).name or f"body{b}"
 
 
 def joint_unit(linear: str, angular: str) -> Callable[[Any, int], str]:
@@ -129,7 +148,8 @@ def joint_unit(linear: str, angular: str) -> Callable[[Any, int], str]:
     return unit
 
 
-def _scalar_only(m: Any, j: int) -> str | None:
+def scalar_only(m: Any, j: int) -> str | None:
+    """Why a joint that is no hinge or slide has no such value, or None."""
     return None if is_scalar(m, j) else "only hinge and slide joints have one"
 
 
@@ -478,12 +498,12 @@ TABLE: dict[str, dict[str, Quantity]] = {
             lambda m, j: (Entry("qpos_spring", (int(m.jnt_qposadr[j]),)),),
             joint_unit("m", "rad"),
             low=-_INF,
-            refuse=lambda m, j: _scalar_only(m, j) or _passive(m, j),
+            refuse=lambda m, j: scalar_only(m, j) or _passive(m, j),
         ),
         "speed_limit": Quantity(
             _dof_entries("speed_limit"),
             joint_unit("m/s", "rad/s"),
-            refuse=_scalar_only,
+            refuse=scalar_only,
         ),
     },
     "actuator": {

@@ -8,6 +8,7 @@ from typing import Any
 _NOISE = 1e-3  # rad, m
 _TRAVEL = {2: 0.5, 3: math.pi}  # m for slides, rad for hinges
 _RATE = 100.0  # Hz
+_TOLD = {"effect", "at", "indistinguishable"}  # of each effect in a gap.json
 
 
 @dataclasses.dataclass(frozen=True)
@@ -227,11 +228,7 @@ def _from_gap(config: Any, m: Any, notes: list[str]) -> tuple[list[Any], Any]:
         raise UserError(f"{path}: not a gap.json of train.gap")
     pairs = []
     for effect in told["effects"]:
-        if not isinstance(effect, dict) or not {
-            "effect",
-            "at",
-            "indistinguishable",
-        } <= set(effect):
+        if not isinstance(effect, dict) or not _TOLD.issubset(effect):
             raise UserError(f"{path}: not a gap.json of train.gap")
         key = f"{effect['effect']}@{effect['at']}"
         pairs += [(key, other) for other in effect["indistinguishable"]]

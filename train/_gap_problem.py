@@ -7,25 +7,42 @@ from typing import Any
 
 
 @dataclasses.dataclass(frozen=True)
-class GapProblem:
-    """A model and its measured motion.
+class GivenModel:
+    """What --model names.
 
     Attributes:
         name: of the model.
         path: of its MJCF; None for a built-in robot.
         mj_model: compiled.
+        env: the built-in robot; None for a file.
+    """
+
+    name: str
+    path: Path | None
+    mj_model: Any
+    env: Any
+
+    @property
+    def fixed(self) -> dict[str, float]:
+        """What a built-in robot has and MJCF cannot say, by address."""
+        return {} if self.env is None else beyond_mjcf(self.env.space)
+
+
+@dataclasses.dataclass(frozen=True)
+class GapProblem:
+    """A model and its measured motion.
+
+    Attributes:
+        model: as --model names it.
         space: its own parameters that may be refitted.
         fit, held: runs.
         held_name, held_names: which data are held out.
         noise: of positions and velocities, ``(2 nv,)``.
         late: joints whose measured velocity lags its position (`velocities.Lag`).
         notes: what the user should know of the data.
-        fixed: what a built-in robot has and MJCF cannot say, by address.
     """
 
-    name: str
-    path: Path | None
-    mj_model: Any
+    model: GivenModel
     space: Any
     fit: list[Any]
     held: list[Any]
@@ -34,7 +51,6 @@ class GapProblem:
     noise: Any
     late: dict[str, Any]
     notes: list[str]
-    fixed: dict[str, float]
 
 
 def read_gap_problem(config: Any) -> GapProblem:
@@ -63,9 +79,7 @@ def read_gap_problem(config: Any) -> GapProblem:
     late = velocity_lags(runs.recorded)
     joints = {int(d): mj_model.joint(j).name for j, d in enumerate(mj_model.jnt_dofadr)}
     return GapProblem(
-        model.name,
-        model.path,
-        mj_model,
+        model,
         space,
         runs.fit,
         runs.held,
@@ -74,7 +88,6 @@ def read_gap_problem(config: Any) -> GapProblem:
         runs.noise,
         {joints[d]: lag for d, lag in late.items() if d in joints},
         [*runs.notes, *coverage_notes(mj_model, runs.fit, runs.held)],
-        {} if model.env is None else beyond_mjcf(model.env.space),
     )
 
 
@@ -86,23 +99,6 @@ def beyond_mjcf(space: Any) -> dict[str, float]:
         for address in p.addresses
         if address.endswith(".speed_limit")
     }
-
-
-@dataclasses.dataclass(frozen=True)
-class GivenModel:
-    """What --model names.
-
-    Attributes:
-        name: of the model.
-        path: of its MJCF; None for a built-in robot.
-        mj_model: compiled.
-        env: the built-in robot; None for a file.
-    """
-
-    name: str
-    path: Path | None
-    mj_model: Any
-    env: Any
 
 
 def read_model(text: str) -> GivenModel:

@@ -54,13 +54,13 @@ def disagreement(run: str, times: float) -> str:
     )
 
 
-def gap_json(problem: Any, analysis: Any, outcome: Any) -> dict[str, Any]:
+def gap_json(problem: Any, outcome: Any) -> dict[str, Any]:
     """The content of ``gap.json``, as the log format describes it."""
-    from easi_jax.gap.where import Conditions, where
+    from easi_jax.gap.where import where
 
-    c, m = outcome.channels, problem.mj_model
+    c, m = outcome.channels, problem.model.mj_model
     last = outcome.after if outcome.found else outcome.refit
-    places = where(last.errors, Conditions(m, outcome.held, analysis.runs), m, c)
+    places = where(last.errors, outcome.conditions, m, c)
     listed = [
         {
             "effect": f.place.effect,
@@ -157,22 +157,22 @@ def write_results(
     shown = [{k: v for k, (v, _, _) in f.values.items()} for f in outcome.found]
     write_effects(
         folder.path / "effects.yaml",
-        str(problem.path or problem.name),
+        str(problem.model.path or problem.model.name),
         entries,
         shown,
         outcome.refitted,
     )
     own = {r["address"]: r["to"] for r in outcome.refitted}
     left: list[str] = []
-    if problem.path is not None:
-        xml, left = repaired_xml(problem.path, entries, own)
+    if problem.model.path is not None:
+        xml, left = repaired_xml(problem.model.path, entries, own)
         folder.write("model.xml", xml)
-    content = gap_json(problem, analysis, outcome)
+    content = gap_json(problem, outcome)
     content["not_in_model_xml"] = left
     if retrained is not None:
         content["retrained"] = retrained
     folder.write_json("gap.json", content)
-    return _report(folder, config, problem, analysis, outcome, content)
+    return _report(folder, config, problem, outcome, content)
 
 
 def retrained_line(retrained: dict[str, Any]) -> str:
@@ -197,9 +197,7 @@ def column_name(column: Any) -> str:
     return column.field
 
 
-def _report(
-    folder: Any, config: Any, problem: Any, analysis: Any, o: Any, content: Any
-) -> Path:
+def _report(folder: Any, config: Any, problem: Any, o: Any, content: Any) -> Path:
     import numpy as np
 
     from easi_jax.io.gap_figures import gap_steps, traces
@@ -260,7 +258,7 @@ def _report(
             "interval.",
         )
     )
-    pictures += _residual_map(problem, analysis, o)
+    pictures += _residual_map(problem, o)
     used = np.flatnonzero(np.isfinite(c.scale))[:6]
     w = _telling(o)
     measured, before, after = _traces(problem, o, w)
@@ -342,7 +340,7 @@ def _report(
     write_report(
         path,
         Report(
-            title=f"The gap of {problem.name}",
+            title=f"The gap of {problem.model.name}",
             headline=lines,
             command="train.gap",
             tables=[t for t in tables if t.rows],
@@ -355,22 +353,21 @@ def _report(
     return path
 
 
-def _residual_map(problem: Any, analysis: Any, o: Any) -> list[Any]:
+def _residual_map(problem: Any, o: Any) -> list[Any]:
     """A picture of where errors sit; none where no hinge or slide is compared."""
     import numpy as np
 
-    from easi_jax.gap.where import Conditions, condition_errors
+    from easi_jax.gap.where import condition_errors
     from easi_jax.io.gap_figures import residual_maps
     from easi_jax.io.report import Picture
-    from easi_jax.quantities import is_scalar
+    from easi_jax.quantities import scalar_dofs
 
-    c, m = o.channels, problem.mj_model
-    found = Conditions(m, o.held, analysis.runs)
-    joints, names, before = condition_errors(o.before.errors, found, m, c)
+    c, m = o.channels, problem.model.mj_model
+    joints, names, before = condition_errors(o.before.errors, o.conditions, m, c)
     if not joints:
         return []
-    *_, after = condition_errors(o.after.errors, found, m, c)
-    dofs = m.jnt_dofadr[[is_scalar(m, j) for j in range(m.njnt)]]
+    *_, after = condition_errors(o.after.errors, o.conditions, m, c)
+    dofs = np.array([d for _, d in scalar_dofs(m).values()])
     used = dofs[np.isfinite(c.scale[dofs])]
     floor = np.maximum(o.floor_si[used] / c.scale[used], 1e-12)
     return [
@@ -400,7 +397,7 @@ def _traces(problem: Any, o: Any, w: Any) -> tuple[Any, Any, Any]:
     run = problem.held[0]
     held = o.held.take(w)
     measured = np.concatenate([held.start_qpos[:, :1], held.target], 1)
-    origin = np.broadcast_to(problem.mj_model.qpos0, measured.shape)
+    origin = np.broadcast_to(problem.model.mj_model.qpos0, measured.shape)
     seen = run.configuration.difference(origin, measured)
     pad = [(0, 0), (1, 0), (0, 0)]
     before = seen + np.pad(o.before.errors[w], pad)

@@ -62,18 +62,18 @@ def run(config: Config) -> None:
     check_seeds(config.retrain_seeds)
     problem = read_gap_problem(config)
     if config.retrain is not None:
-        check_robot(config.retrain, problem.mj_model)
+        check_robot(config.retrain, problem.model.mj_model)
     from easi_jax.gap.analysis import Analysis
 
     analysis = Analysis(
-        problem.mj_model,
+        problem.model.mj_model,
         problem.space,
         problem.fit,
         problem.held,
         problem.noise,
         config.horizon,
         tell=say,
-        fixed=problem.fixed,
+        fixed=problem.model.fixed,
     )
     with RunFolder.open(
         config.out, config, command="train.gap", overwrite=config.overwrite
@@ -117,11 +117,11 @@ def _record_next(
     known = {p.key: p for p in (*analysis.places, *analysis.ripples)}
     # Rows cost time, whatever their rate.
     seconds = max(10 * horizon, min(_LONGEST_TEST, _ROWS * problem.fit[0].dt))
-    plan = quick_tests(problem.mj_model, problem.fit, seconds)
+    plan = quick_tests(problem.model.mj_model, problem.fit, seconds)
     said = []
     for f in open_names:
         proposals = propose(
-            problem.mj_model,
+            problem.model.mj_model,
             analysis.predictor,
             analysis.bounds,
             outcome.x,

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from easi_jax.effects import scalar_joints
 from easi_jax.errors import UserError, nearest
 from easi_jax.excite import evaluate as ev
 from easi_jax.excite.candidates import Test
@@ -23,6 +22,7 @@ from easi_jax.gap.scales import scales_of
 from easi_jax.gap.table import EFFECTS, Place, Scales, covered, places, ripples
 from easi_jax.parameters import ParameterSpace
 from easi_jax.physics import WRITTEN_OUT
+from easi_jax.quantities import scalar_dofs
 from easi_jax.recording import physics_steps
 
 _WORK = 4e6  # physics steps of all simulations together
@@ -79,10 +79,8 @@ def effects_wanted(
     """
     check_names(names)
     found = places(m, scales)
-    for j in range(m.njnt):
-        if m.jnt_type[j] >= 2:
-            span = float(scales.span[int(m.jnt_dofadr[j])])
-            found += ripples(m, j, scales, [_RIPPLE * 2 * np.pi / span])
+    for j, (_, d) in scalar_dofs(m).items():
+        found += ripples(m, j, scales, [_RIPPLE * 2 * np.pi / float(scales.span[d])])
     kept = [
         p for p in found if (not names or p.effect in names) and not covered(p, space)
     ]
@@ -124,7 +122,7 @@ def choose(
         UserError: an effect that the model has no place for.
     """
     runs = [t.run for t in tests]
-    if not scalar_joints(m):
+    if not scalar_dofs(m):
         raise UserError("the model has no hinge or slide joint: nothing to excite")
     scales = scales_of(m, runs) if scales is None else replace(scales, dt=runs[0].dt)
     found = effects_wanted(m, space, scales, names)

@@ -6,7 +6,14 @@ import mujoco
 import numpy as np
 
 from easi_jax.errors import UserError
-from easi_jax.quantities import is_position_servo, is_velocity_servo, joint_name
+from easi_jax.quantities import (
+    actuator_name,
+    is_position_servo,
+    is_scalar,
+    is_velocity_servo,
+    joint_name,
+    scalar_dofs,
+)
 
 _ROOM = 0.15  # of a joint's range that a start needs on both sides
 _SLOWEST = 0.3  # Hz, what a velocity drive has to be able to sweep its travel with
@@ -35,15 +42,6 @@ class Limits:
     assumed: tuple[str, ...] = ()
 
 
-def scalar_dofs(m: mujoco.MjModel) -> dict[int, tuple[int, int]]:
-    """(place in qpos, place in qvel) of hinges and slides, by joint."""
-    return {
-        j: (int(m.jnt_qposadr[j]), int(m.jnt_dofadr[j]))
-        for j in range(m.njnt)
-        if m.jnt_type[j] >= 2
-    }
-
-
 def driven(m: mujoco.MjModel) -> dict[int, tuple[int, ...]]:
     """Actuators at each hinge or slide joint."""
     out: dict[int, tuple[int, ...]] = {}
@@ -54,7 +52,7 @@ def driven(m: mujoco.MjModel) -> dict[int, tuple[int, ...]]:
     )
     for a in range(m.nu):
         j = int(m.actuator_trnid[a, 0])
-        if int(m.actuator_trntype[a]) in at_joint and m.jnt_type[j] >= 2:
+        if int(m.actuator_trntype[a]) in at_joint and is_scalar(m, j):
             out[j] = (*out.get(j, ()), a)
     return out
 
@@ -194,7 +192,7 @@ def amplitudes(
                 natural = min(natural, own - abs(hold[a]))
         out[a] = min(out[a], natural)
         if not np.isfinite(out[a]):
-            name = m.actuator(a).name or f"actuator{a}"
+            name = actuator_name(m, a)
             raise UserError(
                 f'actuator "{name}" has no ctrlrange, and what moves a joint safely '
                 f"cannot be told from the model: give --amplitude {name}=NUMBER"

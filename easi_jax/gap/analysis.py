@@ -37,7 +37,9 @@ from easi_jax.gap.selection import (
     simplest,
 )
 from easi_jax.gap.table import REFITTED, Layout, Place, covered, places, ripples
+from easi_jax.gap.where import Conditions
 from easi_jax.parameters import ParameterSpace
+from easi_jax.quantities import scalar_dofs
 from easi_jax.recording import Run, physics_steps
 
 _FITTED = (32, 96)  # windows that fits see
@@ -83,8 +85,7 @@ class Analysis:
         self.places = [p for p in self.everywhere if not covered(p, space)]
         self.ripples = [
             p
-            for j in range(mj_model.njnt)
-            if mj_model.jnt_type[j] >= 2
+            for j in scalar_dofs(mj_model)
             for p in ripples(mj_model, j, self.scales, self._cycles(j))
         ]
         layout = Layout(mj_model, [*self.everywhere, *self.ripples])
@@ -444,6 +445,7 @@ class Analysis:
             floor_si=np.sqrt(floor),
             channels=self.channels,
             held=self.held,
+            conditions=Conditions(self.m, self.held, self.runs),
             x=x,
             active=model.fit.active.tolist(),
             disagreeing=self.disagreeing(x, after),

@@ -5,7 +5,12 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from easi_jax.quantities import is_scalar, joint_name, joint_unit
+from easi_jax.quantities import (
+    actuator_name,
+    joint_name,
+    joint_unit,
+    scalar_dofs,
+)
 from easi_jax.recording import Run
 from easi_jax.windows import fitted_velocity
 
@@ -33,10 +38,8 @@ def coverage_notes(
         [fitted_velocity(r.qpos, r.dt, r.configuration) for r in part]
         for part in (fit, held)
     ]
-    for j in range(m.njnt):
-        if not is_scalar(m, j):
-            continue
-        name, dof = joint_name(m, j), int(m.jnt_dofadr[j])
+    for j, (_, dof) in scalar_dofs(m).items():
+        name = joint_name(m, j)
         unit = joint_unit("m/s", "rad/s")(m, j)
         mine, theirs = (np.concatenate([v[:, dof] for v in part]) for part in speeds)
         forth, back = np.maximum(mine, 0).sum(), np.maximum(-mine, 0).sum()
@@ -48,7 +51,7 @@ def coverage_notes(
             )
         notes += _beyond(f"the speed of joint {name}", mine, theirs, unit)
     for i in range(m.nu):
-        name = m.actuator(i).name or f"actuator{i}"
+        name = actuator_name(m, i)
         mine, theirs = (
             np.concatenate([r.ctrl[:, i] for r in part]) for part in (fit, held)
         )

@@ -8,6 +8,7 @@ import numpy as np
 from easi_jax.gap.measure import Channels
 from easi_jax.gap.predictor import WindowSet
 from easi_jax.gap.table import Place
+from easi_jax.gap.where import Conditions
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,7 @@ class Outcome:
     """What the workflow found; see the log format's ``gap.json``.
 
     Attributes:
+        conditions: what was going on in the held-out windows.
         x: the whole vector at the end, and ``active`` its entries that the last fit
             moved.
         disagreeing: runs that the model predicts far worse than the others, with how
@@ -73,6 +75,7 @@ class Outcome:
     floor_si: np.ndarray
     channels: Channels
     held: WindowSet
+    conditions: Conditions
     x: np.ndarray
     active: list[int]
     notes: list[str] = field(default_factory=list)

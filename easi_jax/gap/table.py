@@ -17,7 +17,7 @@ from easi_jax import backlash, effects
 from easi_jax.effects import Effects
 from easi_jax.errors import UserError
 from easi_jax.parameters import ParameterSpace
-from easi_jax.quantities import direct_solref
+from easi_jax.quantities import direct_solref, scalar_dofs
 
 EFFECTS = (
     "coulomb_friction",
@@ -178,11 +178,10 @@ def places(m: mujoco.MjModel, s: Scales) -> list[Place]:
     """Every effect at every place of a model where it can sit."""
     out: list[Place] = []
     geared = backlash.geared(m)
-    for j in range(m.njnt):
-        if m.jnt_type[j] >= 2:
-            out += _at_joint(m, j, s)
-            if int(m.jnt_dofadr[j]) in geared:
-                out.append(_play(m, j, s))
+    for j, (_, d) in scalar_dofs(m).items():
+        out += _at_joint(m, j, s)
+        if d in geared:
+            out.append(_play(m, j, s))
     for a in range(m.nu):
         out += _at_actuator(m, a, s)
     moving = [b for b in range(1, m.nbody) if m.body_mass[b] > 0 and _moves(m, b)]

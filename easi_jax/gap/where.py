@@ -9,7 +9,7 @@ import numpy as np
 
 from easi_jax.gap.measure import Channels
 from easi_jax.gap.predictor import WindowSet
-from easi_jax.quantities import is_scalar
+from easi_jax.quantities import actuator_name, body_name, scalar_dofs
 from easi_jax.recording import Run
 from easi_jax.windows import fitted_velocity
 
@@ -49,6 +49,7 @@ class Conditions:
         self._m = m
         self._windows = windows
         self._runs = runs
+        self._of_joint: dict[int, dict[str, np.ndarray]] = {}
         self._at = windows.row[:, None] + np.arange(windows.ctrl.shape[1] + 1)
 
     @cached_property
@@ -83,15 +84,20 @@ class Conditions:
         size = np.abs(self._windows.ctrl).mean(1)
         out = {}
         for a in range(self._m.nu):
-            name = self._m.actuator(a).name or f"actuator{a}"
+            name = actuator_name(self._m, a)
             out[f"when the command of {name} jumps"] = _largest(self._jumps[:, a])
             out[f"at large commands of {name}"] = _largest(size[:, a])
         for b, mask in self._touching.items():
-            out[f"with {self._m.body(b).name or f'body{b}'} in contact"] = mask
+            out[f"with {body_name(self._m, b)} in contact"] = mask
         return out
 
     def of_joint(self, j: int) -> dict[str, np.ndarray]:
         """Those of a hinge or slide."""
+        if j not in self._of_joint:
+            self._of_joint[j] = self._made_of_joint(j)
+        return self._of_joint[j]
+
+    def _made_of_joint(self, j: int) -> dict[str, np.ndarray]:
         m = self._m
         q = self._qpos[..., m.jnt_qposadr[j]]
         v = self._qvel[..., m.jnt_dofadr[j]]
@@ -162,7 +168,7 @@ def where(
     square[:, ~used] = 0.0
     total = max(square.sum(), 1e-300)
     out = []
-    scalar = {int(m.jnt_dofadr[j]): j for j in range(m.njnt) if is_scalar(m, j)}
+    scalar = {d: j for j, (_, d) in scalar_dofs(m).items()}
     for joint in dict.fromkeys(channels.joints):
         dofs = [d for d, name in enumerate(channels.joints) if name == joint]
         mine = square[:, dofs].sum(1)
@@ -203,9 +209,8 @@ def condition_errors(
     square = np.mean(errors.astype(float) ** 2, 1)
     joints: list[str] = []
     rows: list[dict[str, float]] = []
-    for j in range(m.njnt):
-        dof = int(m.jnt_dofadr[j])
-        if not is_scalar(m, j) or not np.isfinite(channels.scale[dof]):
+    for j, (_, dof) in scalar_dofs(m).items():
+        if not np.isfinite(channels.scale[dof]):
             continue
         mine = square[:, dof] / channels.scale[dof] ** 2
         everywhere = {"throughout": np.ones(len(mine), bool)}

@@ -1,7 +1,8 @@
 """The lift arm example: its logs are what make_log.py makes, and carry the truth."""
 
-import importlib.util
+import runpy
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -18,12 +19,7 @@ LOGS = [EXAMPLE / "sweep.csv", EXAMPLE / "moves.csv"]
 
 @pytest.fixture(scope="module")
 def make_log():
-    spec = importlib.util.spec_from_file_location("make_log", EXAMPLE / "make_log.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return SimpleNamespace(**runpy.run_path(str(EXAMPLE / "make_log.py")))
 
 
 @pytest.fixture(scope="module")
