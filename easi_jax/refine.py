@@ -5,7 +5,9 @@ of every segment are fitted together by Levenberg-Marquardt (derivatives:
 `easi_jax.information`). Each round tries several dampings, and jumps of
 single parameters: a speed limit that no simulation reaches has no slope, yet the data
 may show that it is lower. In the first rounds pieces that fit far worse than most
-count less. Starting at the found mean, it is the natural last
+count less. A first stage fits only the beginning of each piece: over few milliseconds
+errors are nearly linear in the parameters, while over contacts and stick-slip they
+have many minima. Starting at the found mean, it is the natural last
 step where commands and states were logged together; it says nothing about unpaired
 data or about distributions.
 """
@@ -26,10 +28,12 @@ from easi_jax.segments import Segments
 
 _DAMPING = 10.0 ** np.arange(-2, 4)  # tried together, relative to the last one
 _TINY = 1e-12
-_PATIENCE = 6  # rounds without progress that end the fit
+_SHORT = 0.02  # s of each piece that the first stage fits
+_PATIENCE = 3, 6  # rounds without progress that end each stage
 _TOLD_APART = 0.05  # of the cost, which is minus a logarithm of likelihood
 _ROUNDING = 3e-6  # of the cost, which the best of many trials takes for progress
 _ROUGH = 1e-3  # of the cost: less progress than that is not to be had by differences
+_NEAR_ENOUGH = 1e-2  # of the cost, for the first stage
 _MOVING, _LOOKING, _FINISHED = range(3)
 _FARTHEST = 0.8, 2.5  # jump that is tried, in initial ranges, in log ratios
 _OUTLYING = 9.0  # times the median cost: such a piece counts half
@@ -42,8 +46,9 @@ class RefineResult:
     Attributes:
         unit: parameters, unit coordinates, ``(n,)``.
         hessian: information at them, without the prior, ``(n, n)``.
-        cost: half the weighted squared error, at the start and after each iteration,
-            ``(I + 1,)``; the last value from where the fit had settled.
+        cost: half the weighted squared error, at ``unit`` as given, then after each
+            round of the last stage, ``(I + 1,)``; the last value from where the fit
+            had settled.
         delta: corrections of the starts, ``(M, 2 nv)``.
     """
 
@@ -65,11 +70,12 @@ def refine(
     misfit: jax.Array | None = None,
     robust: int | jax.Array = 6,
     free_starts: bool = True,
+    short_first: bool | jax.Array = True,
 ) -> RefineResult:
     """Levenberg-Marquardt from ``unit (n,)``; pure, for use inside jit.
 
     Args:
-        iterations: rounds at most; fewer where the cost has settled.
+        iterations: rounds of a stage at most; fewer where the cost has settled.
         noise: standard deviations of the measurement, ``(2 nv,)``, above zero.
         prior_std: weak pull towards the start, in initial ranges, so that
             directions without any information stay where they are.
@@ -78,12 +84,16 @@ def refine(
         robust: in so many first rounds, pieces that fit far worse than most count
             less.
         free_starts: whether the true starts are fitted too, or those given are exact.
+        short_first: whether a first stage fits the beginning of each piece alone. The
+            second starts from its result, or from ``unit`` where that fits better.
     """
     paired = PairedFit(machine, space, segments, noise, mesh, free_starts)
     low, high = space.unit_bounds
     anchor = unit
     pull = jnp.full(space.size, 1.0 / prior_std**2)
     weight = step_weights(segments, noise, misfit)
+    begin = jnp.arange(segments.horizon) < max(1, round(_SHORT / machine.dt))
+    unmoved = jnp.zeros((segments.count, 2 * machine.mj_model.nv))
 
     away = functools.partial(_distance, space, anchor)
 
@@ -91,13 +101,20 @@ def refine(
         return 0.5 * jnp.sum(pull * away(u) ** 2, axis=-1)
 
     n, count = space.size, segments.count
+    jumps = slice(1 + len(_DAMPING), 1 + len(_DAMPING) + 2 * n)
     rounding = _ROUGH if machine.wide else _ROUNDING
     # A start range may be narrow, and wrong.
     wide = np.maximum(_FARTHEST[0], _FARTHEST[1] / space.log_width)
     farthest = np.where(space.log, wide, _FARTHEST[0])
     sides = jnp.array([[1.0], [-1.0]])
 
-    def step(carry: Any, moving: jax.Array, trusting: jax.Array) -> Any:
+    def step(
+        carry: Any,
+        weight: jax.Array,
+        first: jax.Array,
+        moving: jax.Array,
+        trusting: jax.Array,
+    ) -> Any:
         u, shift, damp, near, far, pieces, _ = carry
         trust = jnp.where(trusting, 1.0, _trust(pieces, segments.weight > 0))
         trusted = weight * trust[:, None, None]
@@ -115,13 +132,15 @@ def refine(
         data = jnp.where(trust > 0, each * trust, 0.0).sum(1)
         costs = data + prior(units)
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
-        best = jnp.where(moving, jnp.argmin(costs), 0)
+        home = len(costs) - 1
+        best = jnp.where(first & (costs[home] < costs[0]), home, 0)
+        best = jnp.where(moving, jnp.argmin(costs), best)
         damped = costs[1 : 1 + len(_DAMPING)]
         damp = damp * jnp.asarray(_DAMPING)[jnp.argmin(damped)]
         damp = jnp.where(damped.min() < costs[0], damp, 100.0 * damp)
-        level = data[1 + len(_DAMPING) :].reshape(2, n)
+        level = data[jumps].reshape(2, n)
         flat, worse = level == data[0], ~(level <= data[0])
-        chosen = (jnp.arange(2 * n) == best - 1 - len(_DAMPING)).reshape(2, n)
+        chosen = (jnp.arange(2 * n) == best - jumps.start).reshape(2, n)
         near = jnp.where(moving & flat, reach, jnp.where(chosen.any(0), 0.0, near))
         far = jnp.where(moving & (worse | chosen), reach, far)
         new = (
@@ -133,10 +152,12 @@ def refine(
             each[best],
             eq.hessian,
         )
-        return new, each[0].sum() + prior(u)
+        told = jnp.where(first, home, 0)
+        return new, each[told].sum() + prior(units[told])
 
     def trials(u: Any, shift: Any, damp: Any, hops: Any, eq: Normal) -> Any:
-        """Where the cost is tried: here, Newton steps, jumps of single parameters."""
+        """Where the cost is tried: here, Newton steps, jumps of single parameters, and
+        where the fit began."""
         slope = jax.jvp(away, (u,), (jnp.ones(n),))[1]
         grad = eq.gradient + pull * slope * away(u)
         # A parameter that its bound holds back takes no part in the step.
@@ -154,15 +175,15 @@ def refine(
             return new, shift + eq.start_step + gain
 
         newton, shifted = jax.vmap(trial)(damp * _DAMPING)
-        units = jnp.concatenate([u[None], newton, hops.reshape(2 * n, n)])
+        units = jnp.concatenate([u[None], newton, hops.reshape(2 * n, n), anchor[None]])
         stay = jnp.broadcast_to(shift, (2 * n + 1, *shift.shape))
-        return units, jnp.concatenate([stay[:1], shifted, stay[1:]])
+        return units, jnp.concatenate([stay[:1], shifted, stay[1:], unmoved[None]])
 
     def swept(
         u: Any, shift: Any, damp: Any, hops: Any, weight: Any, trusted: Any
     ) -> Any:
         """Derivatives, then trials, by one simulation that is compiled once."""
-        size = 1 + len(_DAMPING) + 2 * n
+        size = jumps.stop + 1
         points = paired.around(u, shift)
         most = max(size, points[0].shape[0])
 
@@ -182,39 +203,55 @@ def refine(
         )
         return eq, units, shifts, each
 
-    init = (
-        unit,
-        jnp.zeros((count, 2 * machine.mj_model.nv)),
-        jnp.asarray(1e-3),
-        jnp.zeros((2, n)),
-        jnp.broadcast_to(jnp.asarray(farthest), (2, n)),
-        jnp.ones(count),
-        jnp.zeros((n, n)),
-    )
-
-    def going(state: Any) -> jax.Array:
-        return state[0] < _FINISHED
-
-    def round_(state: Any) -> Any:
-        phase, k, costs, carry = state
-        # The first round only looks, and the last: cost and information at the result.
-        moving = (phase == _MOVING) & (k > 0)
-        carry, cost = step(carry, moving, ~moving | (k > robust))
-        costs = jnp.where(jnp.arange(iterations + 2) >= k, cost, costs)
-        # By less than this the data cannot tell two results apart.
-        told_apart = _TOLD_APART + rounding * cost
-        settled = costs[jnp.maximum(k - _PATIENCE, 0)] - cost < told_apart
-        settled &= k > robust + _PATIENCE
-        over = settled | (k >= iterations)
-        phase = jnp.where(
-            moving | (k == 0), jnp.where(over, _LOOKING, _MOVING), _FINISHED
+    def stage(found: Any, item: Any) -> Any:
+        """From parameters and shifts ``found`` to those that fit best."""
+        weight, wanted, robust, patience, rough = item
+        init = (
+            *found,
+            jnp.asarray(1e-3),
+            jnp.zeros((2, n)),
+            jnp.broadcast_to(jnp.asarray(farthest), (2, n)),
+            jnp.ones(count),
+            jnp.zeros((n, n)),
         )
-        return phase, k + 1, costs, carry
 
-    start = (jnp.asarray(_MOVING), jnp.asarray(0), jnp.zeros(iterations + 2), init)
-    _, _, costs, carry = jax.lax.while_loop(going, round_, start)
-    u, shift, *_, hessian = carry
-    return RefineResult(u, hessian, costs[1:], shift)
+        def going(state: Any) -> jax.Array:
+            return state[0] < _FINISHED
+
+        def round_(state: Any) -> Any:
+            phase, k, costs, carry = state
+            # The first round only looks, and the last: cost and information at the
+            # result.
+            moving = (phase == _MOVING) & (k > 0)
+            trusting = ~moving | (k > robust)
+            carry, cost = step(carry, weight, k == 0, moving, trusting)
+            costs = jnp.where(jnp.arange(iterations + 2) >= k, cost, costs)
+            # By less than this the data cannot tell two results apart.
+            told_apart = _TOLD_APART + rough * cost
+            settled = costs[jnp.maximum(k - patience, 0)] - cost < told_apart
+            settled &= k > robust + patience
+            over = settled | (k >= iterations)
+            phase = jnp.where(
+                moving | (k == 0), jnp.where(over, _LOOKING, _MOVING), _FINISHED
+            )
+            return phase, k + 1, costs, carry
+
+        phase = jnp.where(wanted, _MOVING, _FINISHED)
+        start = (phase, jnp.asarray(0), jnp.zeros(iterations + 2), init)
+        _, _, costs, carry = jax.lax.while_loop(going, round_, start)
+        u, shift, *_, hessian = carry
+        return (u, shift), (costs, hessian)
+
+    stages = (
+        jnp.stack([weight * begin[:, None], weight]),
+        jnp.stack([jnp.asarray(short_first), jnp.asarray(True)]),
+        jnp.stack([jnp.asarray(0), jnp.asarray(robust)]),
+        jnp.array(_PATIENCE),
+        jnp.array([_NEAR_ENOUGH, rounding]),
+    )
+    # As a scan, so that a stage is compiled once.
+    (u, shift), (costs, hessians) = jax.lax.scan(stage, (unit, unmoved), stages)
+    return RefineResult(u, hessians[-1], costs[-1], shift)
 
 
 def _trust(pieces: jax.Array, used: jax.Array) -> jax.Array:
