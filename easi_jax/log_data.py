@@ -235,16 +235,28 @@ def rows_of(run: Run, first: int, last: int) -> Run:
 
 
 def trusted_velocity(run: Run) -> np.ndarray:
-    """Velocities ``(T, nv)``: those measured where they are the positions' derivative
-    (within a tenth of its RMS and three times its noise), else the derivative."""
+    """Velocities ``(T, nv)``: those measured where they are the positions' derivative,
+    else that derivative.
+
+    They are where they agree with the fitted one (within a tenth of its RMS or three
+    times its noise), or where they integrate to the positions from row to row (within
+    a tenth): what swings as fast as rows follow each other escapes the fit.
+    """
     fitted = fitted_velocity(run.qpos, run.dt, run.configuration)
     if not run.qvel_measured:
         return fitted
     nv = run.qvel.shape[1]
     slack = 3 * estimate_noise(replace(run, qvel_measured=False))[nv:]
-    rms = np.sqrt(np.mean(fitted**2, 0))
-    off = np.sqrt(np.mean((run.qvel - fitted) ** 2, 0))
-    return np.where(off <= np.maximum(_AGREES * rms, slack), run.qvel, fitted)
+    off = _rms(run.qvel - fitted)
+    agrees = off <= np.maximum(_AGREES * _rms(fitted), slack)
+    moved = run.configuration.difference(run.qpos[:-1], run.qpos[1:]) / run.dt
+    between = 0.5 * (run.qvel[:-1] + run.qvel[1:])
+    agrees |= _rms(between - moved) <= _AGREES * _rms(moved)
+    return np.where(agrees, run.qvel, fitted)
+
+
+def _rms(x: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean(x**2, 0))
 
 
 def visible_steps(

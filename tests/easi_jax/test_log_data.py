@@ -103,6 +103,20 @@ def test_late_velocities_are_not_trusted():
     np.testing.assert_array_equal(trusted_velocity(close), close.qvel)
 
 
+def test_velocities_too_fast_for_the_fit_are_trusted_where_they_integrate():
+    """Ten rows a swing: a parabola through them is off by more than a tenth."""
+    slow = make_run(sine())
+    t = np.arange(len(slow))
+    qpos = np.sin(0.63 * t)[:, None]
+    qvel = 0.63 / slow.dt * np.cos(0.63 * t)[:, None]
+    fast = dataclasses.replace(slow, qpos=qpos, qvel=qvel, qvel_measured=True)
+    np.testing.assert_array_equal(trusted_velocity(fast), qvel)
+    late = dataclasses.replace(fast, qvel=np.roll(qvel, 2, 0))
+    fitted = trusted_velocity(dataclasses.replace(fast, qvel_measured=False))
+    assert np.abs(fitted - qvel).max() > 0.1 * qvel.max()
+    np.testing.assert_array_equal(trusted_velocity(late), fitted)
+
+
 def test_visible_steps_grow_with_noise():
     run = make_run(sine())
     found = [visible_steps([run], np.array([s, 1e-9]), 50, 30) for s in (1e-6, 1e-3, 1)]

@@ -4,15 +4,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 from easi_jax import rollout
 from easi_jax.information import identifiability
 from easi_jax.machine import Machine
-from easi_jax.parameters import ParameterSpace
+from easi_jax.parameters import ParameterSpace, declare
 from easi_jax.refine import RefineResult, refine
-from easi_jax.segments import Segments, windows
+from easi_jax.segments import Segments, cut, to_device, windows
 from envs.cartpole import Cartpole
 
 NOISE = jnp.array([5e-4, 2e-3, 1e-2, 2e-2])
@@ -100,3 +101,60 @@ def test_a_limit_that_nothing_meets_is_found_from_a_narrow_start(
     run = jax.jit(lambda u: refine(machine, far, u, pieces, NOISE))
     out = run(far.to_unit(jnp.asarray(wrong)))
     assert float(far.to_si(out.unit)[i]) == pytest.approx(far.nominal[i], rel=0.02)
+
+
+# Two masses that swing ten times in a piece, with dry friction.
+_MASSES = """
+<mujoco>
+  <option timestep="0.01" integrator="implicitfast"/>
+  <worldbody>
+    <body>
+      <joint name="a" type="slide" stiffness="400" damping=".4" frictionloss="3"/>
+      <geom type="box" size=".1 .1 .1" mass="1"/>
+      <body>
+        <joint name="b" type="slide" stiffness="900" damping=".6" frictionloss="2"/>
+        <geom type="box" size=".1 .1 .1" mass="1"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="a"/></actuator>
+</mujoco>
+"""
+
+_KINDS = ("stiffness", "damping", "frictionloss")
+_WRONG = (1.64, -0.45, 0.25, -2.36, 1.27, 0.19)
+
+
+def test_a_short_first_stage_leads_past_wrong_minima() -> None:
+    """Over many swings the error has a minimum for each number of swings."""
+    m = mujoco.MjModel.from_xml_string(_MASSES)
+    data, rng = mujoco.MjData(m), np.random.default_rng(0)
+    ctrl = np.repeat(30 * rng.normal(size=(120, 1)), 5, 0)
+    qpos, qvel = np.zeros((2, 600, 2))
+    for k, u in enumerate(ctrl):
+        qpos[k], qvel[k], data.ctrl[:] = data.qpos, data.qvel, u
+        mujoco.mj_step(m, data)
+    names = [f"joint.{j}.{p}" for j in "ab" for p in _KINDS]
+    space = ParameterSpace(tuple(declare(m, n, n) for n in names))
+    machine = Machine(m, space, 0.01)
+    found = cut(qpos, qvel, ctrl, 150, 30, machine.past_steps)
+    assert found is not None
+    pieces = to_device(found)
+    noise = jnp.array([1e-4, 1e-4, 1e-3, 1e-3])
+
+    @jax.jit
+    def run(unit: jax.Array, short_first: bool) -> RefineResult:
+        return refine(
+            *(machine, space, unit, pieces, noise),
+            free_starts=False,
+            short_first=short_first,
+        )
+
+    wrong = space.to_unit(jnp.asarray(space.nominal * np.exp(_WRONG)))
+    errors = []
+    for short_first in (False, True):
+        out = run(wrong, short_first)
+        ratio = np.asarray(space.to_si(out.unit)) / space.nominal
+        errors.append(np.abs(np.log(ratio)).max())
+    assert errors[0] > 0.5
+    assert errors[1] < 1e-3
