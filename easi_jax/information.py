@@ -302,7 +302,7 @@ def identifiability(
                 for i in np.argsort(-np.abs(v))
                 if abs(v[i]) > 0.05
             }
-            for v in _readable_basis(null, _forces(space))
+            for v in _readable_basis(null, forces(space))
         ),
         determined=determined,
         covariance=cov / np.outer(scale, scale),
@@ -311,7 +311,7 @@ def identifiability(
     )
 
 
-def _forces(space: ParameterSpace) -> np.ndarray:
+def forces(space: ParameterSpace) -> np.ndarray:
     """1 where a unit holds a mass or a force: what one common factor would scale."""
     bases = (re.findall(r"[A-Za-z]+", u.split("/")[0]) for u in space.units)
     return np.array([float(bool({"kg", "N", "Nm"} & set(b))) for b in bases])

@@ -1,15 +1,15 @@
 """A least-squares finish on paired data (multiple shooting).
 
-Maximum likelihood under independent measurement noise: parameters and the true start
-of every segment are fitted together by Levenberg-Marquardt (derivatives:
-`easi_jax.information`). Each round tries several dampings, and jumps of
-single parameters: a speed limit that no simulation reaches has no slope, yet the data
-may show that it is lower. In the first rounds pieces that fit far worse than most
-count less. A first stage fits only the beginning of each piece: over few milliseconds
-errors are nearly linear in the parameters, while over contacts and stick-slip they
-have many minima. Starting at the found mean, it is the natural last
-step where commands and states were logged together; it says nothing about unpaired
-data or about distributions.
+Maximum likelihood under independent measurement noise: parameters and the true start of
+every segment are fitted together by Levenberg-Marquardt (derivatives:
+`easi_jax.information`). Each round tries several dampings, and jumps of single
+parameters: a speed limit that no simulation reaches has no slope, yet the data may show
+that it is lower. The common scale of all masses and forces jumps as well. In the first
+rounds pieces that fit far worse than most count less. A first stage fits only the
+beginning of each piece: over few milliseconds errors are nearly linear in the
+parameters, while over contacts and stick-slip they have many minima. Starting at the
+found mean, it is the natural last step where commands and states were logged together;
+it says nothing about unpaired data or about distributions.
 """
 
 import functools
@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from easi_jax.information import Normal, PairedFit
+from easi_jax.information import Normal, PairedFit, forces
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
 from easi_jax.segments import Segments
@@ -101,11 +101,13 @@ def refine(
         return 0.5 * jnp.sum(pull * away(u) ** 2, axis=-1)
 
     n, count = space.size, segments.count
-    jumps = slice(1 + len(_DAMPING), 1 + len(_DAMPING) + 2 * n)
+    ways = _ways(space)
+    jumps = slice(1 + len(_DAMPING), 1 + len(_DAMPING) + 2 * len(ways))
     rounding = _ROUGH if machine.wide else _ROUNDING
     # A start range may be narrow, and wrong.
     wide = np.maximum(_FARTHEST[0], _FARTHEST[1] / space.log_width)
     farthest = np.where(space.log, wide, _FARTHEST[0])
+    farthest = np.concatenate([farthest, np.ones(len(ways) - n)])
     sides = jnp.array([[1.0], [-1.0]])
 
     def step(
@@ -121,7 +123,7 @@ def refine(
         # Bisection, per parameter and side, between where a change has left the cost
         # as it was and where it has raised it: at the edge of a plateau it may fall.
         reach = 0.5 * (near + far)
-        hops = jnp.clip(u + (reach * sides)[..., None] * jnp.eye(n), low, high)
+        hops = jnp.clip(u + (reach * sides)[..., None] * ways, low, high)
         if machine.wide:
             eq, units, shifts, each = swept(u, shift, damp, hops, weight, trusted)
         else:
@@ -138,9 +140,9 @@ def refine(
         damped = costs[1 : 1 + len(_DAMPING)]
         damp = damp * jnp.asarray(_DAMPING)[jnp.argmin(damped)]
         damp = jnp.where(damped.min() < costs[0], damp, 100.0 * damp)
-        level = data[jumps].reshape(2, n)
+        level = data[jumps].reshape(2, -1)
         flat, worse = level == data[0], ~(level <= data[0])
-        chosen = (jnp.arange(2 * n) == best - jumps.start).reshape(2, n)
+        chosen = (jnp.arange(level.size) == best - jumps.start).reshape(level.shape)
         near = jnp.where(moving & flat, reach, jnp.where(chosen.any(0), 0.0, near))
         far = jnp.where(moving & (worse | chosen), reach, far)
         new = (
@@ -175,8 +177,8 @@ def refine(
             return new, shift + eq.start_step + gain
 
         newton, shifted = jax.vmap(trial)(damp * _DAMPING)
-        units = jnp.concatenate([u[None], newton, hops.reshape(2 * n, n), anchor[None]])
-        stay = jnp.broadcast_to(shift, (2 * n + 1, *shift.shape))
+        units = jnp.concatenate([u[None], newton, hops.reshape(-1, n), anchor[None]])
+        stay = jnp.broadcast_to(shift, (2 * len(ways) + 1, *shift.shape))
         return units, jnp.concatenate([stay[:1], shifted, stay[1:], unmoved[None]])
 
     def swept(
@@ -209,8 +211,8 @@ def refine(
         init = (
             *found,
             jnp.asarray(1e-3),
-            jnp.zeros((2, n)),
-            jnp.broadcast_to(jnp.asarray(farthest), (2, n)),
+            jnp.zeros((2, len(ways))),
+            jnp.broadcast_to(jnp.asarray(farthest), (2, len(ways))),
             jnp.ones(count),
             jnp.zeros((n, n)),
         )
@@ -224,6 +226,14 @@ def refine(
             # result.
             moving = (phase == _MOVING) & (k > 0)
             trusting = ~moving | (k > robust)
+            # A jump that did not help then may help now.
+            again = k % _PATIENCE[1] == 0
+            carry = (
+                *carry[:3],
+                jnp.where(again, 0.0, carry[3]),
+                jnp.where(again, farthest, carry[4]),
+                *carry[5:],
+            )
             carry, cost = step(carry, weight, k == 0, moving, trusting)
             costs = jnp.where(jnp.arange(iterations + 2) >= k, cost, costs)
             # By less than this the data cannot tell two results apart.
@@ -252,6 +262,17 @@ def refine(
     # As a scan, so that a stage is compiled once.
     (u, shift), (costs, hessians) = jax.lax.scan(stage, (unit, unmoved), stages)
     return RefineResult(u, hessians[-1], costs[-1], shift)
+
+
+def _ways(space: ParameterSpace) -> np.ndarray:
+    """Directions of jumps, ``(n + 1 or n, n)``: single parameters, and the common
+    scale of all masses and forces, along which motion changes least."""
+    scale = forces(space) * space.log
+    if scale.sum() < 2:
+        return np.eye(space.size)
+    # As far as a parameter's own jump where ranges are equally wide.
+    reach = _FARTHEST[1] / space.log_width
+    return np.concatenate([np.eye(space.size), (scale * reach)[None]])
 
 
 def _trust(pieces: jax.Array, used: jax.Array) -> jax.Array:
