@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from easi_jax.quantities import is_scalar
+
 _PARTS = 6  # of a physics step
 _STIFF = 0.4  # phase of the teeth's own oscillation in a part [rad]
 
@@ -56,7 +58,7 @@ def geared(m: Any) -> dict[int, list[int]]:
         dof = int(m.jnt_dofadr[j])
         plain = int(m.actuator_gaintype[a]) in _GAINS
         plain &= int(m.actuator_biastype[a]) in _BIASES
-        if int(m.jnt_type[j]) < 2 or not plain:
+        if not is_scalar(m, j) or not plain:
             out.add(dof)
         found.setdefault(dof, []).append(a)
     return {dof: acts for dof, acts in found.items() if dof not in out}
@@ -73,7 +75,7 @@ def felt_inertia(m: mujoco.MjModel) -> np.ndarray:
 
 
 def first_rotor(
-    scalar: Sequence[tuple[int, int]], qpos: jax.Array, qvel: jax.Array
+    scalar: Sequence[tuple[int, int]] | np.ndarray, qpos: jax.Array, qvel: jax.Array
 ) -> Rotor:
     """Drives in the middle of their play, at the joints' speeds."""
     at, dof = np.array(scalar, int).reshape(-1, 2).T

@@ -19,6 +19,7 @@ from mujoco import mjx
 from easi_jax import backlash
 from easi_jax.backlash import Rotor
 from easi_jax.constants import set_const
+from easi_jax.quantities import scalar_places
 
 _NO_LIMIT = 1e9
 _TINY = 1e-9
@@ -254,17 +255,15 @@ def in_step(
     m: mjx.Model,
     d: mjx.Data,
     e: Effects,
-    scalar: tuple[tuple[int, int], ...],
     rotor: Any,
 ) -> tuple[mjx.Model, mjx.Data, Any]:
     """Model, data and drives with play of one physics step.
 
     Args:
         d: before `forward`.
-        scalar: places in ``qpos`` and ``qvel`` of the hinges and slides.
         rotor: drives before the step (`backlash.Rotor`); empty where none has play.
     """
-    at, dof = np.array(scalar, int).reshape(-1, 2).T
+    at, dof = scalar_places(m).T
     v = d.qvel
     fall = jnp.exp(-jnp.square(v / e.stribeck))
     m = m.replace(

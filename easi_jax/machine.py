@@ -17,7 +17,7 @@ from easi_jax.errors import UserError
 from easi_jax.model import Model, Sense, put_model, with_parameters
 from easi_jax.parameters import ParameterSpace
 from easi_jax.physics import WRITTEN_OUT, Physics, at_rest, control_step
-from easi_jax.quantities import joint_name
+from easi_jax.quantities import is_scalar, joint_name
 from easi_jax.recording import physics_steps
 
 _BATCH = 2048  # benchmarks/speed.py
@@ -157,7 +157,7 @@ class Machine:
 
     @cached_property
     def _hinge_only(self) -> bool:
-        return bool(np.all(self.mj_model.jnt_type >= 2))
+        return all(is_scalar(self.mj_model, j) for j in range(self.mj_model.njnt))
 
     def difference(
         self,

@@ -15,7 +15,7 @@ from easi_jax import effects, solver
 from easi_jax.backlash import first_rotor
 from easi_jax.effects import Effects
 from easi_jax.equality import with_velocity_products
-from easi_jax.quantities import scalar_dofs
+from easi_jax.quantities import scalar_places
 from easi_jax.scalarize import scalarized
 from easi_jax.small_linalg import unroll_small
 
@@ -56,7 +56,7 @@ def at_rest(model: Any, qpos: jax.Array, qvel: jax.Array) -> Physics:
     sensed = jnp.zeros(model.sense_size) if model.sense else ()
     memory, rotor, e = (), (), model.effects
     if e is not None and effects.turns(model.present):
-        rotor = first_rotor(tuple(scalar_dofs(m).values()), qpos, qvel)
+        rotor = first_rotor(scalar_places(m), qpos, qvel)
     if e is not None and effects.remembers(model.present):
         memory = effects.first_memory(model.delay_steps, m.nu)
     return Physics(qpos, qvel, act, warm, sensed, memory, rotor)
@@ -155,7 +155,7 @@ def substep(model: Any, state: Physics, ctrl: jax.Array, wide: bool = False) -> 
     d = data_at(model, state, ctrl)
     e, rotor = model.effects, state.rotor
     if e is not None:
-        m, d, rotor = effects.in_step(m, d, e, tuple(scalar_dofs(m).values()), rotor)
+        m, d, rotor = effects.in_step(m, d, e, rotor)
     d = mjx_step(m, d, wide, e if effects.resists(model.present) else None)
     qvel = jnp.clip(d.qvel, -model.speed_limit, model.speed_limit)
     sensed = model.sense(model.mjx, d) if model.sense else ()

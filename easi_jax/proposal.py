@@ -15,6 +15,7 @@ import numpy as np
 from easi_jax import addresses as language
 from easi_jax.errors import UserError
 from easi_jax.parameters import Parameter, ParameterSpace, declare
+from easi_jax.quantities import is_scalar
 
 _GRAVITY = 9.81
 _SHORTEST = 0.01  # m, arm of a weight
@@ -46,7 +47,7 @@ def propose(m: mujoco.MjModel) -> list[Proposal]:
     Raises:
         UserError: nothing that has a name can vary.
     """
-    joints = [n for n, j in language.names(m, "joint").items() if m.jnt_type[j] >= 2]
+    joints = [n for n, j in language.names(m, "joint").items() if is_scalar(m, j)]
     out: list[Proposal] = []
     for quantity in ("damping", "frictionloss", "armature"):
         out += _tied(m, "joint", quantity, joints)

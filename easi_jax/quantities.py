@@ -124,6 +124,11 @@ def scalar_dofs(m: Any) -> dict[int, tuple[int, int]]:
     }
 
 
+def scalar_places(m: Any) -> np.ndarray:
+    """Places in ``qpos`` and in ``qvel`` of hinges and slides, ``(k, 2)``."""
+    return np.array([*scalar_dofs(m).values()], int).reshape(-1, 2)
+
+
 def joint_name(m: Any, j: int) -> str:
     """A joint's name, or its number."""
     return m.joint(j).name or f"joint{j}"

@@ -46,9 +46,9 @@ class RefineResult:
     Attributes:
         unit: parameters, unit coordinates, ``(n,)``.
         hessian: information at them, without the prior, ``(n, n)``.
-        cost: half the weighted squared error, at ``unit`` as given, then after each
-            round of the last stage, ``(I + 1,)``; the last value from where the fit
-            had settled.
+        cost: half the weighted squared error, at ``unit`` as given, after each round of
+            the last stage, and at the result, ``(I + 2,)``; the last value from where
+            the fit had settled.
         delta: corrections of the starts, ``(M, 2 nv)``.
     """
 
@@ -101,13 +101,10 @@ def refine(
         return 0.5 * jnp.sum(pull * away(u) ** 2, axis=-1)
 
     n, count = space.size, segments.count
-    ways = _ways(space)
+    ways, farthest = _ways(space)
+    fresh = jnp.zeros((2, len(ways))), jnp.tile(jnp.asarray(farthest), (2, 1))
     jumps = slice(1 + len(_DAMPING), 1 + len(_DAMPING) + 2 * len(ways))
     rounding = _ROUGH if machine.wide else _ROUNDING
-    # A start range may be narrow, and wrong.
-    wide = np.maximum(_FARTHEST[0], _FARTHEST[1] / space.log_width)
-    farthest = np.where(space.log, wide, _FARTHEST[0])
-    farthest = np.concatenate([farthest, np.ones(len(ways) - n)])
     sides = jnp.array([[1.0], [-1.0]])
 
     def step(
@@ -116,8 +113,12 @@ def refine(
         first: jax.Array,
         moving: jax.Array,
         trusting: jax.Array,
+        again: jax.Array,
     ) -> Any:
         u, shift, damp, near, far, pieces, _ = carry
+        near, far = (
+            jnp.where(again, x, y) for x, y in zip(fresh, (near, far), strict=True)
+        )
         trust = jnp.where(trusting, 1.0, _trust(pieces, segments.weight > 0))
         trusted = weight * trust[:, None, None]
         # Bisection, per parameter and side, between where a change has left the cost
@@ -211,8 +212,7 @@ def refine(
         init = (
             *found,
             jnp.asarray(1e-3),
-            jnp.zeros((2, len(ways))),
-            jnp.broadcast_to(jnp.asarray(farthest), (2, len(ways))),
+            *fresh,
             jnp.ones(count),
             jnp.zeros((n, n)),
         )
@@ -228,13 +228,7 @@ def refine(
             trusting = ~moving | (k > robust)
             # A jump that did not help then may help now.
             again = k % _PATIENCE[1] == 0
-            carry = (
-                *carry[:3],
-                jnp.where(again, 0.0, carry[3]),
-                jnp.where(again, farthest, carry[4]),
-                *carry[5:],
-            )
-            carry, cost = step(carry, weight, k == 0, moving, trusting)
+            carry, cost = step(carry, weight, k == 0, moving, trusting, again)
             costs = jnp.where(jnp.arange(iterations + 2) >= k, cost, costs)
             # By less than this the data cannot tell two results apart.
             told_apart = _TOLD_APART + rough * cost
@@ -264,15 +258,18 @@ def refine(
     return RefineResult(u, hessians[-1], costs[-1], shift)
 
 
-def _ways(space: ParameterSpace) -> np.ndarray:
-    """Directions of jumps, ``(n + 1 or n, n)``: single parameters, and the common
-    scale of all masses and forces, along which motion changes least."""
-    scale = forces(space) * space.log
-    if scale.sum() < 2:
-        return np.eye(space.size)
-    # As far as a parameter's own jump where ranges are equally wide.
-    reach = _FARTHEST[1] / space.log_width
-    return np.concatenate([np.eye(space.size), (scale * reach)[None]])
+def _ways(space: ParameterSpace) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of jumps, ``(n + 1 or n, n)``, and how far each may go: single
+    parameters in unit coordinates, and the common scale of all masses and forces, along
+    which motion changes least, in log ratios."""
+    # A start range may be narrow, and wrong.
+    wide = np.maximum(_FARTHEST[0], _FARTHEST[1] / space.log_width)
+    single = np.eye(space.size), np.where(space.log, wide, _FARTHEST[0])
+    scaled = forces(space) * space.log
+    if scaled.sum() < 2:
+        return single
+    common = scaled / space.log_width
+    return np.vstack([single[0], common]), np.append(single[1], _FARTHEST[1])
 
 
 def _trust(pieces: jax.Array, used: jax.Array) -> jax.Array:

@@ -102,7 +102,7 @@ def read_excite_problem(config: Any) -> ExciteProblem:
             f'joint "{joint}" has no range in the model: kept within {reach:.3g} of '
             "its start (--travel)"
         )
-    if any(m.jnt_type[j] < 2 for j in range(m.njnt)):
+    if len(scalar_dofs(m)) < m.njnt:
         notes.append(
             "nothing checks what a free or ball joint does: hang up the base, or watch "
             "the predicted positions"

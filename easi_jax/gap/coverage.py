@@ -5,12 +5,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from easi_jax.quantities import (
-    actuator_name,
-    joint_name,
-    joint_unit,
-    scalar_dofs,
-)
+from easi_jax.quantities import actuator_name, joint_name, joint_unit, scalar_dofs
 from easi_jax.recording import Run
 from easi_jax.windows import fitted_velocity
 

@@ -4,16 +4,17 @@ import mujoco
 import numpy as np
 
 from easi_jax.parameters import Parameter, ParameterSpace
+from easi_jax.quantities import scalar_dofs
 
 
 def own_space(m: mujoco.MjModel) -> ParameterSpace:
     """What the model states and a refit may move: damping, frictionloss and stiffness
     of joints where they are not zero, each within a factor of 5."""
     found = []
-    for j in range(m.njnt):
-        if m.jnt_type[j] < 2 or not m.joint(j).name:
+    for j, (_, d) in scalar_dofs(m).items():
+        name = m.joint(j).name
+        if not name:
             continue
-        d, name = int(m.jnt_dofadr[j]), m.joint(j).name
         for quantity, value in (
             ("damping", m.dof_damping[d]),
             ("frictionloss", m.dof_frictionloss[d]),

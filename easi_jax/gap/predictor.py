@@ -30,7 +30,7 @@ from easi_jax.mesh import make_mesh, sharded_map
 from easi_jax.model import Model, full_structure
 from easi_jax.parameters import ParameterSpace
 from easi_jax.physics import Physics, arrived_step
-from easi_jax.quantities import scalar_dofs
+from easi_jax.quantities import scalar_places
 from easi_jax.recording import Run
 from easi_jax.runtime import fast_loops, quick_compile
 from easi_jax.windows import fitted_velocity, make_windows
@@ -174,9 +174,7 @@ class Predictor:
             hinge = m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
             if hinge and not m.jnt_limited[j]:
                 self.wrapped[m.jnt_dofadr[j]] = True
-        self._scalar = tuple(
-            np.array(k, int) for k in zip(*scalar_dofs(m).values(), strict=True)
-        )
+        self._scalar = scalar_places(m).T
         self._mesh = make_mesh()
         self.blocks = -(-len(windows) // BLOCK)
         self._data = self._placed(windows)
