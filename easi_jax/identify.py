@@ -64,6 +64,7 @@ def estimate(
     misfit: jax.Array | None = None,
     robust: int | jax.Array = 6,
     free_starts: bool = True,
+    near: bool | jax.Array = False,
 ) -> Estimate:
     """The result of a search at ``mean``, ``cov`` (unit coordinates); pure.
 
@@ -72,7 +73,7 @@ def estimate(
     initial range as prior. A direction that the data do not show keeps the initial
     spread, whatever the search has drifted to. Without ``informed`` it is the search's
     own covariance alone. ``misfit (2 nv,)`` is what the model itself errs by in every
-    step, on top of the noise; it, ``robust`` and ``free_starts`` go to
+    step, on top of the noise; it, ``robust``, ``free_starts`` and ``near`` go to
     `easi_jax.refine.refine`.
     """
     assumed = effective_noise(machine, pieces, noise)
@@ -88,6 +89,7 @@ def estimate(
             misfit=misfit,
             robust=robust,
             free_starts=free_starts,
+            near=near,
         )
         center, hessian = fit.unit, fit.hessian
         cost, delta = fit.cost, fit.delta

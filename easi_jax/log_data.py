@@ -326,31 +326,48 @@ def segments_from_runs(
 def open_loop_error(machine: Machine, model: Any, segments: Segments) -> jax.Array:
     """RMS over all steps of all segments of the position error, ``(nv,)``."""
     nv = machine.mj_model.nv
-    error = replay.errors(machine, model, segments)[..., :nv]
-    return jnp.sqrt(jnp.mean(error**2, axis=(0, 1)))
+    return _rms_of_steps(replay.errors(machine, model, segments)[..., :nv])
 
 
-def noise_floor(
-    machine: Machine, model: Any, segments: Segments, noise: jax.Array, key: jax.Array
-) -> jax.Array:
-    """What `open_loop_error` of a perfect model would be, ``(nv,)``.
+def errors_and_floor(
+    machine: Machine,
+    model: Any,
+    held: Segments,
+    fit: Segments,
+    noise: jax.Array,
+    key: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`open_loop_error` on ``held``, on ``fit``, and what the first would be for a
+    perfect model, ``(nv,)`` each.
 
-    Noise ``(2 nv,)`` is drawn for starts and targets and pushed through the model.
+    For the floor noise ``(2 nv,)`` is drawn for starts and targets and pushed through
+    the model.
     """
     nv = machine.mj_model.nv
     k_start, k_end = jax.random.split(key)
-    z = noise * jax.random.normal(k_start, (segments.count, 2 * nv))
+    z = noise * jax.random.normal(k_start, (held.count, 2 * nv))
     moved = replace(
-        segments,
-        qpos=jax.vmap(machine.move)(segments.qpos, z[:, :nv]),
-        qvel=segments.qvel + z[:, nv:],
+        held,
+        qpos=jax.vmap(machine.move)(held.qpos, z[:, :nv]),
+        qvel=held.qvel + z[:, nv:],
     )
-    states = replay.predict(machine, model, moved)
-    shift = replay.innovations(
-        machine, replay.predict(machine, model, segments), states
-    )[..., :nv]
+    # One simulation, since compiling it takes longer than running it.
+    every = jax.tree.map(lambda *x: jnp.concatenate(x), held, fit, moved)
+    states = replay.predict(machine, model, every)
+    target = (every.next_qpos, every.next_qvel)
+    error = replay.innovations(machine, states, target)[..., :nv]
+    sharp, noisy = (
+        jax.tree.map(lambda x, at=at: x[at], states)
+        for at in (slice(held.count), slice(held.count + fit.count, None))
+    )
+    shift = replay.innovations(machine, sharp, noisy)[..., :nv]
     shift = shift + noise[:nv] * jax.random.normal(k_end, shift.shape)
-    return jnp.sqrt(jnp.mean(shift**2, axis=(0, 1)))
+    first, second = error[: held.count], error[held.count : held.count + fit.count]
+    return _rms_of_steps(first), _rms_of_steps(second), _rms_of_steps(shift)
+
+
+def _rms_of_steps(error: jax.Array) -> jax.Array:
+    return jnp.sqrt(jnp.mean(error**2, axis=(0, 1)))
 
 
 def misfit_of(error: jax.Array, noise: jax.Array, weight: jax.Array) -> jax.Array:

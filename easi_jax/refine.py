@@ -70,7 +70,7 @@ def refine(
     misfit: jax.Array | None = None,
     robust: int | jax.Array = 6,
     free_starts: bool = True,
-    short_first: bool | jax.Array = True,
+    near: bool | jax.Array = False,
 ) -> RefineResult:
     """Levenberg-Marquardt from ``unit (n,)``; pure, for use inside jit.
 
@@ -84,8 +84,10 @@ def refine(
         robust: in so many first rounds, pieces that fit far worse than most count
             less.
         free_starts: whether the true starts are fitted too, or those given are exact.
-        short_first: whether a first stage fits the beginning of each piece alone. The
-            second starts from its result, or from ``unit`` where that fits better.
+        near: whether ``unit`` is already about the best, so that there is only the last
+            stage, and a short one. Otherwise a first stage fits the beginning of each
+            piece alone; the second starts from its result, or from ``unit`` where that
+            fits better.
     """
     paired = PairedFit(machine, space, segments, noise, mesh, free_starts)
     low, high = space.unit_bounds
@@ -248,9 +250,9 @@ def refine(
 
     stages = (
         jnp.stack([weight * begin[:, None], weight]),
-        jnp.stack([jnp.asarray(short_first), jnp.asarray(True)]),
+        jnp.stack([~jnp.asarray(near), jnp.asarray(True)]),
         jnp.stack([jnp.asarray(0), jnp.asarray(robust)]),
-        jnp.array(_PATIENCE),
+        jnp.stack([jnp.asarray(_PATIENCE[0]), jnp.where(near, *_PATIENCE)]),
         jnp.array([_NEAR_ENOUGH, rounding]),
     )
     # As a scan, so that a stage is compiled once.

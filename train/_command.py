@@ -4,6 +4,7 @@ Imports no jax, so that ``--help`` is quick; a command's ``run`` imports what it
 """
 
 import contextlib
+import os
 import re
 import sys
 import time
@@ -63,7 +64,7 @@ def main(
             with _interrupt.remembered():
                 run(config)
         except UserError as error:
-            _stop(f"error: {' '.join(str(error).split())}", USER_ERROR)
+            _stop(f"error: {' '.join(str(error).split())}", USER_ERROR, args is None)
     except BrokenPipeError:
         # The reader of our output has gone, as in `... | head`.
         sys.stderr.close()
@@ -74,7 +75,7 @@ def main(
         if not told or isinstance(error, SystemExit):
             raise
         out = getattr(config, "out", None)
-        _stop(_interrupted(out, hasattr(config, "resume")), INTERRUPTED)
+        _stop(_interrupted(out, hasattr(config, "resume")), INTERRUPTED, args is None)
 
 
 def show_table(
@@ -258,6 +259,13 @@ def _interrupted(out: Path | str | None, resumable: bool) -> str:
     return f"interrupted before the first checkpoint; nothing to resume in {out}"
 
 
-def _stop(message: str, status: int) -> NoReturn:
+def _stop(message: str, status: int, leave: bool) -> NoReturn:
     print(message, file=sys.stderr)
-    raise SystemExit(status)
+    if not leave:
+        raise SystemExit(status)
+    # Not by the interpreter's end: it waits for what still compiles, and XLA's threads
+    # that are at work then end the process with messages of their own.
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError):
+            stream.flush()
+    os._exit(status)

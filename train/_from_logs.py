@@ -1,6 +1,7 @@
 """Identifies a machine from measured logs; what ``train.easi --data`` does."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from train._command import say, show_table
@@ -30,9 +31,11 @@ def run(config: Any) -> None:
         overwrite=config.overwrite,
     ) as folder:
         from train._log_results import write
+        from train._stages import started
 
+        finish = started(lambda: _ready_finish(problem, search, config.refine))
         states = _search(folder, config, search, problem, seeds)
-        estimates, outliers = _finish(problem, search, states, config.refine)
+        estimates, outliers = finish()(states)
         problem.notes.extend(outliers)
         columns, rows, errors = write(folder, problem, search, estimates, seeds)
     show_table(f"Parameters of {problem.name}", columns, rows)
@@ -44,8 +47,6 @@ def run(config: Any) -> None:
 
 def _settings(config: Any, problem: Problem) -> Any:
     """Search settings; as many pieces a generation as their length lets pay."""
-    from dataclasses import replace
-
     from easi_jax.errors import UserError
     from train._robots import search_config
 
@@ -78,6 +79,7 @@ def _search(
 
     from easi_jax.log_data import segments_from_runs
     from easi_jax.pipeline import seed_keys
+    from easi_jax.runtime import fast_loops, quick_compile
     from easi_jax.search import SearchData
     from easi_jax.segments import to_device
     from train._stages import jit_chunks, run_stage, search_check, search_rows
@@ -90,7 +92,7 @@ def _search(
     keys = seed_keys(list(seeds))
     advance = jit_chunks(
         lambda states, data, n: jax.lax.map(lambda s: search.run(s, data, n), states),
-        fast=True,
+        fast_loops() | quick_compile(),
     )
     states = run_stage(
         folder,
@@ -106,12 +108,15 @@ def _search(
     return states
 
 
-def _finish(
-    problem: Problem, search: Any, states: Any, refined: bool
-) -> tuple[list[Any], list[str]]:
-    """An `Estimate` a seed, and notes on pieces that fit badly."""
-    from dataclasses import replace
+def _ready_finish(
+    problem: Problem, search: Any, refined: bool
+) -> Callable[[Any], tuple[list[Any], list[str]]]:
+    """Compiles the finish.
 
+    Returns:
+        Takes the search's states and returns an `Estimate` a seed, and notes on pieces
+        that fit badly.
+    """
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -120,6 +125,7 @@ def _finish(
     from easi_jax.identify import effective_noise, estimate
     from easi_jax.information import shift_start
     from easi_jax.log_data import misfit_of, outlier_weights, segments_from_runs
+    from easi_jax.runtime import quick_compile
     from easi_jax.segments import to_device
     from train._stages import placed
 
@@ -135,8 +141,9 @@ def _finish(
     seen = jnp.asarray(np.concatenate([np.ones(machine.mj_model.nv), problem.measured]))
     hidden = jnp.where(seen > 0, 0.0, jnp.inf)
 
-    @jax.jit
-    def finish(mean: Any, cov: Any, pieces: Any, misfit: Any, robust: Any) -> Any:
+    def finish(
+        mean: Any, cov: Any, pieces: Any, misfit: Any, robust: Any, near: Any
+    ) -> Any:
         found = estimate(
             machine,
             space,
@@ -149,32 +156,39 @@ def _finish(
             search.mesh,
             misfit,
             robust,
+            near=near,
         )
         model = machine.model(space.to_si(found.distribution.mean))
         starts = shift_start(machine, pieces, found.delta)
         return found, replay.errors_from(machine, model, starts, pieces)
 
+    n = space.size
+    like = placed((jnp.zeros(n), jnp.eye(n), pieces, hidden, _ROBUST, False))
+    compiled = jax.jit(finish).lower(*like).compile(quick_compile())
     assumed = effective_noise(machine, pieces, noise)
-    estimates, notes = [], []
-    for i in range(states.result_mean.shape[0]):
-        mean, cov = states.result_mean[i], states.result_cov[i]
+
+    def passes(mean: Any, cov: Any) -> tuple[Any, Any]:
         misfit, weighed, center = hidden, pieces, mean
         for k in range(_PASSES):
-            robust = 0 if k else _ROBUST
-            given = placed((center, cov, weighed, misfit, robust))
-            found, error = finish(*given)
+            given = (center, cov, weighed, misfit, 0 if k else _ROBUST, k > 0)
+            found, error = compiled(*placed(given))
             misfit = jnp.maximum(misfit_of(error, assumed, weighed.weight), hidden)
             weight = outlier_weights(error, assumed, misfit, _OUTLIER)
             weighed = replace(pieces, weight=pieces.weight * weight)
             center = found.distribution.mean
-        found = found.replace(search_mean=mean, search_cov=cov)
-        estimates.append(found)
-        if i == 0:
-            odd = np.flatnonzero(np.asarray(weight) < 0.5)
-            if odd.size:
-                notes.append(
-                    f"{odd.size} of {pieces.count} pieces of {steps * machine.dt:g} s "
-                    "fit much worse than the rest and weigh less than half "
-                    "(a bump, a wrong reading, or motion that the model lacks)"
-                )
-    return estimates, notes
+        return found.replace(search_mean=mean, search_cov=cov), weight
+
+    def estimates(states: Any) -> tuple[list[Any], list[str]]:
+        both = zip(states.result_mean, states.result_cov, strict=True)
+        results = [passes(mean, cov) for mean, cov in both]
+        odd = np.flatnonzero(np.asarray(results[0][1]) < 0.5)
+        notes = []
+        if odd.size:
+            notes.append(
+                f"{odd.size} of {pieces.count} pieces of {steps * machine.dt:g} s "
+                "fit much worse than the rest and weigh less than half "
+                "(a bump, a wrong reading, or motion that the model lacks)"
+            )
+        return [found for found, _ in results], notes
+
+    return estimates

@@ -1,6 +1,7 @@
 """What an identification from logs leaves in its folder."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from train._log_problem import Problem
@@ -135,8 +136,10 @@ def _errors(problem: Problem, means: Sequence[Any], space: Any) -> dict[str, Any
     import jax.numpy as jnp
     import numpy as np
 
-    from easi_jax.log_data import noise_floor, open_loop_error, segments_from_runs
+    from easi_jax.log_data import errors_and_floor, segments_from_runs
+    from easi_jax.runtime import quick_compile
     from easi_jax.segments import to_device
+    from train._stages import placed
 
     machine, nv = problem.machine, problem.machine.mj_model.nv
     every = max(1, problem.steps // 2)
@@ -145,29 +148,32 @@ def _errors(problem: Problem, means: Sequence[Any], space: Any) -> dict[str, Any
         for runs in (problem.held, problem.fit)
     )
     noise = jnp.asarray(problem.noise, jnp.result_type(float))
-    error = jax.jit(lambda theta, s: open_loop_error(machine, machine.model(theta), s))
-    floor = jax.jit(
-        lambda theta: noise_floor(
-            machine, machine.model(theta), held, noise, jax.random.key(0)
-        )
-    )
-    nominal = jnp.asarray(space.nominal, jnp.result_type(float))
-    scale = jnp.maximum(error(nominal, fit), 1e-12)
+
+    @partial(jax.jit, compiler_options=quick_compile())
+    def errors(theta: Any) -> Any:
+        model = machine.model(theta)
+        return errors_and_floor(machine, model, held, fit, noise, jax.random.key(0))
+
+    def found(theta: Any) -> Any:
+        return jax.device_get(errors(placed(theta)))
+
+    before, scale, _ = found(jnp.asarray(space.nominal, jnp.result_type(float)))
+    scale = np.maximum(scale, 1e-12)
     seeds = []
     for unit in means:
-        theta = space.to_si(unit)
+        after, own, floor = found(space.to_si(unit))
         seeds.append(
             {
-                "held_out": np.asarray(error(theta, held)).tolist(),
-                "fit": float(jnp.mean((error(theta, fit) / scale) ** 2)),
-                "floor": np.asarray(floor(theta)).tolist(),
+                "held_out": after.tolist(),
+                "fit": float(np.mean((own / scale) ** 2)),
+                "floor": floor.tolist(),
             }
         )
     names = [n.removeprefix("qpos.") for n in machine.state_names[:nv]]
     return {
         "channels": names,
         "units": _units(machine.mj_model),
-        "before": np.asarray(error(nominal, held)).tolist(),
+        "before": before.tolist(),
         "seeds": seeds,
     }
 

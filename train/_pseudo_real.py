@@ -41,6 +41,7 @@ def run(config: "Config") -> None:
         stage_keys,
         target_parameters,
     )
+    from easi_jax.runtime import fast_loops
 
     udr = load_udr(config.udr, config.env)
     seeds = config.seeds or udr["seeds"]
@@ -101,7 +102,7 @@ def run(config: "Config") -> None:
         training = states if pipe.search.trainer else ()
         advance = jit_chunks(
             lambda s, demos, policies, n: pipe.search_chunk(s, demos, policies, n),
-            fast=True,
+            fast_loops(),
         )
         found = run_stage(
             folder,

@@ -2,14 +2,16 @@
 
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from train._command import progress
 
 if TYPE_CHECKING:
     from easi_jax.io.runs import RunFolder
 
+T = TypeVar("T")
 Rows = list[tuple[int, dict[str, float]]]
 
 
@@ -94,6 +96,17 @@ def placed(tree: Any) -> Any:
 
     everywhere = NamedSharding(make_mesh(), PartitionSpec())
     return jax.device_put(jax.tree.map(strong, tree), everywhere)
+
+
+def started(work: Callable[[], T]) -> Callable[[], T]:
+    """Begins ``work`` beside what follows; the function waits for its result.
+
+    For compiling, which leaves other cores and the interpreter mostly free.
+    """
+    pool = ThreadPoolExecutor(1)
+    result = pool.submit(work).result
+    pool.shutdown(wait=False)
+    return result
 
 
 def training_rows(seeds: Sequence[int], per_step: int) -> Callable[[int, Any], Rows]:
@@ -190,16 +203,14 @@ def search_check(
     return check
 
 
-def jit_chunks(fun: Callable[..., Any], fast: bool = False) -> Callable[..., Any]:
+def jit_chunks(
+    fun: Callable[..., Any], options: dict[str, Any] | None = None
+) -> Callable[..., Any]:
     """``fun(*arrays, n)`` compiled once for each chunk length.
 
-    ``fast`` is for what simulates for long: slower to compile, faster to run.
+    ``options`` of the compiler are such as those of `easi_jax.runtime`.
     """
     import jax
-
-    from easi_jax.runtime import fast_loops
-
-    options = fast_loops() if fast else None
 
     compiled: dict[int, Any] = {}
 

@@ -11,9 +11,9 @@ import pytest
 from easi_jax.configuration import Configuration
 from easi_jax.errors import UserError
 from easi_jax.log_data import (
+    errors_and_floor,
     estimate_noise,
     misfit_of,
-    noise_floor,
     open_loop_error,
     outlier_weights,
     rows_of,
@@ -191,8 +191,12 @@ def test_error_of_the_true_model_is_the_noise_floor(machine):
     noise = jnp.asarray(estimate_noise(run), jnp.float32)
     truth = machine.model(jnp.asarray(machine.space.nominal, jnp.float32))
     error = open_loop_error(machine, truth, pieces)
-    floor = noise_floor(machine, truth, pieces, noise, jax.random.key(0))
+    odd = pieces.take(slice(1, None, 2))
+    key = jax.random.key(0)
+    same, on_odd, floor = errors_and_floor(machine, truth, pieces, odd, noise, key)
     np.testing.assert_allclose(error, floor, rtol=0.15)
+    np.testing.assert_allclose(same, error, rtol=1e-4)
+    np.testing.assert_allclose(on_odd, open_loop_error(machine, truth, odd), rtol=1e-4)
     wrong = open_loop_error(machine, machine.model(jnp.asarray([5.0])), pieces)
     assert float(wrong[0]) > 2 * float(error[0])
     first = rows_of(run, 0, 21)

@@ -143,17 +143,17 @@ def test_a_short_first_stage_leads_past_wrong_minima() -> None:
     noise = jnp.array([1e-4, 1e-4, 1e-3, 1e-3])
 
     @jax.jit
-    def run(unit: jax.Array, short_first: bool) -> RefineResult:
+    def run(unit: jax.Array, near: bool) -> RefineResult:
         return refine(
             *(machine, space, unit, pieces, noise),
             free_starts=False,
-            short_first=short_first,
+            near=near,
         )
 
     wrong = space.to_unit(jnp.asarray(space.nominal * np.exp(_WRONG)))
     errors = []
-    for short_first in (False, True):
-        out = run(wrong, short_first)
+    for near in (True, False):
+        out = run(wrong, near)
         ratio = np.asarray(space.to_si(out.unit)) / space.nominal
         errors.append(np.abs(np.log(ratio)).max())
     assert errors[0] > 0.5

@@ -332,6 +332,7 @@ def test_a_stopped_run_goes_on_bit_equal(files, tmp_path):
         if blow == signal.SIGINT:
             assert status == 130
             assert "--resume" in said and "Traceback" not in said
+            assert said.splitlines()[-1].startswith("interrupted;")
         call(*args, "--resume")
         resumed[blow] = found.read_bytes()
     call(*args, "--overwrite")
