@@ -30,14 +30,17 @@ def run(config: Any) -> None:
         resume=config.resume,
         overwrite=config.overwrite,
     ) as folder:
-        from train._log_results import write
+        from train._log_results import ready_errors, write
         from train._stages import started
 
         finish = started(lambda: _ready_finish(problem, search, config.refine))
         states = _search(folder, config, search, problem, seeds)
+        errors = started(lambda: ready_errors(problem, search.space))
         estimates, outliers = finish()(states)
         problem.notes.extend(outliers)
-        columns, rows, errors = write(folder, problem, search, estimates, seeds)
+        columns, rows, errors = write(
+            folder, problem, search, estimates, seeds, errors()
+        )
     show_table(f"Parameters of {problem.name}", columns, rows)
     show_table(*errors)
     for note in problem.notes:

@@ -1,7 +1,6 @@
 """What an identification from logs leaves in its folder."""
 
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from train._log_problem import Problem
@@ -16,8 +15,12 @@ def write(
     search: Any,
     estimates: Sequence[Any],
     seeds: Sequence[int],
+    errors_of: Callable[[Any], Any],
 ) -> tuple[Any, Any, Any]:
     """Writes distribution.json, figures and report.html.
+
+    Args:
+        errors_of: of `ready_errors`.
 
     Returns:
         Columns and rows of the parameter table, and the error table as
@@ -37,7 +40,8 @@ def write(
         results.append(
             seed_result(space, found.distribution.mean, root @ root.T, found.hessian)
         )
-    errors = _errors(problem, [found.distribution.mean for found in estimates], space)
+    means = [found.distribution.mean for found in estimates]
+    errors = _errors(problem, means, space, errors_of)
     best = int(np.argmin([e["fit"] for e in errors["seeds"]]))
     result, after = results[best], errors["seeds"][best]["held_out"]
     before, floor = errors["before"], errors["seeds"][best]["floor"]
@@ -130,38 +134,44 @@ def write(
     )
 
 
-def _errors(problem: Problem, means: Sequence[Any], space: Any) -> dict[str, Any]:
-    """Open-loop errors, the model as given and each seed's."""
+def ready_errors(problem: Problem, space: Any) -> Callable[[Any], Any]:
+    """Compiles what takes SI parameters to `easi_jax.log_data.errors_and_floor`."""
     import jax
     import jax.numpy as jnp
-    import numpy as np
 
     from easi_jax.log_data import errors_and_floor, segments_from_runs
     from easi_jax.runtime import quick_compile
     from easi_jax.segments import to_device
     from train._stages import placed
 
-    machine, nv = problem.machine, problem.machine.mj_model.nv
-    every = max(1, problem.steps // 2)
+    machine, every = problem.machine, max(1, problem.steps // 2)
     held, fit = (
         to_device(segments_from_runs(machine, runs, problem.steps, every, fitted=True))
         for runs in (problem.held, problem.fit)
     )
     noise = jnp.asarray(problem.noise, jnp.result_type(float))
 
-    @partial(jax.jit, compiler_options=quick_compile())
     def errors(theta: Any) -> Any:
         model = machine.model(theta)
         return errors_and_floor(machine, model, held, fit, noise, jax.random.key(0))
 
-    def found(theta: Any) -> Any:
-        return jax.device_get(errors(placed(theta)))
+    like = placed(jnp.zeros(space.size))
+    compiled = jax.jit(errors).lower(like).compile(quick_compile())
+    return lambda theta: jax.device_get(compiled(placed(theta)))
 
-    before, scale, _ = found(jnp.asarray(space.nominal, jnp.result_type(float)))
+
+def _errors(
+    problem: Problem, means: Sequence[Any], space: Any, errors_of: Callable[[Any], Any]
+) -> dict[str, Any]:
+    """Open-loop errors, the model as given and each seed's."""
+    import jax.numpy as jnp
+    import numpy as np
+
+    before, scale, _ = errors_of(jnp.asarray(space.nominal, jnp.result_type(float)))
     scale = np.maximum(scale, 1e-12)
     seeds = []
     for unit in means:
-        after, own, floor = found(space.to_si(unit))
+        after, own, floor = errors_of(space.to_si(unit))
         seeds.append(
             {
                 "held_out": after.tolist(),
@@ -169,7 +179,9 @@ def _errors(problem: Problem, means: Sequence[Any], space: Any) -> dict[str, Any
                 "floor": floor.tolist(),
             }
         )
-    names = [n.removeprefix("qpos.") for n in machine.state_names[:nv]]
+    machine = problem.machine
+    coordinates = machine.state_names[: machine.mj_model.nv]
+    names = [n.removeprefix("qpos.") for n in coordinates]
     return {
         "channels": names,
         "units": _units(machine.mj_model),
