@@ -62,6 +62,7 @@ class Model:
         loss: cross-validated squared error of each block, per window, ``(blocks,)``.
         gap: the same in units of the gap; squared, ``(blocks,)``.
         own: indices of the model's own fitted parameters.
+        unlikely: for how many reasons few machines have these effects.
     """
 
     places: list[Place]
@@ -69,6 +70,7 @@ class Model:
     loss: np.ndarray
     gap: np.ndarray
     own: tuple[int, ...] = field(default=())
+    unlikely: int = 0
 
 
 class Selector:
@@ -135,7 +137,8 @@ class Selector:
 
     def model(self, places: list[Place], fit: Fitted) -> Model:
         """A fit with its cross-validated loss."""
-        return Model(places, fit, *self.cross_validated(fit), self.own)
+        unlikely = sum(p.unlikely(fit.x[self.columns(p, fitted=False)]) for p in places)
+        return Model(places, fit, *self.cross_validated(fit), self.own, unlikely)
 
     def fit(self, places: list[Place], x: np.ndarray) -> Model:
         """The best fit of some effects from ``x``."""
@@ -326,9 +329,8 @@ def advantage(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def rank(model: Model) -> float:
-    """Cross-validated loss, with a handicap for effects that machines rarely have."""
-    rare = sum(p.effect in RARE for p in model.places)
-    return float(model.loss.mean()) * (1.0 + _RARE * rare)
+    """Cross-validated loss, with a handicap for what machines rarely have."""
+    return float(model.loss.mean()) * (1.0 + _RARE * model.unlikely)
 
 
 def better(model: Model, base: Model, floor: float) -> bool:

@@ -58,6 +58,11 @@ RARE = (
 )
 
 
+# Sizes beyond which an effect is as unlikely as a rare one: a motor is rarely 2.5 times
+# weaker than its data sheet, but may well carry a load that nobody told of.
+_UNUSUAL = {"actuator_gain": (0.4, 2.5), "gravity_tilt": (-0.25, 0.25)}
+
+
 # Effects that are also quantities which a model states and a refit may move.
 REFITTED = {
     "viscous_damping": "damping",
@@ -120,6 +125,13 @@ class Place:
     def key(self) -> str:
         """``effect@at``."""
         return f"{self.effect}@{self.at}"
+
+    def unlikely(self, values: np.ndarray) -> int:
+        """For how many reasons few machines have it with these values of its columns:
+        a rare effect, an unusual size."""
+        low, high = _UNUSUAL.get(self.effect, (-np.inf, np.inf))
+        usual = np.all((values >= low) & (values <= high))
+        return (self.effect in RARE) + (not usual)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,7 @@
 """Fits, noise floors and whitening on problems whose answers are known."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from easi_jax.gap.selection import (
     advantage,
     better,
     probability,
+    rank,
     shortlist,
     simplest,
 )
@@ -344,6 +347,20 @@ def test_rare_effects_have_to_help_by_either_measure(
     small, large = fitted(9.8, 9.0, *both), fitted(9.0, 8.0, *both)
     assert better(small, base, 2.0) and not better(small, base, 3.0)
     assert better(large, base, 3.0)
+
+
+def test_of_twins_the_one_of_a_usual_size_comes_first(
+    model: mujoco.MjModel, runs: list[Run]
+) -> None:
+    found = {p.effect: p for p in places(model, scales_of(model, runs))}
+    gain, tilt = found["actuator_gain"], found["gravity_tilt"]
+    assert [gain.unlikely(np.array([v])) for v in (0.3, 0.7, 3.0)] == [1, 0, 1]
+    assert [tilt.unlikely(np.array([v, 0.1])) for v in (0.1, -0.3)] == [1, 2]
+    fit = Fitted(np.zeros(1), np.arange(1), np.zeros(1), np.zeros(1), 1.0)
+    even = np.ones(10)
+    weak = Model([gain], fit, even, even, unlikely=gain.unlikely(np.array([0.3])))
+    heavy = Model([found["payload_mass"]], fit, 1.05 * even, even)
+    assert rank(heavy) < rank(weak) < rank(replace(heavy, loss=1.2 * even))
 
 
 def test_what_is_contained_comes_first_where_nearly_as_good(
