@@ -411,30 +411,3 @@ def warmed(
         return commands(e, memory, u, dt, substeps)[1], None
 
     return jax.lax.scan(one, memory, past)[0]
-
-
-def reading(
-    e: Effects, before: jax.Array, q: jax.Array, v: jax.Array, dt: float
-) -> jax.Array:
-    """What late and biased sensors say of a motion.
-
-    Args:
-        before: readings at the start and after each step as they were measured, for
-            what has not arrived yet, ``(H + 1, nv)``.
-        q, v: positions and velocities at the same times, ``(H + 1, nv)``.
-
-    Returns:
-        Readings after each step, ``(H, nv)``.
-    """
-    h, nv = q.shape[0] - 1, q.shape[1]
-    when = jnp.arange(1, h + 1)[:, None] - e.late / dt
-    row = jnp.clip(jnp.floor(when), 0, h - 1).astype(jnp.int32)
-    s = when - row
-    column = jnp.arange(nv)
-    a, b = q[row, column], q[row + 1, column]
-    va, vb = v[row, column] * dt, v[row + 1, column] * dt
-    # Hermite's cubic
-    s2, s3 = s * s, s * s * s
-    between = (2 * s3 - 3 * s2 + 1) * a + (s3 - 2 * s2 + s) * va
-    between += (3 * s2 - 2 * s3) * b + (s3 - s2) * vb
-    return jnp.where(when < 0, before[1:], between + e.bias)

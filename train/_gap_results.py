@@ -396,7 +396,7 @@ def _traces(problem: Any, o: Any, w: Any) -> tuple[Any, Any, Any]:
 
     run = problem.held[0]
     held = o.held.take(w)
-    measured = np.concatenate([held.start_qpos[:, :1], held.target], 1)
+    measured = np.concatenate([held.start_qpos[:, None], held.target], 1)
     origin = np.broadcast_to(problem.model.mj_model.qpos0, measured.shape)
     seen = run.configuration.difference(origin, measured)
     pad = [(0, 0), (1, 0), (0, 0)]

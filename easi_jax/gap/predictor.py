@@ -67,15 +67,18 @@ class WindowSet:
     Attributes:
         run: index of the run.
         row: row of the run where the window starts.
-        start_qpos: measured positions at the start and in the rows after it, as far as
-            readings can be late, ``(W, R, nq)``.
-        start_qvel: fitted velocities there, ``(W, R, nv)``.
+        start_qpos: measured positions at the start, ``(W, nq)``.
+        start_qvel: fitted velocities there and in the rows after it, as far as readings
+            can be late, ``(W, 1 + L, nv)``.
         ctrl: ``(W, H, nu)``.
         past: commands before, oldest first, ``(W, D, nu)``; before a run's first row
             its first command.
         past_qpos: positions in those rows, ``(W, D, nq)``.
         past_qvel: fitted velocities there, ``(W, D, nv)``; at rest before a run.
         target: measured positions after each step, ``(W, H, nq)``.
+        later: positions in the rows after the window, ``(W, L, nq)``; after a run its
+            last.
+        led: whether the run has as many rows before the window as readings can be late.
     """
 
     run: np.ndarray
@@ -87,6 +90,8 @@ class WindowSet:
     past_qpos: np.ndarray
     past_qvel: np.ndarray
     target: np.ndarray
+    later: np.ndarray
+    led: np.ndarray
 
     def __len__(self) -> int:
         return len(self.run)
@@ -114,25 +119,30 @@ def window_set(
     parts = []
     for i, run in enumerate(runs):
         late = math.ceil(longest / run.dt - 1e-9)
-        past = math.ceil(max(longest, _BEFORE) / run.dt) + 1
+        past = math.ceil(max(2 * longest, _BEFORE) / run.dt) + 2
         w = make_windows(run, horizon_s)
         if not len(w.start_row):
             continue
         velocity = fitted_velocity(run.qpos, run.dt, run.configuration)
-        after = np.minimum(w.start_row[:, None] + np.arange(late + 1), len(run) - 1)
+        after = np.arange(late + 1)
+        last, steps = len(run) - 1, w.ctrl.shape[1]
         rows = w.start_row[:, None] + np.arange(-past, 0)
         before = np.maximum(rows, 0)
         parts.append(
             WindowSet(
                 run=np.full(len(w.start_row), first_run + i),
                 row=w.start_row,
-                start_qpos=run.qpos[after],
-                start_qvel=velocity[after],
+                start_qpos=run.qpos[w.start_row],
+                start_qvel=velocity[np.minimum(w.start_row[:, None] + after, last)],
                 ctrl=w.ctrl,
                 past=run.ctrl[before],
                 past_qpos=run.qpos[before],
                 past_qvel=np.where(rows[..., None] < 0, 0.0, velocity[before]),
                 target=w.target_qpos,
+                later=run.qpos[
+                    np.minimum(w.start_row[:, None] + steps + after[1:], last)
+                ],
+                led=w.start_row >= late,
             )
         )
     return join(parts) if parts else None
@@ -180,7 +190,11 @@ class Predictor:
         self._data = self._placed(windows)
         # Items that a device works on together.
         self._batch = max(1, self.machine.batch // BLOCK)
-        self._delay_steps = windows.start_qpos.shape[1]  # late rows, and one
+        latest = sum(
+            max((c.high for c in layout.columns if c.field == name), default=0.0)
+            for name in ("delay", "late")
+        )
+        self._delay_steps = math.ceil(latest / dt - 1e-9) + 1
         # The second is for the few predictions in which a drive has play.
         self._programs = tuple(
             jax.jit(partial(self._sharded, play), compiler_options=options)
@@ -212,6 +226,8 @@ class Predictor:
                 padded.past_qpos,
                 padded.past_qvel,
                 padded.target,
+                padded.later,
+                padded.led,
             )
         )
 
@@ -278,39 +294,46 @@ class Predictor:
         )
 
     def _window(self, model: Model, window: tuple, moved: jax.Array) -> jax.Array:
-        """Readings less measurements after each step, ``(H, nv)``."""
-        start_q, start_v, ctrl, *before, target = window
+        """Readings less measurements after each step, ``(H, nv)``.
+
+        Where readings are late, the simulation begins by the longest delay earlier, so
+        that it starts from what was read until the window's start. Each joint is
+        compared with the readings of the times that are simulated: as far from its
+        start as without delays. Where a run only begins, all is later by that delay.
+        """
+        start_q, start_v, ctrl, past, past_q, past_v, target, later, led = window
         machine, e, nv = self.machine, model.effects, self.nv
         assert e is not None
-        q, v = self._true_start(e, start_q, start_v)
-        physics = machine.start(machine.move(q, moved[:nv]), v + moved[nv:], model)
-        physics = physics.replace(memory=())
-        past, *states = before
+        early = led * jnp.max(e.late)
+        now = len(past_q) - (early - e.late) / machine.dt  # rows of the start, (nv,)
+        # From the start, so that readings are plain numbers also where q is not.
+        zero = jnp.zeros(nv)
+        difference = jax.vmap(machine.difference, (None, None, 0, None))
+        measured = jnp.concatenate([past_q, start_q[None], target, later])
+        seen = difference(start_q, zero, measured, zero)[:, :nv]
+        seen = jnp.where(self.wrapped, jnp.unwrap(seen, axis=0), seen)
+        read = _between(seen, now + jnp.arange(len(target) + 1)[:, None])
+        v = _between(jnp.concatenate([past_v, start_v]), now[None])[0]
+        q = machine.move(start_q, read[0] - e.bias + moved[:nv])
+        physics = machine.start(q, v + moved[nv:], model).replace(memory=())
         arrived = effects.command_sequence(
-            e,
+            e.replace(delay=e.delay + early),
             jnp.concatenate([past, ctrl]),
             self._delay_steps,
             machine.dt,
             machine.substeps,
         )
         if effects.turns(model.present):
-            physics = self._turned(model, physics, arrived[: len(past)], *states)
+            before = (past_q, past_v)
+            physics = self._turned(model, physics, arrived[: len(past)], *before)
 
         def step(state: Physics, u: jax.Array) -> tuple:
             state = arrived_step(model, state, u)
-            return state, (state.qpos, state.qvel)
+            return state, state.qpos
 
-        _, (qs, vs) = jax.lax.scan(step, physics, arrived[len(past) :])
-        qs = jnp.concatenate([physics.qpos[None], qs])
-        vs = jnp.concatenate([physics.qvel[None], vs])
-        # From the start, so that readings are plain numbers also where q is not.
-        zero = jnp.zeros_like(v)
-        difference = jax.vmap(machine.difference, (None, None, 0, None))
-        path = difference(start_q[0], zero, qs, zero)[:, :nv]
-        measured = jnp.concatenate([start_q[:1], target])
-        seen = difference(start_q[0], zero, measured, zero)[:, :nv]
-        told = effects.reading(e, seen, path, vs, machine.dt)
-        error = told - seen[1:]
+        _, qs = jax.lax.scan(step, physics, arrived[len(past) :])
+        path = difference(start_q, zero, qs, zero)[:, :nv]
+        error = path + e.bias - read[1:]
         turn = 2 * jnp.pi
         near = error - turn * jnp.round(error / turn)
         return jnp.where(self.wrapped, near, error)
@@ -356,22 +379,6 @@ class Predictor:
                 angle=q[-1] + twist, push=jnp.zeros(self.nv), joint=first.qvel
             )
         )
-
-    def _true_start(
-        self, e: effects.Effects, q: jax.Array, v: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """The state at the start from readings that are late and biased.
-
-        What is late is read in the rows after the start, ``q (R, nq)``.
-        """
-        at, dof = self._scalar
-        when = e.late[dof] / self.machine.dt
-        row = jnp.clip(jnp.floor(when), 0, max(q.shape[0] - 2, 0)).astype(jnp.int32)
-        s = when - row
-        after = jnp.minimum(row + 1, q.shape[0] - 1)
-        qd = (1 - s) * q[row, at] + s * q[after, at]
-        vd = (1 - s) * v[row, dof] + s * v[after, dof]
-        return q[0].at[at].set(qd - e.bias[dof]), v[0].at[dof].set(vd)
 
     def errors(
         self,
@@ -419,3 +426,18 @@ class Predictor:
     def count(self, windows: np.ndarray | None) -> int:
         """Number of windows in some blocks; all where None."""
         return len(self.windows) if windows is None else len(windows) * BLOCK
+
+
+def _between(x: jax.Array, row: jax.Array) -> jax.Array:
+    """Columns of ``x (T, n)`` at rows ``(K, n)`` that need not be whole, from 1 on.
+
+    Catmull and Rom's cubic: exact at whole rows.
+    """
+    x = jnp.concatenate([x, 2 * x[-1:] - x[-2:-1], 3 * x[-1:] - 2 * x[-2:-1]])
+    whole = jnp.floor(row).astype(jnp.int32)
+    s, column = row - whole, jnp.arange(x.shape[1])
+    a, b, c, d = (x[whole + k, column] for k in (-1, 0, 1, 2))
+    slope_b, slope_c = (c - a) / 2, (d - b) / 2
+    third = 2 * (b - c) + slope_b + slope_c
+    second = 3 * (c - b) - 2 * slope_b - slope_c
+    return b + s * (slope_b + s * (second + s * third))

@@ -147,12 +147,15 @@ class Selector:
 
     def cross_validated(self, fit: Fitted) -> tuple[np.ndarray, np.ndarray]:
         """Squared error per window of each block by a fit without it, ``(blocks,)``:
-        of whitened errors, and in units of the gap.
+        of whitened errors, and in units of the gap; inf where a prediction is not
+        finite.
 
         One Gauss-Newton step from the whole fit, exact where errors are linear.
         """
         w, r, j = self.weight, fit.residual, fit.slope
         blocks = int(self.group.max()) + 1
+        if not (np.isfinite(r).all() and np.isfinite(j).all()):
+            return np.full(blocks, np.inf), np.full(blocks, np.inf)
         a = j.shape[-1]
         out, plain = np.zeros((2, blocks))
         size = self.bounds.size[fit.active]

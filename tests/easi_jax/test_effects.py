@@ -260,17 +260,3 @@ def test_deadband(jump: float, model: mujoco.MjModel) -> None:
     beyond = 0.5 if jump else 0.3
     np.testing.assert_allclose(got[:, 0], [0, 0, beyond, -beyond], atol=1e-6)
     np.testing.assert_allclose(got[:, 1], ctrl[:, 1], atol=1e-6)
-
-
-def test_readings_are_late_and_biased(model: mujoco.MjModel) -> None:
-    dt = 0.01
-    t = dt * np.arange(21)
-    q = jnp.asarray(np.stack([np.sin(8 * t), np.cos(8 * t)], 1))
-    v = jnp.asarray(np.stack([8 * np.cos(8 * t), -8 * np.sin(8 * t)], 1))
-    e = effects.none(model).replace(
-        late=jnp.array([0.024, 0.0]), bias=jnp.array([0.0, 0.3])
-    )
-    got = np.asarray(effects.reading(e, jnp.full((21, 2), 7.0), q, v, dt))
-    np.testing.assert_allclose(got[:2, 0], 7.0)  # what is not known yet
-    np.testing.assert_allclose(got[2:, 0], np.sin(8 * (t[3:] - 0.024)), atol=1e-5)
-    np.testing.assert_allclose(got[:, 1], np.cos(8 * t[1:]) + 0.3, atol=1e-6)

@@ -49,13 +49,15 @@ def machine() -> tuple[WindowSet, list[Run]]:
     windows = WindowSet(
         run=np.zeros(len(rows), int),
         row=rows,
-        start_qpos=qpos[rows][:, None],
+        start_qpos=qpos[rows],
         start_qvel=run.qvel[rows][:, None],
         ctrl=run.ctrl[at],
         past=run.ctrl[rows][:, None],
         past_qpos=qpos[rows][:, None],
         past_qvel=run.qvel[rows][:, None],
         target=qpos[at + 1],
+        later=qpos[at + 1][:, :0],
+        led=rows >= 0,
     )
     return windows, [run]
 

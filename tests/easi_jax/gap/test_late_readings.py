@@ -1,0 +1,110 @@
+"""Predictions of readings that come late, against MuJoCo C."""
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+import pytest
+
+from easi_jax.configuration import Configuration
+from easi_jax.gap.predictor import Predictor, window_set
+from easi_jax.gap.scales import scales_of
+from easi_jax.gap.table import Layout, places
+from easi_jax.parameters import ParameterSpace
+from easi_jax.recording import Run
+from easi_jax.windows import fitted_velocity
+
+# A second joint, which the first moves, or none.
+ARM = """
+<mujoco>
+  <option timestep="0.001" integrator="implicitfast"/>
+  <worldbody>
+    <body>
+      <joint name="a" axis="0 -1 0" damping="0.3"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="0.6"/>
+      {}
+    </body>
+  </worldbody>
+  <actuator><motor name="m" joint="a"/></actuator>
+</mujoco>
+"""
+SECOND = """
+<body pos="0 0 -0.4">
+  <joint name="b" axis="0 -1 0" damping="0.01"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.3"/>
+</body>
+"""
+DT, STEPS, LATE = 0.01, 10, 0.034
+
+
+def recorded(m: mujoco.MjModel, late: tuple[float, ...]) -> Run:
+    """Angles as sensors tell them that are late by whole physics steps."""
+    d, c = mujoco.MjData(m), Configuration.of(m)
+    t = DT * np.arange(300)
+    ctrl = np.stack([2 * np.sin(7 * t) + np.sin(3.1 * t)], 1)
+    q = [d.qpos.copy()]
+    for u in ctrl:
+        d.ctrl[:] = u
+        for _ in range(STEPS):
+            mujoco.mj_step(m, d)
+            q.append(d.qpos.copy())
+    path = np.array(q)
+    row = STEPS * np.arange(len(t))[:, None] - np.round(
+        np.array(late) / m.opt.timestep
+    ).astype(int)
+    qpos = path[np.maximum(row, 0), np.arange(m.nv)]
+    return Run("r", "made", DT, t, qpos, fitted_velocity(qpos, DT, c), False, ctrl, c)
+
+
+Vector = Callable[[str, str, float], np.ndarray]
+
+
+def predictor(m: mujoco.MjModel, run: Run) -> tuple[Predictor, Vector]:
+    """Predictions, and the vector of one effect of a size."""
+    found = places(m, scales_of(m, [run]))
+    layout = Layout(m, found)
+    windows = window_set([run], 0.2, 0.1)
+    assert windows is not None
+    p = Predictor(m, ParameterSpace(()), layout, windows, DT)
+
+    def vector(effect: str, at: str, value: float) -> np.ndarray:
+        place = next(q for q in found if (q.effect, q.at) == (effect, at))
+        x = p.neutral.copy()
+        x[layout.where(place)[0]] = value
+        return x
+
+    return p, vector
+
+
+def rms(error: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean(np.square(error, dtype=float), axis=(1, 2)))
+
+
+@pytest.mark.parametrize("joint", ["a", "b"])
+def test_one_late_sensor_of_two_is_predicted(joint: str) -> None:
+    m = mujoco.MjModel.from_xml_string(ARM.format(SECOND))
+    p, _ = predictor(m, recorded(m, (0.0, 0.0)))
+    plain = rms(p.errors(p.neutral[None]))[0]  # of fitted start velocities
+    run = recorded(m, (LATE, 0.0) if joint == "a" else (0.0, LATE))
+    p, vector = predictor(m, run)
+    right = vector("sensor_delay", joint, LATE)
+    ignored, known = rms(p.errors(np.stack([p.neutral, right])))
+    assert (ignored > 5 * plain).all()
+    assert (known < 1.1 * plain).all()
+
+
+def test_lateness_buys_no_shorter_prediction() -> None:
+    """With one joint, late readings and late commands are the same thing."""
+    m = mujoco.MjModel.from_xml_string(ARM.format(""))
+    run = recorded(m, (0.0,))
+    m.body_mass[1] *= 1.5  # a wrong model, with nothing late
+    m.body_inertia[1] *= 1.5
+    p, vector = predictor(m, run)
+    each = [
+        vector("sensor_delay", "a", LATE),
+        vector("actuator_delay", "m", LATE),
+    ]
+    errors = p.errors(np.stack([p.neutral, *each]))
+    plain, sensor, command = rms(errors[:, p.windows.led])[:, 0]
+    assert sensor == pytest.approx(command, rel=1e-3)
+    assert sensor > 0.7 * plain
