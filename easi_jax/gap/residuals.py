@@ -94,7 +94,9 @@ def start_sensitivity(
     for i in range(2 * nv):
         moved[2 * i, :, i], moved[2 * i + 1, :, i] = step[i], -step[i]
     got = predictor.errors(np.repeat(x[None], 4 * nv, 0), blocks, moved)
-    return (got[0::2] - got[1::2]) / (2 * step)[:, None, None, None]
+    slope = (got[0::2] - got[1::2]) / (2 * step)[:, None, None, None]
+    # One prediction in thousands is not finite; it must not spoil all windows.
+    return np.where(np.isfinite(slope), slope, 0.0)
 
 
 def make_residuals(

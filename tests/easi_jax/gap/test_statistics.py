@@ -8,7 +8,14 @@ import pytest
 
 from easi_jax.configuration import Configuration
 from easi_jax.gap import measure
-from easi_jax.gap.fit import Bounds, Fitted, least_squares, lockstep, window_weights
+from easi_jax.gap.fit import (
+    Bounds,
+    Fitted,
+    bounds_of,
+    least_squares,
+    lockstep,
+    window_weights,
+)
 from easi_jax.gap.outcome import for_people
 from easi_jax.gap.predictor import Predictor, window_set
 from easi_jax.gap.residuals import make_residuals, start_sensitivity, step_groups
@@ -16,6 +23,7 @@ from easi_jax.gap.scales import scales_of
 from easi_jax.gap.selection import (
     Candidate,
     Model,
+    Selector,
     advantage,
     better,
     probability,
@@ -321,6 +329,24 @@ def test_a_run_that_the_others_contradict_is_told() -> None:
     ((odd, times),) = measure.odd_runs(square, scale, run).items()
     assert odd == 2 and times == pytest.approx(5.0, rel=0.2)
     assert measure.odd_runs(square[20:], scale, run[20:]) == {}, "one of two: which?"
+
+
+def test_what_is_not_finite_loses(model: mujoco.MjModel, runs: list[Run]) -> None:
+    """Physics in single precision fails now and then; the command must not."""
+    layout = Layout(model, places(model, scales_of(model, runs)))
+    windows = window_set(runs, 0.2, 0.03)
+    assert windows is not None
+    predictor = Predictor(model, ParameterSpace(()), layout, windows, DT)
+    bounds = bounds_of(ParameterSpace(()), layout)
+    count, blocks = len(windows), np.arange(predictor.blocks)
+    group = np.arange(count) % 5
+    selector = Selector(predictor, blocks, count, bounds, group, ())
+    residual = np.ones((count, 4))
+    residual[3, 2] = np.nan
+    fit = Fitted(predictor.neutral, np.array([0]), residual, residual[..., None], 1.0)
+    loss, gap = selector.cross_validated(fit)
+    assert loss.shape == gap.shape == (5,)
+    assert np.isinf(loss).all() and np.isinf(gap).all()
 
 
 def test_rare_effects_have_to_help_by_either_measure(
