@@ -6,7 +6,6 @@ push of a physics step, found in a few shorter parts in which the joint is taken
 as heavy as a torque there meets it.
 """
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import flax.struct
@@ -14,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import numpy.typing as npt
 
 from easi_jax.quantities import is_scalar
 
@@ -74,10 +74,11 @@ def felt_inertia(m: mujoco.MjModel) -> np.ndarray:
     return 1.0 / np.diag(np.linalg.inv(full))
 
 
-def first_rotor(
-    scalar: Sequence[tuple[int, int]] | np.ndarray, qpos: jax.Array, qvel: jax.Array
-) -> Rotor:
-    """Drives in the middle of their play, at the joints' speeds."""
+def first_rotor(scalar: npt.ArrayLike, qpos: jax.Array, qvel: jax.Array) -> Rotor:
+    """Drives in the middle of their play, at the joints' speeds.
+
+    ``scalar``: places in ``qpos`` and ``qvel`` of the hinges and slides, ``(k, 2)``.
+    """
     at, dof = np.array(scalar, int).reshape(-1, 2).T
     zero = jnp.zeros_like(qvel)
     return Rotor(zero.at[dof].set(qpos[at]), qvel, zero, qvel)
