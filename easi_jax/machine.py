@@ -20,8 +20,9 @@ from easi_jax.physics import WRITTEN_OUT, Physics, at_rest, control_step
 from easi_jax.quantities import is_scalar, joint_name
 from easi_jax.recording import physics_steps
 
-_BATCH = 2048  # benchmarks/speed.py
-_WIDE_BATCH = 160  # benchmarks/physics.py
+# Small enough for XLA to run a simulation as one piece (see `runtime`).
+_BATCH = 128  # benchmarks/speed.py
+_WIDE_BATCH = 32  # benchmarks/physics.py
 _SETTLED = 4.0  # time constants after which a lag has forgotten
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend import core as jex_core
 
-MAX_ENTRIES = 30_000  # computed by all operations together: beyond, code gets too long
+MAX_ENTRIES = 60_000  # computed by all operations together: beyond, code gets too long
 _REMEMBERED = 32  # programs
 _UNROLLED = 8  # steps of an inner scan that are written out
 

@@ -60,7 +60,7 @@ def gap_json(problem: Any, outcome: Any) -> dict[str, Any]:
 
     c, m = outcome.channels, problem.model.mj_model
     last = outcome.after if outcome.found else outcome.refit
-    places = where(last.errors, outcome.conditions, m, c)
+    places = where(last.errors, last.conditions, m, c)
     listed = [
         {
             "effect": f.place.effect,
@@ -363,10 +363,10 @@ def _residual_map(problem: Any, o: Any) -> list[Any]:
     from easi_jax.quantities import scalar_dofs
 
     c, m = o.channels, problem.model.mj_model
-    joints, names, before = condition_errors(o.before.errors, o.conditions, m, c)
+    joints, names, before = condition_errors(o.before.errors, o.before.conditions, m, c)
     if not joints:
         return []
-    *_, after = condition_errors(o.after.errors, o.conditions, m, c)
+    *_, after = condition_errors(o.after.errors, o.after.conditions, m, c)
     dofs = np.array([d for _, d in scalar_dofs(m).values()])
     used = dofs[np.isfinite(c.scale[dofs])]
     floor = np.maximum(o.floor_si[used] / c.scale[used], 1e-12)
@@ -394,12 +394,26 @@ def _telling(o: Any) -> Any:
 def _traces(problem: Any, o: Any, w: Any) -> tuple[Any, Any, Any]:
     import numpy as np
 
-    run = problem.held[0]
-    held = o.held.take(w)
-    measured = np.concatenate([held.start_qpos[:, None], held.target], 1)
-    origin = np.broadcast_to(problem.model.mj_model.qpos0, measured.shape)
-    seen = run.configuration.difference(origin, measured)
-    pad = [(0, 0), (1, 0), (0, 0)]
-    before = seen + np.pad(o.before.errors[w], pad)
-    after = seen + np.pad((o.after if o.found else o.refit).errors[w], pad)
-    return seen, before, after
+    last = o.after if o.found else o.refit
+    configuration = problem.held[0].configuration
+    found = []
+    for figures in (o.before, last):
+        positions = figures.conditions.positions[w]
+        origin = np.broadcast_to(problem.model.mj_model.qpos0, positions.shape)
+        seen = configuration.difference(origin, positions)
+        error = np.pad(figures.errors[w], [(0, 0), (1, 0), (0, 0)])
+        found.append((seen, seen + error))
+    (measured, before), (_, after) = found
+    return measured, before, _on_rows(after, last.rows.readings[w], o.held.row[w])
+
+
+def _on_rows(path: Any, rows: Any, first: Any) -> Any:
+    """Paths ``(W, T, nv)`` at ``rows`` as they are at T rows from ``first`` on, NaN
+    where they do not reach."""
+    import numpy as np
+
+    out = np.full(path.shape, np.nan)
+    at = rows - first[:, None, None]
+    w, t, d = np.nonzero((at >= 0) & (at < path.shape[1]))
+    out[w, at[w, t, d], d] = path[w, t, d]
+    return out

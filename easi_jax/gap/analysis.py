@@ -203,12 +203,15 @@ class Analysis:
         errors = self.predictor.errors(x[None], self.held_blocks)[0][: len(self.held)]
         square = measure.squares(errors)
         scale = self.channels.scale
+        rows = self.predictor.rows(x, self.held)
         return Figures(
             float(measure.gap(square.mean(0), scale)),
             measure.interval(square, scale),
             np.sqrt(square.mean(0)),
             square,
             errors,
+            rows,
+            Conditions(self.m, self.held, self.runs, rows),
         )
 
     def floor(self, x: np.ndarray) -> np.ndarray:
@@ -445,7 +448,6 @@ class Analysis:
             floor_si=np.sqrt(floor),
             channels=self.channels,
             held=self.held,
-            conditions=Conditions(self.m, self.held, self.runs),
             x=x,
             active=model.fit.active.tolist(),
             disagreeing=self.disagreeing(x, after),

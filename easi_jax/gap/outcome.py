@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from easi_jax.gap.measure import Channels
-from easi_jax.gap.predictor import WindowSet
+from easi_jax.gap.predictor import Rows, WindowSet
 from easi_jax.gap.table import Place
 from easi_jax.gap.where import Conditions
 
@@ -43,6 +43,8 @@ class Figures:
         si: RMS error of each degree of freedom, ``(nv,)``.
         square: mean squares of each window, ``(W, nv)``.
         errors: of every step, ``(W, H, nv)``.
+        rows: of the runs, that the errors belong to.
+        conditions: what was going on there.
     """
 
     gap: float
@@ -50,6 +52,8 @@ class Figures:
     si: np.ndarray
     square: np.ndarray
     errors: np.ndarray
+    rows: Rows
+    conditions: Conditions
 
 
 @dataclass
@@ -57,7 +61,6 @@ class Outcome:
     """What the workflow found; see the log format's ``gap.json``.
 
     Attributes:
-        conditions: what was going on in the held-out windows.
         x: the whole vector at the end, and ``active`` its entries that the last fit
             moved.
         disagreeing: runs that the model predicts far worse than the others, with how
@@ -75,7 +78,6 @@ class Outcome:
     floor_si: np.ndarray
     channels: Channels
     held: WindowSet
-    conditions: Conditions
     x: np.ndarray
     active: list[int]
     notes: list[str] = field(default_factory=list)

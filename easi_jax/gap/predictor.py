@@ -36,6 +36,7 @@ from easi_jax.runtime import fast_loops, quick_compile
 from easi_jax.windows import fitted_velocity, make_windows
 
 BLOCK = 16  # windows
+_ITEMS = 4  # that a device works on together: many requests ask for few
 _BEFORE = 0.6  # s before a window in which a drive with play finds its side
 _ROW = 0.01  # s of it at a time
 
@@ -68,29 +69,30 @@ class WindowSet:
         run: index of the run.
         row: row of the run where the window starts.
         start_qpos: measured positions at the start, ``(W, nq)``.
-        start_qvel: fitted velocities there and in the rows after it, as far as readings
-            can be late, ``(W, 1 + L, nv)``.
         ctrl: ``(W, H, nu)``.
         past: commands before, oldest first, ``(W, D, nu)``; before a run's first row
             its first command.
         past_qpos: positions in those rows, ``(W, D, nq)``.
         past_qvel: fitted velocities there, ``(W, D, nv)``; at rest before a run.
         target: measured positions after each step, ``(W, H, nq)``.
-        later: positions in the rows after the window, ``(W, L, nq)``; after a run its
-            last.
+        read: way from the start to the positions of the rows from ``L + 1`` before it
+            to ``H + L`` after, tangents ``(W, 2 L + 2 + H, nv)``, where readings can be
+            L rows late; beyond a run its first or last.
+        speed: fitted velocities from ``L + 1`` rows before the start to L after,
+            ``(W, 2 L + 2, nv)``; at rest before a run.
         led: whether the run has as many rows before the window as readings can be late.
     """
 
     run: np.ndarray
     row: np.ndarray
     start_qpos: np.ndarray
-    start_qvel: np.ndarray
     ctrl: np.ndarray
     past: np.ndarray
     past_qpos: np.ndarray
     past_qvel: np.ndarray
     target: np.ndarray
-    later: np.ndarray
+    read: np.ndarray
+    speed: np.ndarray
     led: np.ndarray
 
     def __len__(self) -> int:
@@ -99,6 +101,20 @@ class WindowSet:
     def take(self, index: np.ndarray) -> "WindowSet":
         """Some of the windows."""
         return WindowSet(*(getattr(self, f)[index] for f in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of a run, to the nearest, that predictions of windows are about; some may
+    lie beyond its ends.
+
+    Attributes:
+        readings: those of each degree of freedom, ``(W, H + 1, nv)``.
+        commands: that act in the meantime, ``(W, H)``.
+    """
+
+    readings: np.ndarray
+    commands: np.ndarray
 
 
 def join(sets: Sequence[WindowSet]) -> WindowSet:
@@ -116,36 +132,42 @@ def window_set(
         longest: delay of commands and readings that predictions allow for [s].
         first_run: index of the first of ``runs``.
     """
-    parts = []
-    for i, run in enumerate(runs):
-        late = math.ceil(longest / run.dt - 1e-9)
-        past = math.ceil(max(2 * longest, _BEFORE) / run.dt) + 2
-        w = make_windows(run, horizon_s)
-        if not len(w.start_row):
-            continue
-        velocity = fitted_velocity(run.qpos, run.dt, run.configuration)
-        after = np.arange(late + 1)
-        last, steps = len(run) - 1, w.ctrl.shape[1]
-        rows = w.start_row[:, None] + np.arange(-past, 0)
-        before = np.maximum(rows, 0)
-        parts.append(
-            WindowSet(
-                run=np.full(len(w.start_row), first_run + i),
-                row=w.start_row,
-                start_qpos=run.qpos[w.start_row],
-                start_qvel=velocity[np.minimum(w.start_row[:, None] + after, last)],
-                ctrl=w.ctrl,
-                past=run.ctrl[before],
-                past_qpos=run.qpos[before],
-                past_qvel=np.where(rows[..., None] < 0, 0.0, velocity[before]),
-                target=w.target_qpos,
-                later=run.qpos[
-                    np.minimum(w.start_row[:, None] + steps + after[1:], last)
-                ],
-                led=w.start_row >= late,
-            )
-        )
-    return join(parts) if parts else None
+    sets = [
+        _windows_of(run, first_run + i, horizon_s, longest)
+        for i, run in enumerate(runs)
+    ]
+    sets = [s for s in sets if len(s)]
+    return join(sets) if sets else None
+
+
+def _windows_of(run: Run, number: int, horizon_s: float, longest: float) -> WindowSet:
+    late = math.ceil(longest / run.dt - 1e-9)
+    past = math.ceil(max(2 * longest, _BEFORE) / run.dt) + 2
+    w = make_windows(run, horizon_s)
+    velocity = fitted_velocity(run.qpos, run.dt, run.configuration)
+    start, steps = w.start_row[:, None], w.ctrl.shape[1]
+
+    def inside(rows: np.ndarray) -> np.ndarray:
+        return np.clip(rows, 0, len(run) - 1)
+
+    def moving(rows: np.ndarray) -> np.ndarray:
+        return np.where(rows[..., None] < 0, 0.0, velocity[inside(rows)])
+
+    before = start + np.arange(-past, 0)
+    seen = start + np.arange(-late - 1, steps + late + 1)
+    return WindowSet(
+        run=np.full(len(w.start_row), number),
+        row=w.start_row,
+        start_qpos=run.qpos[w.start_row],
+        ctrl=w.ctrl,
+        past=run.ctrl[inside(before)],
+        past_qpos=run.qpos[inside(before)],
+        past_qvel=moving(before),
+        target=w.target_qpos,
+        read=run.configuration.difference(run.qpos[start], run.qpos[inside(seen)]),
+        speed=moving(start + np.arange(-late - 1, late + 1)),
+        led=w.start_row >= late,
+    )
 
 
 class Predictor:
@@ -188,8 +210,6 @@ class Predictor:
         self._mesh = make_mesh()
         self.blocks = -(-len(windows) // BLOCK)
         self._data = self._placed(windows)
-        # Items that a device works on together.
-        self._batch = max(1, self.machine.batch // BLOCK)
         latest = sum(
             max((c.high for c in layout.columns if c.field == name), default=0.0)
             for name in ("delay", "late")
@@ -210,6 +230,8 @@ class Predictor:
         """The windows in blocks, on all devices; the last is repeated to fill them."""
         fill = np.minimum(np.arange(self.blocks * BLOCK), len(windows) - 1)
         padded = windows.take(fill)
+        read = padded.read
+        read = np.where(self.wrapped, np.unwrap(read, axis=1), read)
         whole = NamedSharding(self._mesh, PartitionSpec())
 
         def blocks(x: np.ndarray) -> jax.Array:
@@ -220,13 +242,12 @@ class Predictor:
             blocks(x)
             for x in (
                 padded.start_qpos,
-                padded.start_qvel,
                 padded.ctrl,
                 padded.past,
                 padded.past_qpos,
                 padded.past_qvel,
-                padded.target,
-                padded.later,
+                read,
+                padded.speed,
                 padded.led,
             )
         )
@@ -246,9 +267,10 @@ class Predictor:
         Raises:
             ValueError: windows of another shape, or too many.
         """
-        mine = (getattr(self.windows, f).shape[1:] for f in ("ctrl", "past"))
-        theirs = (getattr(windows, f).shape[1:] for f in ("ctrl", "past"))
-        if tuple(mine) != tuple(theirs) or len(windows) > self.capacity:
+        parts = ("ctrl", "past", "speed")
+        mine = [getattr(self.windows, f).shape[1:] for f in parts]
+        theirs = [getattr(windows, f).shape[1:] for f in parts]
+        if mine != theirs or len(windows) > self.capacity:
             raise ValueError("windows of another shape, or more than there is room for")
         other = copy.copy(self)
         other.windows = windows
@@ -266,6 +288,20 @@ class Predictor:
             present=present,
             delay_steps=self._delay_steps,
         )
+
+    def rows(self, x: np.ndarray, windows: WindowSet) -> Rows:
+        """What the predictions of some windows under a vector are about.
+
+        Where readings are late they are those of other times than the window's.
+        """
+        e = self.layout.effects(jnp.asarray(x[self.own :], jnp.float32))
+        late = np.asarray(e.late, float) / self.machine.dt
+        early = windows.led[:, None] * late.max(initial=0.0)  # (W, 1)
+        start = windows.row[:, None] - early
+        step = np.arange(self.steps + 1)
+        readings = (start + late)[:, None] + step[:, None]
+        commands = start + step[:-1]
+        return Rows(np.round(readings).astype(int), np.round(commands).astype(int))
 
     def _sharded(
         self,
@@ -301,19 +337,14 @@ class Predictor:
         compared with the readings of the times that are simulated: as far from its
         start as without delays. Where a run only begins, all is later by that delay.
         """
-        start_q, start_v, ctrl, past, past_q, past_v, target, later, led = window
+        start_q, ctrl, past, past_q, past_v, seen, speed, led = window
         machine, e, nv = self.machine, model.effects, self.nv
         assert e is not None
         early = led * jnp.max(e.late)
-        now = len(past_q) - (early - e.late) / machine.dt  # rows of the start, (nv,)
-        # From the start, so that readings are plain numbers also where q is not.
-        zero = jnp.zeros(nv)
-        difference = jax.vmap(machine.difference, (None, None, 0, None))
-        measured = jnp.concatenate([past_q, start_q[None], target, later])
-        seen = difference(start_q, zero, measured, zero)[:, :nv]
-        seen = jnp.where(self.wrapped, jnp.unwrap(seen, axis=0), seen)
-        read = _between(seen, now + jnp.arange(len(target) + 1)[:, None])
-        v = _between(jnp.concatenate([past_v, start_v]), now[None])[0]
+        start = len(speed) // 2  # its row in both
+        now = start - (early - e.late) / machine.dt  # (nv,)
+        read = _between(seen, now + jnp.arange(self.steps + 1)[:, None])
+        v = _between(speed, now[None])[0]
         q = machine.move(start_q, read[0] - e.bias + moved[:nv])
         physics = machine.start(q, v + moved[nv:], model).replace(memory=())
         arrived = effects.command_sequence(
@@ -332,6 +363,9 @@ class Predictor:
             return state, state.qpos
 
         _, qs = jax.lax.scan(step, physics, arrived[len(past) :])
+        # From the start, so that readings are plain numbers also where q is not.
+        zero = jnp.zeros(nv)
+        difference = jax.vmap(machine.difference, (None, None, 0, None))
         path = difference(start_q, zero, qs, zero)[:, :nv]
         error = path + e.bias - read[1:]
         turn = 2 * jnp.pi
@@ -418,7 +452,7 @@ class Predictor:
 
     def _batches(self, chosen: np.ndarray) -> list[np.ndarray]:
         """Items by batches of one size; the last item fills the last of them."""
-        batch = self._batch * self._mesh.size
+        batch = _ITEMS * self._mesh.size
         pad = -len(chosen) % batch
         filled = np.concatenate([chosen, np.repeat(chosen[-1:], pad)])
         return list(filled.reshape(-1, batch))

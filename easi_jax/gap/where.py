@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.gap.measure import Channels
-from easi_jax.gap.predictor import WindowSet
+from easi_jax.gap.predictor import Rows, WindowSet
 from easi_jax.quantities import actuator_name, body_name, scalar_dofs
 from easi_jax.recording import Run
 from easi_jax.windows import fitted_velocity
@@ -41,29 +41,49 @@ class Conditions:
     Args:
         m: the model that was recorded.
         windows: of ``runs``.
+        rows: what their predictions are about.
     """
 
     def __init__(
-        self, m: mujoco.MjModel, windows: WindowSet, runs: Sequence[Run]
+        self,
+        m: mujoco.MjModel,
+        windows: WindowSet,
+        runs: Sequence[Run],
+        rows: Rows,
     ) -> None:
         self._m = m
         self._windows = windows
         self._runs = runs
         self._of_joint: dict[int, dict[str, np.ndarray]] = {}
-        self._at = windows.row[:, None] + np.arange(windows.ctrl.shape[1] + 1)
+        self._rows = rows
+        first = np.zeros(m.nq, int)  # of each position's joint, among velocities
+        for at, dof in zip(m.jnt_qposadr, m.jnt_dofadr, strict=True):
+            first[at:] = dof
+        self._position_rows = rows.readings[..., first]
 
     @cached_property
-    def _qpos(self) -> np.ndarray:
-        run = self._windows.run
-        return np.array(
-            [self._runs[r].qpos[at] for r, at in zip(run, self._at, strict=True)]
-        )
+    def positions(self) -> np.ndarray:
+        """Measured positions that predictions are compared with, ``(W, H + 1, nq)``."""
+        return self._taken([r.qpos for r in self._runs], self._position_rows)
 
     @cached_property
     def _qvel(self) -> np.ndarray:
         speed = [fitted_velocity(r.qpos, r.dt, r.configuration) for r in self._runs]
-        run = self._windows.run
-        return np.array([speed[r][at] for r, at in zip(run, self._at, strict=True)])
+        return self._taken(speed, self._rows.readings)
+
+    @cached_property
+    def _ctrl(self) -> np.ndarray:
+        rows = np.repeat(self._rows.commands[..., None], self._m.nu, -1)
+        return self._taken([r.ctrl for r in self._runs], rows)
+
+    def _taken(self, of_runs: Sequence[np.ndarray], rows: np.ndarray) -> np.ndarray:
+        column = np.arange(rows.shape[-1])
+        return np.array(
+            [
+                of_runs[r][np.clip(row, 0, len(of_runs[r]) - 1), column]
+                for r, row in zip(self._windows.run, rows, strict=True)
+            ]
+        )
 
     @cached_property
     def general(self) -> dict[str, np.ndarray]:
@@ -81,7 +101,7 @@ class Conditions:
     @cached_property
     def named(self) -> dict[str, np.ndarray]:
         """Those of one actuator or body."""
-        size = np.abs(self._windows.ctrl).mean(1)
+        size = np.abs(self._ctrl).mean(1)
         out = {}
         for a in range(self._m.nu):
             name = actuator_name(self._m, a)
@@ -99,7 +119,7 @@ class Conditions:
 
     def _made_of_joint(self, j: int) -> dict[str, np.ndarray]:
         m = self._m
-        q = self._qpos[..., m.jnt_qposadr[j]]
+        q = self.positions[..., m.jnt_qposadr[j]]
         v = self._qvel[..., m.jnt_dofadr[j]]
         typical = np.sqrt(np.mean(v**2)) + 1e-12
         up, down = v.max(1) > 0.1 * typical, v.min(1) < -0.1 * typical
@@ -122,7 +142,7 @@ class Conditions:
     @cached_property
     def _jumps(self) -> np.ndarray:
         """Largest change of each command, ``(W, nu)``."""
-        ctrl = self._windows.ctrl
+        ctrl = self._ctrl
         if ctrl.shape[1] < 2:
             return np.zeros((len(ctrl), ctrl.shape[2]))
         return np.abs(np.diff(ctrl, axis=1)).max(1)
@@ -131,16 +151,16 @@ class Conditions:
     def _touching(self) -> dict[int, np.ndarray]:
         """Windows in which a body touches something, by body."""
         m, data = self._m, mujoco.MjData(self._m)
-        steps = self._at.shape[1] - 1
+        steps = self.positions.shape[1] - 1
         out: dict[int, np.ndarray] = {}
-        for w, positions in enumerate(self._qpos):
+        for w, positions in enumerate(self.positions):
             for k in sorted({0, steps // 2, steps}):
                 data.qpos[:] = positions[k]
                 mujoco.mj_fwdPosition(m, data)
                 geoms = data.contact.geom[data.contact.dist < 0]
                 for body in np.unique(m.geom_bodyid[geoms]).tolist():
                     if m.body_weldid[body]:  # not the world
-                        mask = out.setdefault(body, np.zeros(len(self._qpos), bool))
+                        mask = out.setdefault(body, np.zeros(len(self.positions), bool))
                         mask[w] = True
         return dict(sorted(out.items()))
 

@@ -108,3 +108,27 @@ def test_lateness_buys_no_shorter_prediction() -> None:
     plain, sensor, command = rms(errors[:, p.windows.led])[:, 0]
     assert sensor == pytest.approx(command, rel=1e-3)
     assert sensor > 0.7 * plain
+
+
+def test_predictions_know_the_rows_that_they_are_about() -> None:
+    m = mujoco.MjModel.from_xml_string(ARM.format(SECOND))
+    p, vector = predictor(m, recorded(m, (0.0, LATE)))
+    w = p.windows
+    both = [p.rows(x, w) for x in (p.neutral, vector("sensor_delay", "b", LATE))]
+    plain, late = both
+    steps = np.arange(p.steps + 1)
+    np.testing.assert_array_equal(plain.readings[..., 0], w.row[:, None] + steps)
+    np.testing.assert_array_equal(plain.readings[..., 1], plain.readings[..., 0])
+    np.testing.assert_array_equal(plain.commands, plain.readings[:, :-1, 0])
+    rows = round(LATE / DT)
+    # The late joint starts from the window's row, what is simulated before it.
+    led = w.led
+    np.testing.assert_array_equal(
+        late.readings[led][..., 1], plain.readings[led][..., 1]
+    )
+    assert (plain.readings - late.readings)[led][..., 0].min() == rows
+    assert (plain.commands - late.commands)[led].min() == rows
+    first = ~led
+    assert first.any()
+    assert (late.readings - plain.readings)[first][..., 1].min() == rows
+    np.testing.assert_array_equal(late.commands[first], plain.commands[first])

@@ -1,12 +1,14 @@
 """Errors are placed where, and at the moments when, they were put."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 
 from easi_jax.configuration import Configuration
 from easi_jax.gap.measure import Channels
-from easi_jax.gap.predictor import WindowSet
+from easi_jax.gap.predictor import Rows, WindowSet
 from easi_jax.gap.where import Conditions, condition_errors, where
 from easi_jax.recording import Run
 
@@ -50,16 +52,26 @@ def machine() -> tuple[WindowSet, list[Run]]:
         run=np.zeros(len(rows), int),
         row=rows,
         start_qpos=qpos[rows],
-        start_qvel=run.qvel[rows][:, None],
         ctrl=run.ctrl[at],
         past=run.ctrl[rows][:, None],
         past_qpos=qpos[rows][:, None],
         past_qvel=run.qvel[rows][:, None],
         target=qpos[at + 1],
-        later=qpos[at + 1][:, :0],
+        read=np.zeros((len(rows), H + 2, 2)),
+        speed=run.qvel[rows][:, None],
         led=rows >= 0,
     )
     return windows, [run]
+
+
+def conditions(
+    windows: WindowSet, runs: list[Run], late: tuple[int, int] = (0, 0)
+) -> Conditions:
+    """Of predictions of readings that are late by some rows."""
+    steps = windows.ctrl.shape[1]
+    at = windows.row[:, None] + np.arange(steps + 1)
+    rows = Rows(at[..., None] + np.array(late), at[:, :-1])
+    return Conditions(MODEL, windows, runs, rows)
 
 
 def channels(scale: tuple[float, float] = (1.0, 1.0)) -> Channels:
@@ -91,7 +103,7 @@ def errors(size: np.ndarray, dof: int) -> np.ndarray:
 def test_the_condition_that_errors_were_put_under_is_told(
     machine: tuple[WindowSet, list[Run]], joint: str, text: str
 ) -> None:
-    found = Conditions(MODEL, *machine)
+    found = conditions(*machine)
     j = MODEL.joint(joint).id
     masks = {**found.general, **found.named, **found.of_joint(j)}
     assert 8 <= masks[text].sum() <= len(masks[text]) - 8
@@ -104,7 +116,7 @@ def test_the_condition_that_errors_were_put_under_is_told(
 
 
 def test_equal_errors_sit_throughout(machine: tuple[WindowSet, list[Run]]) -> None:
-    found = Conditions(MODEL, *machine)
+    found = conditions(*machine)
     even = np.full((len(machine[0]), H, 2), 0.1)
     told = where(even, found, MODEL, channels())
     assert [w.when for w in told] == ["throughout"] * 2
@@ -114,7 +126,7 @@ def test_equal_errors_sit_throughout(machine: tuple[WindowSet, list[Run]]) -> No
 def test_what_is_not_compared_has_no_share(
     machine: tuple[WindowSet, list[Run]],
 ) -> None:
-    found = Conditions(MODEL, *machine)
+    found = conditions(*machine)
     even = np.full((len(machine[0]), H, 2), 0.1)
     told = where(even, found, MODEL, channels((np.inf, 1.0)))
     assert [(w.at, w.share) for w in told] == [("turn", 1.0), ("lift", 0.0)]
@@ -125,7 +137,7 @@ def test_what_is_not_compared_has_no_share(
 def test_the_map_has_a_row_for_each_joint(
     machine: tuple[WindowSet, list[Run]],
 ) -> None:
-    found = Conditions(MODEL, *machine)
+    found = conditions(*machine)
     size = np.zeros(len(machine[0]))
     joints, names, table = condition_errors(errors(size, 0), found, MODEL, channels())
     assert joints == ["lift", "turn"] and table.shape == (2, len(names))
@@ -141,4 +153,23 @@ def test_a_window_of_one_step_has_no_jumps(
 ) -> None:
     windows, runs = machine
     single = WindowSet(**{**vars(windows), "ctrl": windows.ctrl[:, :1]})
-    assert not Conditions(MODEL, single, runs).general["when the command jumps"].any()
+    assert not conditions(single, runs).general["when the command jumps"].any()
+
+
+def test_errors_of_late_readings_belong_to_what_was_read(
+    machine: tuple[WindowSet, list[Run]],
+) -> None:
+    windows, runs = machine
+    found = conditions(windows, runs)
+    late = conditions(windows, runs, (0, 3))
+    after = conditions(replace(windows, row=windows.row + 3), runs)
+    turn = MODEL.joint("turn").id
+    then, told, now = (c.of_joint(turn)["moving down"] for c in (after, late, found))
+    np.testing.assert_array_equal(told, then)
+    assert (told != now).any()
+    lift = [c.of_joint(MODEL.joint("lift").id)["moving down"] for c in (late, found)]
+    np.testing.assert_array_equal(*lift)
+    np.testing.assert_array_equal(
+        late.positions[:-1, :, 1],
+        runs[0].qpos[windows.row[:-1, None] + 3 + np.arange(H + 1), 1],
+    )
