@@ -17,6 +17,7 @@ from typing import Any
 from train._command import main, say
 
 RESULTS = Path(__file__).parent / "results"
+LARGE = ("arm3", "leg", "arm3", "leg", "arm6")  # in turns
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Config:
     seeds: tuple[int, int] = (0, 10)
     """First seed, and the one after the last."""
     cheap: bool = False
-    """Mechanisms of one or two joints only."""
+    """Mechanisms of one or two joints; without it those of three and six, and a leg."""
     out: Path = RESULTS / "gap_cases.jsonl"
     """Where a line for each case is added."""
 
@@ -50,7 +51,10 @@ def run(config: Config) -> None:
         with tempfile.TemporaryDirectory() as folder:
             data = Path(folder) / "case"
             try:
-                draw_case(seed, config.kind, data, cheap=config.cheap)
+                mechanism = "" if config.cheap else LARGE[seed % len(LARGE)]
+                draw_case(
+                    seed, config.kind, data, cheap=config.cheap, mechanism=mechanism
+                )
             except CaseError as error:
                 say(f"{config.kind} {seed}: no case ({error})")
                 continue
@@ -95,7 +99,8 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
     """What is right in a ``gap.json``, by the answer of the case.
 
     A name is right where it is the truth's, or an exact twin of it by physics; the
-    first names have to be the truth's, in any order.
+    first names have to be the truth's, in any order (``found``). ``listed``: what is
+    among the names that the held-out data do not tell from one of those.
     """
     truth = {f"{e['effect']}@{e['at']}": set(e["twins"]) for e in answer["effects"]}
     outside = answer["kind"] == "outside"
@@ -119,6 +124,7 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
         "truth": list(truth),
         "named": named,
         "confidence": [e["confidence"] for e in told["effects"]],
+        "found": found,
         "listed": listed,
         "verdict": told["verdict"],
         "verdicts": answer["verdicts"],

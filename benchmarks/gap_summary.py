@@ -67,6 +67,14 @@ def generated(folder: Path) -> list[str]:
                 )
             )
     out.append(markdown_table(("what", "cases", "95 % (Wilson)", "goal", ""), lines))
+    strict = {
+        k: sum(r["right"] for r in rows if r["kind"] == k) for k in ("single", "pair")
+    }
+    out.append(
+        f"Right names and pairs that are named themselves: {strict['single']} and "
+        f"{strict['pair']}; the others are listed as names that the held-out data "
+        "do not tell from the one named."
+    )
     pairs = judged(rows)
     bins = [(f"{c:.2f}", f"{s:.2f}", n) for c, s, n in calibration(pairs)]
     out.append(

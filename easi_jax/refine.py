@@ -117,15 +117,16 @@ def refine(
         trusting: jax.Array,
         again: jax.Array,
     ) -> Any:
-        u, shift, damp, near, far, pieces, _ = carry
-        near, far = (
-            jnp.where(again, x, y) for x, y in zip(fresh, (near, far), strict=True)
+        u, shift, damp, unchanged, raised, pieces, _ = carry
+        unchanged, raised = (
+            jnp.where(again, x, y)
+            for x, y in zip(fresh, (unchanged, raised), strict=True)
         )
         trust = jnp.where(trusting, 1.0, _trust(pieces, segments.weight > 0))
         trusted = weight * trust[:, None, None]
         # Bisection, per parameter and side, between where a change has left the cost
         # as it was and where it has raised it: at the edge of a plateau it may fall.
-        reach = 0.5 * (near + far)
+        reach = 0.5 * (unchanged + raised)
         hops = jnp.clip(u + (reach * sides)[..., None] * ways, low, high)
         if machine.wide:
             eq, units, shifts, each = swept(u, shift, damp, hops, weight, trusted)
@@ -146,14 +147,16 @@ def refine(
         level = data[jumps].reshape(2, -1)
         flat, worse = level == data[0], ~(level <= data[0])
         chosen = (jnp.arange(level.size) == best - jumps.start).reshape(level.shape)
-        near = jnp.where(moving & flat, reach, jnp.where(chosen.any(0), 0.0, near))
-        far = jnp.where(moving & (worse | chosen), reach, far)
+        unchanged = jnp.where(
+            moving & flat, reach, jnp.where(chosen.any(0), 0.0, unchanged)
+        )
+        raised = jnp.where(moving & (worse | chosen), reach, raised)
         new = (
             units[best],
             shifts[best],
             jnp.where(moving, jnp.clip(damp, 1e-6, 1e6), carry[2]),
-            near,
-            far,
+            unchanged,
+            raised,
             each[best],
             eq.hessian,
         )

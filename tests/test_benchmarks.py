@@ -49,7 +49,9 @@ def test_goals_are_judged(tmp_path: Path, ratio: float, said: str) -> None:
     assert said in row
 
 
-def case(kind: str, truth: list[str], named: list[str], sure: float) -> dict[str, Any]:
+def case(
+    kind: str, truth: list[str], named: list[str], sure: float, listed: str = ""
+) -> dict[str, Any]:
     right = named[: len(truth)] == truth if truth else not named
     return {
         "kind": kind,
@@ -57,6 +59,8 @@ def case(kind: str, truth: list[str], named: list[str], sure: float) -> dict[str
         "named": named,
         "confidence": [sure] * len(named),
         "verdict": "explained",
+        "found": {k: k in named[: len(truth)] for k in truth},
+        "listed": {k: k == listed for k in truth},
         "right": right,
     }
 
@@ -65,13 +69,15 @@ def test_cases_of_the_gap_are_counted() -> None:
     rows = [
         case("single", ["a@x"], ["a@x"], 0.9),
         case("single", ["a@x"], ["b@x"], 0.9),
-        case("single", ["a@x"], ["b@x"], 0.3),
+        case("single", ["a@x"], ["b@x"], 0.3, listed="a@x"),
         case("none", [], [], 0.0),
         case("wrong_own", [], ["b@x"], 0.6),
         case("pair", ["a@x", "b@x"], ["a@x", "b@x"], 1.0),
     ]
+    assert not gap_score.told(case("pair", ["a@x", "b@x"], ["a@x"], 1.0))
+    assert gap_score.told(case("pair", ["a@x", "b@x"], ["a@x"], 1.0, listed="b@x"))
     got = gap_score.shares(rows)
-    assert got["right name and place first"] == (1, 3)
+    assert got["right name and place first"] == (2, 3)
     assert got["false alarms without effect"] == (1, 2)
     assert got["wrong with confidence above 0.8"] == (1, 6)
     assert got["pairs both found"] == (1, 1)
