@@ -16,8 +16,8 @@ _EMITTERS = "xla_cpu_use_fusion_emitters"
 _LEVEL = "xla_backend_optimization_level"
 _WAIT = 10**7  # s
 _EXTRA = "xla_backend_extra_options"
-# Bytes that a loop may touch and still run as one piece.
-_LOOPS = "xla_cpu_small_while_loop_byte_threshold=20000000"
+# Bytes that a loop may touch and still run as one piece; beyond, compiling takes long.
+_LOOPS = "xla_cpu_small_while_loop_byte_threshold=2000000"
 _FLAGS = {
     _EMITTERS: "false",
     _EXTRA: _LOOPS,
@@ -65,7 +65,7 @@ def prepare() -> dict[str, object]:
     - one CPU device per core, so that a mesh over them uses all of them;
     - XLA's older loop emitters, which compile faster; what simulates for long asks for
       the newer ones by `fast_loops` (measured with jaxlib 0.10.2, benchmarks/speed.py);
-    - loops that touch little memory become one function, in place of a call for each
+    - loops that touch up to 2 MB become one function, in place of a call for each
       operation of each round (a cart-pole is simulated six times as fast);
     - CPU devices wait for each other as long as it takes: XLA ends the process after a
       minute, but a device without a seed of its own waits for a chunk of training;
