@@ -167,6 +167,7 @@ def status() -> dict[str, object]:
         "one_device_per_core": devices[0].platform != "cpu" or len(devices) == cores(),
         "compilation_cache": _setting("jax_compilation_cache_dir"),
         "quick_compile": f"{_EMITTERS}=false" in os.environ.get("XLA_FLAGS", ""),
+        "loops_in_one_piece": _LOOPS in os.environ.get("XLA_FLAGS", ""),
         "matmul_precision": _setting("jax_default_matmul_precision"),
         "x64": bool(_setting("jax_enable_x64")),
         "prepared_before_backend": not _state["late"],

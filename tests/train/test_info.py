@@ -4,9 +4,13 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import pytest
 
+import envs
 from easi_jax import runtime
+from easi_jax.physics import control_step
 from train.info import measures
 
 ROOT = Path(__file__).parents[2]
@@ -68,3 +72,24 @@ def test_each_lost_measure_is_a_no(change, printed, name):
     assert state.keys() <= runtime.status().keys()
     rows = measures({**state, **change}, printed)
     assert [row[0] for row in rows if row[1] == "NO"] == [name]
+
+
+@pytest.mark.skipif(
+    not runtime.status()["loops_in_one_piece"], reason="flags of this jax are unknown"
+)
+def test_a_batch_of_simulations_runs_in_one_piece():
+    """Else each step of each substep is many calls, and takes six times as long."""
+    env = envs.make("cartpole")
+    machine = env.machine
+    model = env.model()
+    start = env.reset(model, jax.random.key(0)).physics
+    batch = jax.tree.map(lambda x: jnp.stack([x] * machine.batch), start)
+
+    @jax.jit
+    def go(states, ctrl):
+        step = jax.vmap(lambda s: control_step(model, s, ctrl, machine.substeps))
+        return jax.lax.scan(lambda s, _: (step(s), None), states, None, length=20)[0]
+
+    program = go.lower(batch, jnp.zeros(machine.mj_model.nu))
+    text = program.compile(runtime.fast_loops()).as_text()
+    assert "xla_cpu_small_call" in text
