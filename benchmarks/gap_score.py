@@ -102,7 +102,8 @@ def parameter_errors(rows: Sequence[dict[str, Any]]) -> list[float]:
     """Relative errors of the parameters of effects that were named right, one each.
 
     The parts of a vector (x, y, z; roll, pitch) are one parameter. Left out is where a
-    ripple stands in its period, which has no size.
+    ripple stands in its period and what a deadband does beyond its edge, which have no
+    size.
     """
     out = []
     for r in rows:
@@ -117,10 +118,11 @@ def parameter_errors(rows: Sequence[dict[str, Any]]) -> list[float]:
     return out
 
 
-def _grouped(parameters: Mapping[str, float]) -> list[list[str]]:
+def _grouped(parameters: Mapping[str, Any]) -> list[list[str]]:
     vectors = [[k for k in v if k in parameters] for v in _VECTORS]
     inside = {k for v in _VECTORS for k in v}
-    single = [[k] for k in parameters if k not in inside | {"phase"}]
+    unsized = {"phase"} | {k for k, v in parameters.items() if isinstance(v, str)}
+    single = [[k] for k in parameters if k not in inside | unsized]
     return [g for g in (*vectors, *single) if g]
 
 

@@ -92,7 +92,9 @@ def test_cases_of_the_gap_are_counted() -> None:
 
 def test_parameters_are_compared_as_what_they_are() -> None:
     row = case("single", ["a@x"], ["a@x"], 0.9)
-    row["true_parameters"] = [{"x": 3.0, "y": 4.0, "mass": 2.0, "phase": 1.0}]
+    row["true_parameters"] = [
+        {"x": 3.0, "y": 4.0, "mass": 2.0, "phase": 1.0, "shape": "a"}
+    ]
     row["parameters"] = [{"x": 3.0, "y": 4.5, "mass": 1.0, "phase": 7.0}]
     wrong = {**row, "named": ["b@x"]}
     assert gap_score.parameter_errors([row, wrong]) == pytest.approx([0.1, 0.5])
