@@ -66,7 +66,8 @@ def prepare() -> dict[str, object]:
     - XLA's older loop emitters, which compile faster; what simulates for long asks for
       the newer ones by `fast_loops` (measured with jaxlib 0.10.2, benchmarks/speed.py);
     - loops that touch up to 2 MB become one function, in place of a call for each
-      operation of each round (a cart-pole is simulated six times as fast);
+      operation of each round (a cart-pole is simulated five times as fast,
+      benchmarks/speed.py);
     - CPU devices wait for each other as long as it takes: XLA ends the process after a
       minute, but a device without a seed of its own waits for a chunk of training;
     - persistent compilation cache;

@@ -404,7 +404,11 @@ def _traces(problem: Any, o: Any, w: Any) -> tuple[Any, Any, Any]:
         error = np.pad(figures.errors[w], [(0, 0), (1, 0), (0, 0)])
         found.append((seen, seen + error))
     (measured, before), (_, after) = found
-    return measured, before, _on_rows(after, last.rows.readings[w], o.held.row[w])
+    return (
+        measured,
+        before,
+        _on_rows(after, last.conditions.rows.readings[w], o.held.row[w]),
+    )
 
 
 def _on_rows(path: Any, rows: Any, first: Any) -> Any:

@@ -210,7 +210,6 @@ class Analysis:
             np.sqrt(square.mean(0)),
             square,
             errors,
-            rows,
             Conditions(self.m, self.held, self.runs, rows),
         )
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from easi_jax.gap.measure import Channels
-from easi_jax.gap.predictor import Rows, WindowSet
+from easi_jax.gap.predictor import WindowSet
 from easi_jax.gap.table import Place
 from easi_jax.gap.where import Conditions
 
@@ -43,8 +43,7 @@ class Figures:
         si: RMS error of each degree of freedom, ``(nv,)``.
         square: mean squares of each window, ``(W, nv)``.
         errors: of every step, ``(W, H, nv)``.
-        rows: of the runs, that the errors belong to.
-        conditions: what was going on there.
+        conditions: what was going on in the rows that the errors belong to.
     """
 
     gap: float
@@ -52,7 +51,6 @@ class Figures:
     si: np.ndarray
     square: np.ndarray
     errors: np.ndarray
-    rows: Rows
     conditions: Conditions
 
 

@@ -55,7 +55,7 @@ class Conditions:
         self._windows = windows
         self._runs = runs
         self._of_joint: dict[int, dict[str, np.ndarray]] = {}
-        self._rows = rows
+        self.rows = rows
         first = np.zeros(m.nq, int)  # of each position's joint, among velocities
         for at, dof in zip(m.jnt_qposadr, m.jnt_dofadr, strict=True):
             first[at:] = dof
@@ -69,11 +69,11 @@ class Conditions:
     @cached_property
     def _qvel(self) -> np.ndarray:
         speed = [fitted_velocity(r.qpos, r.dt, r.configuration) for r in self._runs]
-        return self._taken(speed, self._rows.readings)
+        return self._taken(speed, self.rows.readings)
 
     @cached_property
     def _ctrl(self) -> np.ndarray:
-        rows = np.repeat(self._rows.commands[..., None], self._m.nu, -1)
+        rows = np.repeat(self.rows.commands[..., None], self._m.nu, -1)
         return self._taken([r.ctrl for r in self._runs], rows)
 
     def _taken(self, of_runs: Sequence[np.ndarray], rows: np.ndarray) -> np.ndarray:
