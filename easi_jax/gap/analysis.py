@@ -31,6 +31,7 @@ from easi_jax.gap.selection import (
     Model,
     Selector,
     better,
+    explained,
     probability,
     rank,
     shortlist,
@@ -52,6 +53,7 @@ _CLOSED = 1.1  # times the floor: nothing left to explain
 _RIVALS = 8
 _UNLIKELY = 0.3  # probability of an effect beside which a rival replaces it
 _ROUNDING = 0.005  # of the gap
+_CLEAR = 1.5  # times the floor: a gap that fits see without doubt
 _BEAM = 3  # sets of effects that are followed
 _DRAWS = 8  # of the noise of each held-out window
 
@@ -394,6 +396,8 @@ class Analysis:
         refit = self.figures(base.fit.x)
         after = self.figures(model.fit.x) if model.places else refit
         floor = self.floor(model.fit.x if model.places else base.fit.x)
+        floor_gap = float(measure.gap(floor, scale))
+        share = explained(refit.gap, after.gap, floor_gap)
         found = []
         deviation = self.deviations(model)
         for k, place in enumerate(model.places):
@@ -418,20 +422,27 @@ class Analysis:
                 Found(
                     place,
                     self.values(model, place, deviation),
-                    1.0 / (1.0 + odds),
+                    share / (1.0 + odds),
                     same,
                     figures.gap,
                     self.column_deviations(model, place, deviation),
                 )
             )
-        floor_gap = float(measure.gap(floor, scale))
         goal = GOAL * floor_gap
-        if refit.gap <= goal:
+        fitted = float(base.gap.mean()) ** 0.5 / self.fit_floor
+        notes = []
+        if refit.gap <= goal and not (found and fitted > _CLEAR):
             verdict = "no_gap"
         elif found and after.interval[1] <= goal:
             verdict = "explained"
         else:
             verdict = "unexplained"
+        if refit.gap <= goal and verdict != "no_gap":
+            notes.append(
+                "the held-out data show no gap: what was found acts in the fitting "
+                f"data alone, which the model misses by {fitted:.3g} times their "
+                "noise; hold out other runs to see it confirmed"
+            )
         if verdict == "no_gap":
             found = []
             after = refit
@@ -449,6 +460,7 @@ class Analysis:
             held=self.held,
             x=x,
             active=model.fit.active.tolist(),
+            notes=notes,
             disagreeing=self.disagreeing(x, after),
             seconds=time.perf_counter() - began,
         )

@@ -18,7 +18,8 @@ class Found:
     Attributes:
         place: which, and where.
         values: of its parameters, with their standard deviations.
-        confidence: probability of this name against its rivals.
+        confidence: probability of this name against its rivals, an unknown effect
+            among them.
         indistinguishable: rivals that predict the held-out data as well.
         gap_after: held-out gap with it and those before it.
         deviations: standard deviation of each of the place's columns that the fit

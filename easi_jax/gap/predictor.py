@@ -74,7 +74,6 @@ class WindowSet:
             its first command.
         past_qpos: positions in those rows, ``(W, D, nq)``.
         past_qvel: fitted velocities there, ``(W, D, nv)``; at rest before a run.
-        target: measured positions after each step, ``(W, H, nq)``.
         read: way from the start to the positions of the rows from ``L + 1`` before it
             to ``H + L`` after, tangents ``(W, 2 L + 2 + H, nv)``, where readings can be
             L rows late; beyond a run its first or last.
@@ -90,7 +89,6 @@ class WindowSet:
     past: np.ndarray
     past_qpos: np.ndarray
     past_qvel: np.ndarray
-    target: np.ndarray
     read: np.ndarray
     speed: np.ndarray
     led: np.ndarray
@@ -163,7 +161,6 @@ def _windows_of(run: Run, number: int, horizon_s: float, longest: float) -> Wind
         past=run.ctrl[inside(before)],
         past_qpos=run.qpos[inside(before)],
         past_qvel=moving(before),
-        target=w.target_qpos,
         read=run.configuration.difference(run.qpos[start], run.qpos[inside(seen)]),
         speed=moving(start + np.arange(-late - 1, late + 1)),
         led=w.start_row >= late,

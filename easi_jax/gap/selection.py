@@ -37,6 +37,8 @@ _RARE = 0.1  # relative loss by which a rare effect has to be better than others
 _ALIKE = 0.02  # relative difference of losses that says nothing
 _AS_GOOD = 1.5  # standard errors within which the simpler of two candidates wins
 _NEARLY = 0.7  # share of what the best explains
+_FEW = 0.25  # share of the windows
+_LEAST = 3  # windows that can tell
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,7 @@ class Model:
         gap: the same in units of the gap; squared, ``(blocks,)``.
         own: indices of the model's own fitted parameters.
         unlikely: for how many reasons few machines have these effects.
+        windows: loss and gap of each window, weighted, ``(2, W)``.
     """
 
     places: list[Place]
@@ -71,6 +74,7 @@ class Model:
     gap: np.ndarray
     own: tuple[int, ...] = field(default=())
     unlikely: int = 0
+    windows: np.ndarray = field(default_factory=lambda: np.zeros((2, 0)))
 
 
 class Selector:
@@ -138,26 +142,27 @@ class Selector:
     def model(self, places: list[Place], fit: Fitted) -> Model:
         """A fit with its cross-validated loss."""
         unlikely = sum(p.unlikely(fit.x[self.columns(p, fitted=False)]) for p in places)
-        return Model(places, fit, *self.cross_validated(fit), self.own, unlikely)
+        windows = self.cross_validated(fit)
+        loss, gap = self._of_blocks(windows)
+        return Model(places, fit, loss, gap, self.own, unlikely, windows)
 
     def fit(self, places: list[Place], x: np.ndarray) -> Model:
         """The best fit of some effects from ``x``."""
         problem = least_squares(x[None], self.active(places), self.bounds, self.weight)
         return self.model(places, lockstep([problem], self.simulate)[0])
 
-    def cross_validated(self, fit: Fitted) -> tuple[np.ndarray, np.ndarray]:
-        """Squared error per window of each block by a fit without it, ``(blocks,)``:
-        of whitened errors, and in units of the gap; inf where a prediction is not
-        finite.
+    def cross_validated(self, fit: Fitted) -> np.ndarray:
+        """Squared error of each window by a fit without its block, weighted,
+        ``(2, W)``: of whitened errors, and in units of the gap; inf where a prediction
+        is not finite.
 
         One Gauss-Newton step from the whole fit, exact where errors are linear.
         """
         w, r, j = self.weight, fit.residual, fit.slope
-        blocks = int(self.group.max()) + 1
         if not (np.isfinite(r).all() and np.isfinite(j).all()):
-            return np.full(blocks, np.inf), np.full(blocks, np.inf)
+            return np.full((2, len(w)), np.inf)
         a = j.shape[-1]
-        out, plain = np.zeros((2, blocks))
+        out = np.zeros((2, len(w)))
         size = self.bounds.size[fit.active]
         j = j * size
         normal = np.einsum("w,wma,wmb->ab", w, j, j, optimize=True)
@@ -166,7 +171,7 @@ class Selector:
         x = fit.x[fit.active]
         stuck = (x <= self.bounds.low[fit.active]) | (x >= self.bounds.high[fit.active])
         free = ~stuck
-        for b in range(blocks):
+        for b in range(int(self.group.max()) + 1):
             at = self.group == b
             jb, rb, wb = j[at], r[at], w[at]
             if a and free.any():
@@ -176,11 +181,14 @@ class Selector:
                 move = np.zeros(a)
                 move[free] = -np.linalg.lstsq(inner, pull[free], rcond=1e-10)[0]
                 rb = rb + jb @ move
-            total = max(wb.sum(), 1e-30)
-            out[b] = float((wb * (rb**2).mean(1)).sum() / total)
             raw = np.einsum("wij,wj->wi", self.residuals.plain[at], rb)
-            plain[b] = float((wb * (raw**2).mean(1)).sum() / total)
-        return out, plain
+            out[:, at] = np.stack([wb * (e**2).mean(1) for e in (rb, raw)])
+        return out
+
+    def _of_blocks(self, windows: np.ndarray) -> np.ndarray:
+        """Means over each block, ``(2, blocks)``, of weighted ``(2, W)``."""
+        total = np.maximum(np.bincount(self.group, self.weight), 1e-30)
+        return np.array([np.bincount(self.group, x) / total for x in windows])
 
     # -- stages ----------------------------------------------------------------
 
@@ -348,6 +356,9 @@ def better(model: Model, base: Model, floor: float) -> bool:
     Where the gap is all but closed, small gains count for nothing: no machine quite
     follows any physics.
 
+    An effect that acts in a few windows only, such as a force limit, leaves most blocks
+    as they are; it has to help in those windows, one by one.
+
     Args:
         floor: the gap of a perfect model.
     """
@@ -357,17 +368,43 @@ def better(model: Model, base: Model, floor: float) -> bool:
     known = {p.key for p in base.places}
     rare = any(p.effect in RARE for p in model.places if p.key not in known)
     both = ((model.loss, base.loss), (model.gap, base.gap))
-    sure = [advantage(a, b) for a, b in both]
     gain = [1 - a.mean() / max(b.mean(), 1e-300) for a, b in both]
-    if min(gain) > _LARGE:
-        sure = [
-            max(s, advantage(np.log(a + _TINY), np.log(b + _TINY)))
-            for s, (a, b) in zip(sure, both, strict=True)
-        ]
+    large = min(gain) > _LARGE
+    sure = [_sure(a, b, large) for a, b in both]
+    acting = _acting(model, base)
+    if len(acting):
+        single = zip(model.windows[:, acting], base.windows[:, acting], strict=True)
+        # Windows overlap by a half.
+        ones = [_sure(a, b, large) / sqrt(2) for a, b in single]
+        sure = [max(pair) for pair in zip(sure, ones, strict=True)]
     if rare:
         return min(sure) > _SURE and min(gain) > 2 * helps
     likely = min(sure) > _LIKELY and sum(sure) > 2 * _SURE
     return likely and max(gain) > helps and min(gain) > helps / 3
+
+
+def _sure(a: np.ndarray, b: np.ndarray, by_ratio: bool) -> float:
+    """`advantage` of losses, or of their logarithms where that is more."""
+    plain = advantage(a, b)
+    if not by_ratio:
+        return plain
+    return max(plain, advantage(np.log(a + _TINY), np.log(b + _TINY)))
+
+
+def _acting(model: Model, base: Model) -> np.ndarray:
+    """Windows whose predictions differ by more than noise, where they are few; else
+    none."""
+    mine, other = model.fit.residual, base.fit.residual
+    if mine.shape != other.shape or not mine.size:
+        return np.zeros(0, int)
+    return _few(((mine - other) ** 2).mean(-1) > 1.0)
+
+
+def _few(windows: np.ndarray) -> np.ndarray:
+    """Indices of windows ``(W,)``, where those are few that can tell; else none."""
+    found = np.flatnonzero(windows)
+    few = _LEAST <= len(found) <= _FEW * len(windows)
+    return found if few else found[:0]
 
 
 def size_of(model: Model) -> int:
@@ -417,16 +454,32 @@ def simplest(models: Sequence[Model], base: Model) -> Model:
 def probability(model: Model, rival: Model) -> float:
     """That a model is better than a rival, by their cross-validated losses.
 
-    In units of the noise and of the gap, on average over both, as `better` asks. What
-    fits as well with more numbers is less likely by a half standard error for each;
-    what only adds to the model hardly counts.
+    In units of the noise and of the gap, on average over both, as `better` asks; where
+    only a few windows tell the two apart, also by those, one by one. What fits as well
+    with more numbers is less likely by a half standard error for each; what only adds
+    to the model hardly counts.
     """
-    extra = size_of(rival) - size_of(model)
-    t = 0.5 * extra
+    t = 0.0
     for mine, theirs in ((model.loss, rival.loss), (model.gap, rival.gap)):
         d = theirs - mine
         error = max(d.std(ddof=1) / sqrt(len(d)), _ALIKE * mine.mean())
         t += 0.5 * float(d.mean()) / max(error, _TINY)
+    apart = _few(np.abs(model.windows - rival.windows).max(0, initial=0.0) > 1.0)
+    if len(apart):
+        mine, theirs = (np.log(x.windows[:, apart] + _TINY) for x in (model, rival))
+        # Windows overlap by a half.
+        single = np.mean(list(map(advantage, mine, theirs))) / sqrt(2)
+        t = max(t, float(single), key=abs)
+    t += 0.5 * (size_of(rival) - size_of(model))
     if contains(rival.places[-1], model.places[-1]):
         t = max(t, 0.0) + 1.0
     return 0.5 * (1 + erf(t / sqrt(2)))
+
+
+def explained(before: float, after: float, floor: float) -> float:
+    """Share of the squared gap that effects close: the rest may be of something that
+    they stand in for."""
+    if after <= GOAL * floor:
+        return 1.0
+    left = (after**2 - floor**2) / max(before**2 - floor**2, after**2 - floor**2)
+    return 1.0 - left

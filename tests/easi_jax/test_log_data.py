@@ -43,8 +43,12 @@ def machine() -> Machine:
     return Machine(model, ParameterSpace((declare(model, "m", "joint.slide.damping"),)))
 
 
-def make_run(qpos: np.ndarray, name: str = "run", dt: float = 0.01) -> Run:
+def make_run(
+    qpos: np.ndarray, name: str = "run", dt: float = 0.01, size: float = 0.0
+) -> Run:
+    """``size``: of its commands; by default they count its rows."""
     rows = len(qpos)
+    ctrl = np.full(rows, size) if size else np.arange(rows, dtype=float)
     return Run(
         name=name,
         source=f"{name}.csv",
@@ -53,7 +57,7 @@ def make_run(qpos: np.ndarray, name: str = "run", dt: float = 0.01) -> Run:
         qpos=qpos[:, None],
         qvel=fitted_velocity(qpos[:, None], dt, FLAT),
         qvel_measured=False,
-        ctrl=np.arange(rows, dtype=float)[:, None],
+        ctrl=ctrl[:, None],
         configuration=FLAT,
     )
 
@@ -126,14 +130,28 @@ def test_visible_steps_grow_with_noise():
 
 
 def test_whole_runs_are_held_out():
-    runs = [make_run(np.zeros(n), f"r{i}") for i, n in enumerate((100, 90, 100, 10))]
+    lengths = enumerate((100, 90, 100, 10))
+    runs = [make_run(np.zeros(n), f"r{i}", size=1.0) for i, n in lengths]
     fit, held, name = split_held_out(runs, 0.2)
     assert [r.name for r in held] == ["r1"] == [name]
     assert [r.name for r in fit] == ["r0", "r2", "r3"]
-    many = [make_run(np.zeros(50), f"r{i}") for i in range(10)]
+    many = [make_run(np.zeros(50), f"r{i}", size=1.0) for i in range(10)]
     fit, held, _ = split_held_out(many, 0.2)
     assert [r.name for r in held] == ["r7", "r8", "r9"]  # 150 of 500 rows
     assert len(fit) == 7
+
+
+def test_runs_to_fit_reach_as_far_as_those_held_out():
+    sizes = (4.0, 1.0, 3.8, 0.9)
+    runs = [make_run(np.zeros(100), f"r{i}", size=c) for i, c in enumerate(sizes)]
+    assert split_held_out(runs, 0.2)[2] == "r2"
+    longer = [*runs[:2], make_run(np.zeros(300), "r2", size=3.8), runs[3]]
+    assert split_held_out(longer, 0.2)[2] == "r0, r3", "a third of the rows, not a half"
+    short = [make_run(np.zeros(20), f"s{i}", size=c) for i, c in enumerate(sizes * 3)]
+    fit, held, _ = split_held_out(short, 0.2)
+    assert len(held) == 3
+    top = [max(r.ctrl.max() for r in part) for part in (fit, held)]
+    assert top[1] <= top[0] <= 1.1 * top[1]
 
 
 def test_a_single_run_is_split_behind_a_gap():

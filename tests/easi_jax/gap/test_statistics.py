@@ -26,12 +26,13 @@ from easi_jax.gap.selection import (
     Selector,
     advantage,
     better,
+    explained,
     probability,
     rank,
     shortlist,
     simplest,
 )
-from easi_jax.gap.table import EFFECTS, Layout, places, ripples
+from easi_jax.gap.table import EFFECTS, Layout, Place, places, ripples
 from easi_jax.gap.velocities import velocity_lags
 from easi_jax.parameters import ParameterSpace
 from easi_jax.recording import Run
@@ -344,9 +345,9 @@ def test_what_is_not_finite_loses(model: mujoco.MjModel, runs: list[Run]) -> Non
     residual = np.ones((count, 4))
     residual[3, 2] = np.nan
     fit = Fitted(predictor.neutral, np.array([0]), residual, residual[..., None], 1.0)
-    loss, gap = selector.cross_validated(fit)
-    assert loss.shape == gap.shape == (5,)
-    assert np.isinf(loss).all() and np.isinf(gap).all()
+    lost = selector.model([], fit)
+    assert lost.loss.shape == lost.gap.shape == (5,)
+    assert np.isinf(lost.loss).all() and np.isinf(lost.gap).all()
 
 
 def test_rare_effects_have_to_help_by_either_measure(
@@ -373,6 +374,37 @@ def test_rare_effects_have_to_help_by_either_measure(
     small, large = fitted(9.8, 9.0, *both), fitted(9.0, 8.0, *both)
     assert better(small, base, 2.0) and not better(small, base, 3.0)
     assert better(large, base, 3.0)
+
+
+def test_what_acts_in_few_windows_is_judged_in_those(
+    model: mujoco.MjModel, runs: list[Run]
+) -> None:
+    limit = next(
+        p
+        for p in places(model, scales_of(model, runs))
+        if p.effect == "actuator_saturation"
+    )
+
+    def fitted(at: tuple[int, ...], size: float, *names: Place) -> Model:
+        residual = np.ones((40, 5))
+        residual[list(at)] *= np.sqrt(size * (1 + 0.1 * np.arange(len(at))))[:, None]
+        windows = np.tile((residual**2).mean(1), (2, 1))
+        blocks = windows.reshape(2, 10, 4).mean(-1)
+        fit = Fitted(np.zeros(1), np.arange(1), residual, np.zeros(1), 1.0)
+        return Model([*names], fit, *blocks, windows=windows)
+
+    for at, enough in (((5, 6, 7), True), ((6, 7), False)):
+        base, mended = fitted(at, 30.0), fitted(at, 1.0, limit)
+        assert advantage(mended.loss, base.loss) < 1.7, "one block of ten"
+        assert better(mended, base, 0.1) == enough
+    base, worse = fitted((5, 6, 7), 30.0), fitted((9, 10, 11), 20.0, limit)
+    assert not better(worse, base, 0.1), "mends some windows and spoils others"
+
+
+def test_confidence_falls_with_what_is_left() -> None:
+    assert explained(1.0, 0.12, 0.1) == 1.0
+    assert explained(1.0, 0.5, 0.1) == pytest.approx(1 - 0.24 / 0.99)
+    assert explained(0.1, 0.5, 0.1) == 0.0
 
 
 def test_of_twins_the_one_of_a_usual_size_comes_first(

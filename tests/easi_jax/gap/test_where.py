@@ -56,7 +56,6 @@ def machine() -> tuple[WindowSet, list[Run]]:
         past=run.ctrl[rows][:, None],
         past_qpos=qpos[rows][:, None],
         past_qvel=run.qvel[rows][:, None],
-        target=qpos[at + 1],
         read=np.zeros((len(rows), H + 2, 2)),
         speed=run.qvel[rows][:, None],
         led=rows >= 0,
