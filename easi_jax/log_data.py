@@ -18,8 +18,6 @@ from easi_jax.recording import Run
 from easi_jax.segments import Segments, cut, join
 from easi_jax.windows import fitted_velocity
 
-HELD_OUT = 0.25  # of the rows, where whole runs are held out
-LAST = 0.3  # of a single run
 _ORDERS = range(2, 7)
 _MAD = 1.4826  # median absolute deviation -> standard deviation, Gaussian
 _JITTER = 1e-6  # rounding of a written number, as a share of the largest
@@ -29,7 +27,6 @@ _ODD = 20.0  # times the noise
 _ODD_ALONE = 3.0  # times the largest of the others
 _ODD_ROWS = 3  # left out at either end, at most
 _ODD_MINIMUM = 30  # rows of a run that can tell
-_REACHED = 99.0  # percentile
 _SCALAR = Configuration(1, 1, (0,), (0,), ())
 
 
@@ -177,73 +174,6 @@ def to_common_step(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
             "smallest of all runs, by interpolation"
         )
     return out, notes
-
-
-def split_held_out(
-    runs: Sequence[Run], gap_s: float
-) -> tuple[list[Run], list[Run], str]:
-    """Runs to fit, runs held out, and a sentence that says which.
-
-    Of two runs or more, whole runs with a quarter of the rows, and hardly more, whose
-    commands and speeds reach about as far as those of the runs left to fit, and rather
-    less far than further; of equals the last. Of a single run its last 30 % behind a
-    gap of ``gap_s`` seconds.
-
-    Raises:
-        UserError: a single run too short to be split.
-    """
-    if len(runs) == 1:
-        run = runs[0]
-        first = round((1 - LAST) * len(run))
-        last = first - math.ceil(gap_s / run.dt)
-        if last < 2 or len(run) - first < 2:
-            raise UserError(
-                f"{run.source}: {len(run)} rows are too few to hold some out behind a "
-                f"gap of {gap_s:g} s: record more, or shorten --horizon"
-            )
-        return (
-            [rows_of(run, 0, last)],
-            [rows_of(run, first, len(run))],
-            f"the last {100 * LAST:.0f} % of {run.name}",
-        )
-    total = sum(len(run) for run in runs)
-    reach = np.array([_reach(run) for run in runs])
-
-    def cost(held: set[int]) -> tuple[float, int]:
-        rows = sum(len(runs[i]) for i in held)
-        more = max(rows / total - HELD_OUT, 0.0)
-        return round(_unlike(reach, held) + 2 * more, 2), -sum(held)
-
-    sets = []
-    for first in range(len(runs)):
-        chosen = {first}
-        while sum(len(runs[i]) for i in chosen) < HELD_OUT * total:
-            left = [i for i in range(len(runs)) if i not in chosen]
-            if len(left) == 1:
-                break
-            chosen.add(min(left, key=lambda i: cost({*chosen, i})))
-        sets.append(chosen)
-    chosen = min(sets, key=cost)
-    held = [run for i, run in enumerate(runs) if i in chosen]
-    return (
-        [run for i, run in enumerate(runs) if i not in chosen],
-        held,
-        ", ".join(run.name for run in held),
-    )
-
-
-def _reach(run: Run) -> np.ndarray:
-    """Sizes of commands and speeds, but for the largest percent, ``(nu + nv,)``."""
-    speed = fitted_velocity(run.qpos, run.dt, run.configuration)
-    return np.percentile(np.abs(np.c_[run.ctrl, speed]), _REACHED, axis=0)
-
-
-def _unlike(reach: np.ndarray, held: set[int]) -> float:
-    """How differently far the runs held out reach; doubled where further."""
-    out = np.isin(np.arange(len(reach)), list(held))
-    least = 1e-3 * reach.max(0) + 1e-12
-    d = np.log((reach[out].max(0) + least) / (reach[~out].max(0) + least))
-    return float(np.mean(np.where(d > 0, 2 * d, -d)))
 
 
 def rows_of(run: Run, first: int, last: int) -> Run:

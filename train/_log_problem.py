@@ -132,13 +132,9 @@ def read_runs(config: Any, mj_model: Any, horizon: float) -> MeasuredRuns:
         UserError: whatever is wrong with the files, or nothing is left to fit.
     """
     from easi_jax.errors import UserError
+    from easi_jax.held_out import split_held_out
     from easi_jax.io.logs import read_logs
-    from easi_jax.log_data import (
-        pooled_noise,
-        split_held_out,
-        to_common_step,
-        without_odd_ends,
-    )
+    from easi_jax.log_data import pooled_noise, to_common_step, without_odd_ends
 
     fit_files = [p for p in config.data if p not in config.held_out]
     if not fit_files:
@@ -158,7 +154,7 @@ def read_runs(config: Any, mj_model: Any, horizon: float) -> MeasuredRuns:
     notes += odd
     fit, held = runs[: len(log.runs)], runs[len(log.runs) :]
     if held_log is None:
-        fit, held, held_name = split_held_out(fit, horizon)
+        fit, held, held_name = split_held_out(mj_model, fit, horizon)
     else:
         held_name = ", ".join(run.name for run in held)
     return MeasuredRuns(log.runs, noise, fit, held, held_name, notes)

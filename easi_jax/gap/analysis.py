@@ -13,11 +13,12 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
+from easi_jax.drive_forces import drive_forces
 from easi_jax.errors import UserError
 from easi_jax.gap import measure
 from easi_jax.gap.fit import bounds_of, window_weights
 from easi_jax.gap.outcome import Figures, Found, Outcome, for_people
-from easi_jax.gap.predictor import BLOCK, Predictor, join, window_set
+from easi_jax.gap.predictor import BLOCK, Predictor, WindowSet, join, window_set
 from easi_jax.gap.residuals import (
     make_residuals,
     start_sensitivity,
@@ -42,9 +43,11 @@ from easi_jax.gap.where import Conditions
 from easi_jax.parameters import ParameterSpace
 from easi_jax.quantities import scalar_dofs
 from easi_jax.recording import Run, physics_steps
+from easi_jax.windows import fitted_velocity
 
 _FITTED = (32, 96)  # windows that fits see
 _STEPS = 9_600  # physics steps in them
+_EXTREME = 4  # one of so many has large forces or speeds
 _BLOCKS = 10
 _MOST = 5  # effects
 _STAGES = 8  # of adding one and taking out what has become needless
@@ -101,7 +104,7 @@ class Analysis:
             )
         physics = fitted.ctrl.shape[1] * physics_steps(dt, mj_model.opt.timestep)
         most = min(max(_STEPS // physics, _FITTED[0]), _FITTED[1])
-        chosen = _spread(len(fitted), most)
+        chosen = _spread(fitted, most, _reach(mj_model, fit, fitted))
         self.fit_windows, self.held = fitted.take(chosen), kept
         pad = -len(self.fit_windows) % BLOCK
         repeated = np.r_[np.arange(len(chosen)), np.full(pad, len(chosen) - 1)]
@@ -537,11 +540,32 @@ class Analysis:
         return out
 
 
-def _spread(count: int, most: int) -> np.ndarray:
-    """Indices of at most ``most`` windows at even distances."""
+def _reach(m: mujoco.MjModel, runs: Sequence[Run], windows: WindowSet) -> np.ndarray:
+    """Largest drive forces and speeds in each window, ``(W, nu + nv)``."""
+    steps = windows.ctrl.shape[1]
+    sizes = [
+        np.abs(
+            np.c_[drive_forces(m, r), fitted_velocity(r.qpos, r.dt, r.configuration)]
+        )
+        for r in runs
+    ]
+    parts = zip(windows.run, windows.row, strict=True)
+    return np.array([sizes[r][row : row + steps + 1].max(0) for r, row in parts])
+
+
+def _spread(windows: WindowSet, most: int, reach: np.ndarray) -> np.ndarray:
+    """Indices of at most ``most`` windows: a few with the largest forces and speeds,
+    where limits show, the others at even distances."""
+    count = len(windows)
     if count <= most:
         return np.arange(count)
-    return np.unique(np.linspace(0, count - 1, most).round().astype(int))
+    even = np.linspace(0, count - 1, most - most // _EXTREME).round().astype(int)
+    chosen = set(even.tolist())
+    for largest in np.argsort(-reach, axis=0, kind="stable"):
+        for window in largest.tolist():
+            if len(chosen) < most:
+                chosen.add(window)
+    return np.array(sorted(chosen))
 
 
 def _keys(model: Model) -> frozenset[str]:

@@ -18,7 +18,6 @@ from easi_jax.log_data import (
     outlier_weights,
     rows_of,
     segments_from_runs,
-    split_held_out,
     to_common_step,
     trusted_velocity,
     visible_steps,
@@ -127,42 +126,6 @@ def test_visible_steps_grow_with_noise():
     assert found[0] == 1
     assert 1 < found[1] < 50
     assert found[2] == 50
-
-
-def test_whole_runs_are_held_out():
-    lengths = enumerate((100, 90, 100, 10))
-    runs = [make_run(np.zeros(n), f"r{i}", size=1.0) for i, n in lengths]
-    fit, held, name = split_held_out(runs, 0.2)
-    assert [r.name for r in held] == ["r1"] == [name]
-    assert [r.name for r in fit] == ["r0", "r2", "r3"]
-    many = [make_run(np.zeros(50), f"r{i}", size=1.0) for i in range(10)]
-    fit, held, _ = split_held_out(many, 0.2)
-    assert [r.name for r in held] == ["r7", "r8", "r9"]  # 150 of 500 rows
-    assert len(fit) == 7
-
-
-def test_runs_to_fit_reach_as_far_as_those_held_out():
-    sizes = (4.0, 1.0, 3.8, 0.9)
-    runs = [make_run(np.zeros(100), f"r{i}", size=c) for i, c in enumerate(sizes)]
-    assert split_held_out(runs, 0.2)[2] == "r2"
-    longer = [*runs[:2], make_run(np.zeros(300), "r2", size=3.8), runs[3]]
-    assert split_held_out(longer, 0.2)[2] == "r0, r3", "a third of the rows, not a half"
-    short = [make_run(np.zeros(20), f"s{i}", size=c) for i, c in enumerate(sizes * 3)]
-    fit, held, _ = split_held_out(short, 0.2)
-    assert len(held) == 3
-    top = [max(r.ctrl.max() for r in part) for part in (fit, held)]
-    assert top[1] <= top[0] <= 1.1 * top[1]
-
-
-def test_a_single_run_is_split_behind_a_gap():
-    run = make_run(np.arange(100.0))
-    (fit,), (held,), name = split_held_out([run], 0.2)
-    assert held.qpos[0, 0] == 70
-    assert len(held) == 30
-    assert fit.qpos[-1, 0] == 49  # 20 steps before
-    assert "30 %" in name
-    with pytest.raises(UserError, match="too few"):
-        split_held_out([make_run(np.zeros(30))], 0.3)
 
 
 def test_runs_of_two_rates_come_to_the_smaller_step():
