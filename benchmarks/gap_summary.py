@@ -20,6 +20,7 @@ from benchmarks.gap_score import (
     shares,
     wilson,
 )
+from benchmarks.loop import HIDDEN
 
 
 def generated(folder: Path) -> list[str]:
@@ -111,24 +112,55 @@ def loop(folder: Path) -> list[str]:
     """Returns in a target with a hidden effect, before and after it is found."""
     from easi_jax.io.files import read_json
 
-    out = ["## The loop closed: a hidden effect on Cartpole"]
-    lines, methods = [], []
-    for effect in ("friction", "delay"):
-        path = folder / f"loop_cartpole_{effect}.json"
-        if not path.is_file():
-            out.append(f"Not run: `python -m benchmarks.loop --effect {effect}`.")
-            continue
-        r = read_json(path)
-        methods = list(r["returns"])
-        named = ", ".join(f"{e['effect']}@{e['at']}" for e in r["found"]["effects"])
-        mean = [sum(v.values()) / len(v) for v in r["returns"].values()]
-        seeds = len(next(iter(r["returns"].values())))
-        lines.append((effect, named, seeds, *(f"{x:.1f}" for x in mean)))
-    if lines:
-        head = ("hidden", "named by train.gap", "seeds", *methods)
-        out.append(markdown_table(head, lines))
-        out.append("`python -m benchmarks.loop`: mean return in the target.")
+    out = ["## The loop closed: a hidden effect in the target"]
+    for robot, effects in HIDDEN.items():
+        lines, methods = [], []
+        for effect in effects:
+            path = folder / f"loop_{robot}_{effect}.json"
+            if not path.is_file():
+                how = "" if robot == "cartpole" else f" --robot {robot}"
+                out.append(
+                    f"{robot}, {effect}: not run (`python -m benchmarks.loop{how} "
+                    f"--effect {effect}`)."
+                )
+                continue
+            r = read_json(path)
+            methods = list(r["returns"])
+            named = ", ".join(f"{e['effect']}@{e['at']}" for e in r["found"]["effects"])
+            mean = [sum(v.values()) / len(v) for v in r["returns"].values()]
+            seeds = len(next(iter(r["returns"].values())))
+            lines.append((effect, named, seeds, *(f"{x:.1f}" for x in mean)))
+        if lines:
+            head = (f"{robot}, hidden", "named by train.gap", "seeds", *methods)
+            out.append(markdown_table(head, lines))
+            out.append("`python -m benchmarks.loop`: mean return in the target.")
     return out
+
+
+def times(folder: Path) -> list[str]:
+    """Seconds of the whole command."""
+    from easi_jax.io.files import read_json
+
+    path = folder / "gap_times.json"
+    if not path.is_file():
+        return ["## Time of train.gap", "Not run: `python -m benchmarks.gap_times`."]
+    r = read_json(path)
+    lines = [
+        (
+            c["mechanism"],
+            ", ".join(c["truth"]),
+            ", ".join(c["named"]) or "none",
+            f"{c['seconds']:.0f}",
+            f"{c['goal_s']}, {'met' if c['seconds'] <= c['goal_s'] else '**missed**'}",
+        )
+        for c in r["cases"]
+    ]
+    return [
+        "## Time of train.gap",
+        f"`python -m benchmarks.gap_times`: from a first start, nothing cached, on "
+        f"{r['cores']} cores.",
+        markdown_table(("machine", "hidden", "named", "s", "goal [s]"), lines),
+    ]
 
 
 def real(folder: Path) -> list[str]:

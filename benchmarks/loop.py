@@ -2,11 +2,16 @@
 
     python -m benchmarks.loop --effect friction
     python -m benchmarks.loop --effect delay
+    python -m train.udr --robot go2 --out results/go2_udr
+    python -m benchmarks.loop --robot go2 --start-from results/go2_udr --seeds 0 1 2
 
 The target has an effect that no training knows of. UDR policies act in it; from their
 noisy logs ``train.gap`` finds what the model lacks; ``train.easi`` then searches and
 trains with what was found, and without it. Oracle trains in the target itself. All
 seeds are paired, and the commands are those that a user has.
+
+On Go2 one trained policy acts in the target, and each training goes on from it, as long
+with what was found as without it.
 """
 
 import dataclasses
@@ -15,25 +20,39 @@ from typing import Any
 
 from train._command import main, say, show_table
 
-# Of the target alone: the largest that an Oracle still balances with.
+# Of the target alone: on Cartpole the largest that an Oracle still balances with.
 HIDDEN = {
-    "friction": """effects:
+    "cartpole": {
+        "friction": """effects:
 - {effect: coulomb_friction, at: cart, kind: joint, columns: {coulomb: 1.2}}
 """,
-    "delay": """effects:
+        "delay": """effects:
 - {effect: actuator_delay, at: cart, kind: actuator, columns: {delay: 0.05}}
 """,
+    },
+    "go2": {
+        "friction": """effects:
+- {effect: coulomb_friction, at: RR_calf, kind: joint, columns: {coulomb: 4.0}}
+- {effect: coulomb_friction, at: RR_thigh, kind: joint, columns: {coulomb: 4.0}}
+""",
+    },
 }
-NOISE = (2e-4, 5e-4)  # m, rad: standard deviation of a reading
-EPISODES = 2  # of each seed's policy, as logs
+# Standard deviations of a reading [m, rad], of a free joint's six, then of the others.
+NOISE = {"cartpole": (2e-4, 5e-4), "go2": (*[2e-4] * 3, *[5e-4] * 3, *[2e-4] * 12)}
+EPISODES = {"cartpole": 2, "go2": 6}  # of each policy, as logs
+STEPS = {"go2": 1_000_000}  # of each training that goes on
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
     """Trains before and after the gap workflow, in a target with a hidden effect."""
 
+    robot: str = "cartpole"
+    """cartpole or go2."""
     effect: str = "friction"
-    """friction or delay."""
+    """friction, or delay (cartpole)."""
+    start_from: Path | None = None
+    """Run folder of train.udr that Go2's trainings go on from."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds, paired over methods."""
     folder: Path = Path("results/loop")
@@ -46,16 +65,52 @@ def run(config: Config) -> None:
 
     from benchmarks._common import command_of, write_result
     from easi_jax.errors import UserError, nearest
-    from easi_jax.io.files import atomic_write, read_json
-    from train import easi, gap, udr
+    from easi_jax.io.files import atomic_write
 
-    if config.effect not in HIDDEN:
-        hint = nearest(config.effect, HIDDEN)
-        raise UserError(f'--effect {config.effect}: "friction" or "delay"{hint}')
+    for flag, word, known in (
+        ("robot", config.robot, HIDDEN),
+        ("effect", config.effect, HIDDEN.get(config.robot, {})),
+    ):
+        if word not in known:
+            which = " or ".join(known)
+            raise UserError(f"--{flag} {word}: {which}{nearest(word, known)}")
+    if (config.start_from is None) == (config.robot in STEPS):
+        raise UserError("--start-from goes with --robot go2, and is needed there")
     folder = config.folder / config.effect
+    if config.robot != "cartpole":
+        folder = config.folder / f"{config.robot}_{config.effect}"
     hidden = folder / "hidden.yaml"
-    atomic_write(hidden, HIDDEN[config.effect])
-    found = folder / "gap" / "effects.yaml"
+    atomic_write(hidden, HIDDEN[config.robot][config.effect])
+    if config.start_from is None:
+        told, returns = _searched(config, folder, hidden)
+    else:
+        told, returns = _gone_on(config, folder, hidden, config.start_from)
+    path = write_result(
+        f"loop_{config.robot}_{config.effect}",
+        command_of("benchmarks.loop", config),
+        config,
+        hidden=HIDDEN[config.robot][config.effect],
+        noise=NOISE[config.robot],
+        found={k: told[k] for k in ("verdict", "effects", "refitted", "gap")},
+        returns=returns,
+    )
+    show_table(
+        f"{config.robot}, hidden {config.effect}: return in the target",
+        ("method", "mean", *(f"seed {s}" for s in config.seeds)),
+        [
+            (m, f"{np.mean([*v.values()]):.1f}", *(f"{x:.1f}" for x in v.values()))
+            for m, v in returns.items()
+        ],
+    )
+    say(f"written: {path}")
+
+
+def _searched(
+    config: Config, folder: Path, hidden: Path
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What was found, and returns by method: UDR, then a search and its training."""
+    from easi_jax.io.files import read_json
+    from train import easi, udr
 
     def train(name: str, effects: Path | None) -> Path:
         out = folder / f"udr_{name}"
@@ -88,49 +143,84 @@ def run(config: Config) -> None:
         return out
 
     first = train("without", None)
-    logs = _recorded(first, hidden, folder / "logs")
+    found, told = _asked(config.robot, first, hidden, folder)
+    second = train("with", found)
+    runs = {
+        "UDR": (first, "UDR"),
+        "EASI": (identify("without"), "EASI"),
+        "UDR, effects found": (second, "UDR"),
+        "EASI, effects found": (identify("with"), "EASI"),
+        "Oracle": (identify("without"), "Oracle"),
+    }
+    return told, {
+        method: read_json(out / "results.json")["returns"][name]
+        for method, (out, name) in runs.items()
+    }
+
+
+def _gone_on(
+    config: Config, folder: Path, hidden: Path, start: Path
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The same for trainings that go on from one trained policy."""
+    from easi_jax.io.files import read_json
+    from train import udr
+
+    found, told = _asked(config.robot, start, hidden, folder)
+    returns = {}
+    for method, name, effects, fixed in (
+        ("UDR", "without", None, False),
+        ("UDR, effects found", "with", found, False),
+        ("Oracle", "oracle", hidden, True),
+    ):
+        out = folder / f"udr_{name}"
+        if not (out / "results.json").exists():
+            say(f"== {method}")
+            udr.run(
+                udr.Config(
+                    robot=config.robot,
+                    out=out,
+                    seeds=config.seeds,
+                    effects=effects,
+                    target_effects=hidden,
+                    fixed=fixed,
+                    start_from=start,
+                    env_steps=STEPS[config.robot],
+                    overwrite=True,
+                )
+            )
+        (returns[method],) = read_json(out / "results.json")["returns"].values()
+    return told, returns
+
+
+def _asked(
+    robot: str, policies: Path, hidden: Path, folder: Path
+) -> tuple[Path, dict[str, Any]]:
+    """Logs the policies in the target and asks what the model lacks.
+
+    Returns:
+        The effects file, and ``gap.json``.
+
+    Raises:
+        UserError: nothing was named.
+    """
+    from easi_jax.errors import UserError
+    from easi_jax.io.files import read_json
+    from train import gap
+
+    logs = _recorded(robot, policies, hidden, folder / "logs")
+    found = folder / "gap" / "effects.yaml"
     if not found.exists():
         say("== what does the model lack?")
         gap.run(
-            gap.Config(
-                model="cartpole", data=tuple(logs), out=found.parent, overwrite=True
-            )
+            gap.Config(model=robot, data=tuple(logs), out=found.parent, overwrite=True)
         )
     told = read_json(found.parent / "gap.json")
     if not told["effects"]:
         raise UserError(f"train.gap named no effect: see {found.parent}/report.html")
-    second = train("with", found)
-    runs = {"without": identify("without"), "with": identify("with")}
-    returns = {
-        "UDR": read_json(first / "results.json")["returns"]["UDR"],
-        "EASI": read_json(runs["without"] / "results.json")["returns"]["EASI"],
-        "UDR, effects found": read_json(second / "results.json")["returns"]["UDR"],
-        "EASI, effects found": read_json(runs["with"] / "results.json")["returns"][
-            "EASI"
-        ],
-        "Oracle": read_json(runs["without"] / "results.json")["returns"]["Oracle"],
-    }
-    path = write_result(
-        f"loop_cartpole_{config.effect}",
-        command_of("benchmarks.loop", config),
-        config,
-        hidden=HIDDEN[config.effect],
-        noise=NOISE,
-        found={k: told[k] for k in ("verdict", "effects", "refitted", "gap")},
-        returns=returns,
-    )
-    show_table(
-        f"hidden {config.effect}: return in the target",
-        ("method", "mean", *(f"seed {s}" for s in config.seeds)),
-        [
-            (m, f"{np.mean([*v.values()]):.1f}", *(f"{x:.1f}" for x in v.values()))
-            for m, v in returns.items()
-        ],
-    )
-    say(f"written: {path}")
+    return found, told
 
 
-def _recorded(run_folder: Path, hidden: Path, folder: Path) -> list[Path]:
+def _recorded(robot: str, run_folder: Path, hidden: Path, folder: Path) -> list[Path]:
     """Logs of the policies in the target, with noise."""
     import jax
     import jax.numpy as jnp
@@ -144,10 +234,12 @@ def _recorded(run_folder: Path, hidden: Path, folder: Path) -> list[Path]:
     from train._robots import load_udr
 
     saved = load_udr(run_folder)
-    given = read_given(udr.Config(target_effects=hidden))
+    given = read_given(udr.Config(robot=robot, target_effects=hidden))
     _, env = robots(saved["env"], given)
     nv = env.mj_model.nv
-    noise = jnp.array([*NOISE, *[0.0] * nv])  # of positions; no velocities are logged
+    noise = jnp.array(
+        [*NOISE[robot], *[0.0] * nv]
+    )  # of positions; no velocities are logged
 
     @jax.jit
     def episodes(policy: Any, key: Any) -> Any:
@@ -157,19 +249,24 @@ def _recorded(run_folder: Path, hidden: Path, folder: Path) -> list[Path]:
             env.model(),
             lambda obs, k: act(policy, obs, k, False),
             run,
-            EPISODES,
+            EPISODES[robot],
             env.episode_length,
         )
         return measured(trajectories, noise, sensors)
 
-    joints = [env.mj_model.joint(j).name for j in range(env.mj_model.njnt)]
+    joints = [env.mj_model.joint(j) for j in range(env.mj_model.njnt)]
+    columns = [
+        f"qpos.{j.name}" + f".{i}" * (len(j.qpos0) > 1)
+        for j in joints
+        for i in range(len(j.qpos0))
+    ]
     drives = [env.mj_model.actuator(i).name for i in range(env.mj_model.nu)]
-    head = ["time", *(f"qpos.{j}" for j in joints), *(f"ctrl.{a}" for a in drives)]
+    head = ["time", *columns, *(f"ctrl.{a}" for a in drives)]
     out = []
     for i, seed in enumerate(saved["seeds"]):
         policy = jax.tree.map(lambda x, i=i: x[i], saved["policies"])
         logs = jax.tree.map(np.asarray, episodes(policy, jax.random.key(seed)))
-        for k in range(EPISODES):
+        for k in range(EPISODES[robot]):
             alive = int(logs.weight[k].sum())
             rows = np.c_[
                 env.dt * np.arange(alive), logs.qpos[k, :alive], logs.ctrl[k, :alive, 0]

@@ -46,7 +46,7 @@ def run(config: Config) -> None:
             _transfer,
             _real,
         ),
-        *(gap_summary.generated, gap_summary.real, gap_summary.loop),
+        *(gap_summary.generated, gap_summary.real, gap_summary.times, gap_summary.loop),
     ):
         parts += section(config.results)
     for name, text in gap_summary.figures(config.results).items():
