@@ -5,12 +5,14 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from easi_jax.drive_forces import drive_forces
 from easi_jax.gap.table import Scales
 from easi_jax.recording import Run
 from easi_jax.windows import fitted_velocity
 
 _ROWS = 400
 _LONGEST = 0.1  # s
+_PEAK = 99.8  # percentile
 
 
 def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
@@ -50,6 +52,7 @@ def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
     def rms(x: np.ndarray) -> np.ndarray:
         return np.sqrt(np.mean(np.minimum(x**2, 1e12), 0))
 
+    forces = np.concatenate([drive_forces(m, run) for run in runs])
     inertia = got["inertia"].mean(0)
     speed = rms(got["v"])
     torque = np.median(np.abs(got["torque"]), 0)
@@ -63,6 +66,7 @@ def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
         inertia=inertia,
         command=np.maximum(rms(got["ctrl"]), 1e-9) if m.nu else np.zeros(0),
         force=np.maximum(rms(got["force"]), 1e-9) if m.nu else np.zeros(0),
+        peak=np.percentile(np.abs(forces), _PEAK, axis=0) if m.nu else np.zeros(0),
         span=np.maximum(np.ptp(got["q"], 0), 1e-9),
         dt=runs[0].dt,
         longest=max(_LONGEST, 3 * runs[0].dt),

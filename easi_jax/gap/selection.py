@@ -269,7 +269,8 @@ class Selector:
             kept = [p for p in model.places if p is not place]
             found = self.fitted(kept, model.fit.x, more)
             best = min(found, key=lambda m: m.loss.mean())
-            if better(best, model, self.floor):
+            # Of one nature at one place: also a small gain says which.
+            if better(best, model, 0.0):
                 order = [best.places[-1] if p is place else p for p in model.places]
                 model = replace(best, places=order)
         return model
@@ -457,7 +458,7 @@ def probability(model: Model, rival: Model) -> float:
     In units of the noise and of the gap, on average over both, as `better` asks; where
     only a few windows tell the two apart, also by those, one by one. What fits as well
     with more numbers is less likely by a half standard error for each; what only adds
-    to the model hardly counts.
+    to the model counts less, however well it does.
     """
     t = 0.0
     for mine, theirs in ((model.loss, rival.loss), (model.gap, rival.gap)):
@@ -472,7 +473,7 @@ def probability(model: Model, rival: Model) -> float:
         t = max(t, float(single), key=abs)
     t += 0.5 * (size_of(rival) - size_of(model))
     if contains(rival.places[-1], model.places[-1]):
-        t = max(t, 0.0) + 1.0
+        t = max(t, -1.0) + 1.0
     return 0.5 * (1 + erf(t / sqrt(2)))
 
 

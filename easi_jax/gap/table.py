@@ -144,6 +144,7 @@ class Scales:
         inertia: about each degree of freedom, ``(nv,)``.
         command: RMS, ``(nu,)``.
         force: RMS of an actuator's force, ``(nu,)``.
+        peak: its largest, but for two rows in 1,000, ``(nu,)``.
         span: range of positions, ``(nv,)``.
         dt: control step [s].
         longest: longest delay that is looked for [s].
@@ -156,6 +157,7 @@ class Scales:
     inertia: np.ndarray
     command: np.ndarray
     force: np.ndarray
+    peak: np.ndarray
     span: np.ndarray
     dt: float
     longest: float
@@ -448,6 +450,7 @@ def _play(m: mujoco.MjModel, j: int, s: Scales) -> Place:
 def _at_actuator(m: mujoco.MjModel, a: int, s: Scales) -> list[Place]:
     at = name_of(m, "actuator", a)
     command, force = max(float(s.command[a]), 1e-9), max(float(s.force[a]), 1e-9)
+    peak = float(s.peak[a])
     dt = s.dt
 
     def place(
@@ -482,10 +485,12 @@ def _at_actuator(m: mujoco.MjModel, a: int, s: Scales) -> list[Place]:
                 "N m",
                 1e9,
                 0.02 * force,
-                4.0 * force,
+                max(4.0 * force, peak),
                 0.02 * force,
             ),
-            starts=[[2.2 * force], [1.5 * force], [1.0 * force], [0.6 * force]],
+            # A limit that is seldom met shows at the largest forces alone.
+            starts=[[x * force] for x in (2.2, 1.5, 1.0, 0.6)]
+            + [[x * peak] for x in (0.8, 0.5) if peak > 3.0 * force],
         ),
         *(
             Place(

@@ -460,8 +460,9 @@ def test_confidence_weighs_both_measures(
     assert probability(mine, fitted(0.5, 0.5, "viscous_damping")) < 0.01
     mixed = probability(mine, fitted(0.9, 1.1, "viscous_damping"))
     assert 0.3 < mixed < 0.7
-    # What contains the effect is no rival by being better.
-    assert probability(mine, fitted(0.9, 0.9, "stribeck_friction")) > 0.8
+    # What contains the effect is little of a rival, and none by being as good.
+    assert probability(mine, fitted(0.5, 0.5, "stribeck_friction")) == 0.5
+    assert probability(mine, fitted(1.0, 1.0, "stribeck_friction")) > 0.8
 
 
 def test_special_cases_of_the_promising_are_tried(

@@ -1,0 +1,196 @@
+"""The paper's tables and figures, cell by cell.
+
+    python -m benchmarks.paper table1
+    python -m benchmarks.paper table1 --robot ant --seeds 0 1 2
+    python -m benchmarks.paper table3 --shard 1/2
+    python -m benchmarks.paper table5 --list
+
+A cell is one method, robot, target and seed. Each that is done is a line of
+``results/paper.jsonl``, and is not run again: a run that was stopped goes on, and
+several processes or batch jobs share the work by ``--shard`` (the second of four is
+2/4) or ``--only``. Tables and figures are made from that file alone
+(``python -m benchmarks.summary``).
+"""
+
+import dataclasses
+import fcntl
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from benchmarks.paper_cells import METHODS, Cell
+from train._command import main, say
+
+RESULTS = Path(__file__).parent / "results" / "paper.jsonl"
+
+# As in the paper: what is changed in the target, and by how much.
+CHANGED = {
+    "cartpole": "cart_kp",
+    "ant": "torso_mass",
+    "ballbalance": "ball_mass",
+    "go2": "thigh_kp",
+}
+MUST = METHODS[:7]
+SEARCHES = ("EASI paper", "EASI default, not refined")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Runs the cells of one of the paper's tables or figures."""
+
+    experiment: Annotated[str, tyro.conf.Positional]
+    """table1, table3, table4, table5, fig6."""
+    robot: str = "cartpole"
+    """Built-in robot."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Seeds, paired over methods."""
+    methods: tuple[str, ...] = ()
+    """Methods; those of the experiment where not given."""
+    env_steps: int | None = None
+    """Control steps of each training; the robot's preset where not given."""
+    shard: str = "1/1"
+    """Which part of the cells this process runs."""
+    only: str = ""
+    """One cell, by its name as --list shows it."""
+    list: bool = False
+    """Show the cells, and which are done, without running any."""
+    folder: Path = Path("results/paper")
+    """Where UDR trainings are kept."""
+    out: Path = RESULTS
+    """Where a line for each cell is added."""
+
+
+def run(config: Config) -> None:
+    """Runs the cells that are not there yet."""
+    from benchmarks.paper_cells import solve
+    from easi_jax.errors import UserError
+    from easi_jax.io.versions import versions
+
+    every = cells(config)
+    if config.only:
+        every = [c for c in every if c.key == config.only]
+        if not every:
+            raise UserError(f'no cell "{config.only}": see --list')
+    part, parts = _shard(config.shard)
+    done = {row["key"] for row in read_rows(config.out)}
+    if config.list:
+        for c in every:
+            say(f"{'done' if c.key in done else 'open'}  {c.key}")
+        return
+    for c in every[part - 1 :: parts]:
+        if c.key in done:
+            continue
+        row = solve(c, config.folder)
+        row = {"key": c.key, **dataclasses.asdict(c), **row, "versions": versions()}
+        add_row(config.out, row)
+        told = f"return {row['return']:.1f}" if "return" in row else "identified"
+        say(f"{c.key}: {told}, {row.get('seconds', row.get('identify_s', 0)):.0f} s")
+
+
+def _shard(text: str) -> tuple[int, int]:
+    from easi_jax.errors import UserError
+
+    part, _, parts = text.partition("/")
+    good = part.isdigit() and parts.isdigit() and 1 <= int(part) <= int(parts)
+    if not good:
+        raise UserError(f"--shard {text}: write PART/PARTS, such as 2/4")
+    return int(part), int(parts)
+
+
+def cells(config: Config) -> list[Cell]:
+    """The cells of an experiment, in the order in which they are run.
+
+    Raises:
+        UserError: no such experiment, robot or method.
+    """
+    from easi_jax.errors import UserError, nearest
+
+    if config.experiment not in EXPERIMENTS:
+        known = ", ".join(EXPERIMENTS)
+        hint = nearest(config.experiment, EXPERIMENTS)
+        raise UserError(f'experiment "{config.experiment}": {known}{hint}')
+    if config.robot not in CHANGED:
+        hint = nearest(config.robot, CHANGED)
+        raise UserError(f"--robot {config.robot}: {', '.join(CHANGED)}{hint}")
+    for m in config.methods:
+        if m not in METHODS:
+            raise UserError(f'--methods "{m}": unknown{nearest(m, METHODS)}')
+    found = []
+    for seed in config.seeds:
+        for c in EXPERIMENTS[config.experiment](config, seed):
+            found.append(dataclasses.replace(c, env_steps=config.env_steps))
+    return found
+
+
+def _returns(config: Config, seed: int, factors: tuple[float, ...]) -> list[Cell]:
+    what = CHANGED[config.robot]
+    return [
+        Cell(m, config.robot, f"{what}*{x:g}", seed)
+        for x in factors
+        for m in config.methods or MUST
+    ]
+
+
+def _table1(config: Config, seed: int) -> list[Cell]:
+    return _returns(config, seed, (0.25, 0.5))
+
+
+def _fig6(config: Config, seed: int) -> list[Cell]:
+    methods = config.methods or ("UDR", "EASI default", "Oracle")
+    config = dataclasses.replace(config, methods=methods)
+    return _returns(config, seed, (0.25, 0.5, 2.0, 4.0))
+
+
+def _table3(config: Config, seed: int) -> list[Cell]:
+    target = f"{CHANGED[config.robot]}*0.5"
+    found = [Cell("UDR", config.robot, target, seed)]
+    for m in config.methods or ("EASI default",):
+        for count in (1, 50, 100, 200):
+            found.append(Cell(m, config.robot, target, seed, count))
+    return found
+
+
+def _swept(config: Config, seed: int, name: str, values: tuple) -> list[Cell]:
+    return [
+        Cell(m, config.robot, "", seed, settings=(f"{name}={x:g}",), policy=False)
+        for x in values
+        for m in config.methods or SEARCHES
+    ]
+
+
+def _table4(config: Config, seed: int) -> list[Cell]:
+    return _swept(config, seed, "elite_ratio", (0.1, 0.3, 0.5, 0.7, 0.9))
+
+
+def _table5(config: Config, seed: int) -> list[Cell]:
+    return _swept(config, seed, "discriminator_updates", (2, 5, 10, 15, 20))
+
+
+EXPERIMENTS = {
+    "table1": _table1,
+    "table3": _table3,
+    "table4": _table4,
+    "table5": _table5,
+    "fig6": _fig6,
+}
+
+
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """One a cell; none where the file is missing."""
+    if not path.is_file():
+        return []
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def add_row(path: Path, row: dict[str, Any]) -> None:
+    """Adds a line; several processes may do so at once."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        file.write(json.dumps(row) + "\n")
+
+
+if __name__ == "__main__":
+    main(Config, run, name="benchmarks.paper")

@@ -1,0 +1,31 @@
+"""Methods that EASI is compared with, and EASI itself, behind one interface.
+
+Each is a frozen dataclass of its settings with ``fit(task, demonstrations, budget,
+key)``; the published settings and their source are in its docstring.
+"""
+
+from easi_jax.methods.dropo import Dropo
+from easi_jax.methods.easi import Easi
+from easi_jax.methods.garat import Garat
+from easi_jax.methods.paired import PairedCmaEs, RandomSearch
+from easi_jax.methods.policies import FineTune, Learned, Oracle, PolicyMethod, Practice
+from easi_jax.methods.simopt import SimOpt
+from easi_jax.methods.task import Budget, Identified, Method, Task
+
+__all__ = [
+    "Budget",
+    "Dropo",
+    "Easi",
+    "FineTune",
+    "Garat",
+    "Identified",
+    "Learned",
+    "Method",
+    "Oracle",
+    "PairedCmaEs",
+    "PolicyMethod",
+    "Practice",
+    "RandomSearch",
+    "SimOpt",
+    "Task",
+]

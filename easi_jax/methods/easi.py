@@ -1,0 +1,73 @@
+"""EASI as a method among others."""
+
+from dataclasses import dataclass, field, replace
+
+import jax
+import numpy as np
+
+from easi_jax.identify import estimate
+from easi_jax.methods.task import Budget, Identified, Task
+from easi_jax.runtime import fast_loops
+from easi_jax.search import Search, SearchData
+from easi_jax.search_config import SearchConfig
+from easi_jax.segments import Segments, windows
+
+
+@dataclass(frozen=True)
+class Easi:
+    """The adversarial search (EASI, NeurIPS 2024), of either preset.
+
+    Settings and their sources: `easi_jax.search_config.SearchConfig`.
+    """
+
+    search: SearchConfig = field(default_factory=SearchConfig)
+    """The search; its generations are cut to the budget."""
+    refine: bool = False
+    """Finish with least squares on the paired data."""
+    refine_horizon: int = 25
+    """Control steps of a piece there."""
+
+    def fit(
+        self, task: Task, demonstrations: Segments, budget: Budget, key: jax.Array
+    ) -> Identified:
+        """The result of the search, refined where asked."""
+        c = self.search
+        replays = c.source == "replay"
+        horizon = c.horizon if replays else 1
+        pieces = windows(demonstrations, horizon, max(1, horizon // 2))
+        steps = min(c.segments, pieces.count) * horizon if replays else c.rollout_steps
+        rounds = min(c.generations, budget.rounds(c.population * steps))
+        search = Search(
+            task.machine,
+            replace(c, generations=rounds),
+            env=task.env,
+            act=task.act,
+            mesh=task.mesh,
+        )
+        noise, noisy = task.noise, bool(np.any(np.asarray(task.noise) > 0))
+
+        def found(key: jax.Array, policy: object) -> tuple[jax.Array, jax.Array]:
+            data = SearchData(pieces, noise, policy)
+            state, _ = search.run(search.init(key, data), data, rounds)
+            return state.result_mean, state.result_cov
+
+        mean, cov = jax.jit(found, compiler_options=fast_loops())(key, task.policy)
+        steps_of = min(self.refine_horizon, demonstrations.weight.shape[1])
+        longer = windows(demonstrations, steps_of, steps_of + 1)
+
+        def result(mean: jax.Array, cov: jax.Array) -> object:
+            return estimate(
+                task.machine,
+                search.space,
+                mean,
+                cov,
+                longer,
+                noise,
+                self.refine,
+                c.informed_spread,
+                task.mesh,
+                free_starts=noisy,
+            ).distribution
+
+        distribution = jax.jit(result)(mean, cov)
+        return Identified(distribution, search.space, rounds * c.population * steps)

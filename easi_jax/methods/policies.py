@@ -1,0 +1,150 @@
+"""Methods that end with a policy: Oracle, FineTune and GARAT's retraining."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import jax
+
+from easi_jax.errors import UserError
+from easi_jax.rl.config import SacConfig
+from easi_jax.rl.networks import PolicyParams
+from easi_jax.rl.seeds import init_seeds, run_seeds
+from easi_jax.rl.trainer import TrainingConfig, make_trainer
+from easi_jax.segments import Segments
+
+
+@dataclass(frozen=True)
+class Practice:
+    """A policy that does not transfer, and where it may be trained.
+
+    Attributes:
+        env: what is simulated, nominal parameters at ``theta``.
+        theta: of the simulation, SI units ``(n,)``.
+        real: the machine that the policy is for, as an environment.
+        target: its parameters, ``(m,)``.
+        training: settings and budget of a whole training.
+        state: of the training that the policy comes from.
+        policy: the policy, which recorded the demonstrations.
+    """
+
+    env: Any
+    theta: jax.Array
+    real: Any
+    target: jax.Array
+    training: TrainingConfig
+    state: Any
+    policy: PolicyParams
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A method's policy.
+
+    Attributes:
+        policy: to be tested.
+        simulated: control steps simulated for it.
+        measured: control steps of the real machine beyond the demonstrations.
+    """
+
+    policy: PolicyParams
+    simulated: int
+    measured: int = 0
+
+
+class PolicyMethod(Protocol):
+    """A way from demonstrations to a policy."""
+
+    def fit(
+        self, practice: Practice, demonstrations: Segments, key: jax.Array
+    ) -> Learned:
+        """Learns; ``demonstrations`` are trajectories ``(B, T, 1, ...)``."""
+        ...
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """A whole training in the target itself: what knowing everything would bring."""
+
+    def fit(
+        self, practice: Practice, demonstrations: Segments, key: jax.Array
+    ) -> Learned:
+        """Trains from scratch in the target."""
+        del demonstrations
+        training = quiet(practice.training)
+        policy = trained_at(practice.real, training, practice.target, key)
+        return Learned(policy, 0, training.env_steps)
+
+
+@dataclass(frozen=True)
+class FineTune:
+    """The policy's own training, continued in the target.
+
+    As in EASI's reference (NeurIPS 2024): 40,000 control steps of the target, of which
+    the first 10,000 are uniformly random actions. ``random_steps=0`` leaves that
+    handicap out, but for what fills the replay buffer first.
+    """
+
+    env_steps: int = 40_000
+    """Control steps in the target."""
+    random_steps: int = 10_000
+    """Of them, with random actions (SAC)."""
+
+    def fit(
+        self, practice: Practice, demonstrations: Segments, key: jax.Array
+    ) -> Learned:
+        """Goes on from the networks of the policy's training."""
+        del demonstrations
+        training = replace(quiet(practice.training), env_steps=self.env_steps)
+        if isinstance(training, SacConfig):
+            training = replace(training, random_steps=self.random_steps)
+        elif self.random_steps:
+            raise UserError(
+                "random actions are for SAC's buffer: with PPO give random_steps=0"
+            )
+        policy = trained_at(
+            practice.real, training, practice.target, key, practice.state
+        )
+        return Learned(policy, 0, self.env_steps)
+
+
+def quiet(training: TrainingConfig) -> TrainingConfig:
+    """The same training without evaluations on the way."""
+    return replace(training, evaluate_every=0)
+
+
+def trained_at(
+    env: Any,
+    training: TrainingConfig,
+    theta: Any,
+    key: jax.Array,
+    start: Any = None,
+) -> PolicyParams:
+    """A policy trained in one model, from the networks of ``start`` where given.
+
+    Args:
+        theta: what ``env.model`` takes; any pytree.
+    """
+    return trained(env, training, lambda given, _: given, theta, key, start)
+
+
+def trained(
+    env: Any,
+    training: TrainingConfig,
+    draw: Callable[[Any, jax.Array], Any],
+    dist: Any,
+    key: jax.Array,
+    start: Any = None,
+) -> PolicyParams:
+    """A policy trained under ``draw(dist, key) -> theta``, from the networks of
+    ``start`` where given; PPO's environments are split over all devices."""
+    trainer = make_trainer(env, training, env.model, draw)
+
+    def run(key: jax.Array, dist: Any, start: Any) -> PolicyParams:
+        states = init_seeds(trainer, key[None], dist)
+        if start is not None:
+            states = jax.vmap(trainer.continued, (0, None))(states, start)
+        states, _ = run_seeds(trainer, states, dist, training.iterations)
+        return trainer.policy(jax.tree.map(lambda x: x[0], states))
+
+    return jax.jit(run)(key, dist, start)

@@ -1,0 +1,120 @@
+"""What every method is given, and what it gives back."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from easi_jax.distribution import Distribution
+from easi_jax.errors import UserError
+from easi_jax.machine import Machine
+from easi_jax.mesh import make_mesh
+from easi_jax.parameters import ParameterSpace
+from easi_jax.segments import Segments
+
+Act = Callable[[Any, jax.Array, jax.Array], jax.Array]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What identification may spend, the same for all methods.
+
+    Attributes:
+        simulated: control steps that may be simulated; what EASI's 50 generations of
+            300 individuals and 200 steps take where not given.
+    """
+
+    simulated: int = 3_000_000
+
+    def __post_init__(self) -> None:
+        """Raises UserError for a budget that buys nothing."""
+        if self.simulated < 1:
+            raise UserError(f"a budget of {self.simulated} control steps buys nothing")
+
+    def rounds(self, steps: int) -> int:
+        """How many rounds of ``steps`` control steps it pays for.
+
+        Raises:
+            UserError: not even one.
+        """
+        if steps > self.simulated:
+            raise UserError(
+                f"a budget of {self.simulated} control steps does not pay for one "
+                f"round of {steps}"
+            )
+        return self.simulated // steps
+
+
+@dataclass(frozen=True)
+class Task:
+    """A machine to be identified, and what may be asked of it.
+
+    Attributes:
+        machine: what is simulated; its space says where a search starts and may go.
+        noise: of what is measured, standard deviations ``(2 nv,)``; zero: none.
+        env: the machine as an environment, for methods that simulate the controller.
+        act: ``act(policy, obs, key) -> action``, what recorded the demonstrations.
+        act_best: the same without exploration; ``act`` where not given.
+        policy: its parameters.
+        record: ``record(policy, keys) -> Segments``: further trajectories of the real
+            machine, one for each key, ``(B, T, 1, ...)``, from the starts that
+            `easi_jax.rollout.policy_rollout` has with these keys; None where there are
+            none to be had.
+        train: ``train(space, distribution, key) -> policy``, under the method's
+            training budget; None where policies are not asked for.
+        mesh: devices.
+    """
+
+    machine: Machine
+    noise: Any
+    env: Any = None
+    act: Act | None = None
+    act_best: Act | None = None
+    policy: Any = None
+    record: Callable[[Any, jax.Array], Segments] | None = None
+    train: Callable[[ParameterSpace, Distribution, jax.Array], Any] | None = None
+    mesh: Mesh = field(default_factory=make_mesh)
+
+    @property
+    def space(self) -> ParameterSpace:
+        return self.machine.space
+
+    @property
+    def start_mean(self) -> jax.Array:
+        """The middle of where a search starts, unit coordinates ``(n,)``."""
+        return jnp.full(self.space.size, 0.5)
+
+    @property
+    def start_std(self) -> jax.Array:
+        """Of a uniform draw from there, ``(n,)``."""
+        return jnp.full(self.space.size, 12.0**-0.5)
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What a method found.
+
+    Attributes:
+        distribution: over the parameters.
+        space: whose unit coordinates it is in.
+        simulated: control steps simulated to identify it.
+        measured: control steps of the real machine beyond the demonstrations.
+    """
+
+    distribution: Distribution
+    space: ParameterSpace
+    simulated: int
+    measured: int = 0
+
+
+class Method(Protocol):
+    """A way from demonstrations to a distribution over parameters."""
+
+    def fit(
+        self, task: Task, demonstrations: Segments, budget: Budget, key: jax.Array
+    ) -> Identified:
+        """Identifies; ``demonstrations`` are trajectories ``(B, T, 1, ...)``."""
+        ...

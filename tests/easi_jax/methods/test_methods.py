@@ -1,0 +1,152 @@
+"""Each method moves from a wrong start towards the truth, within its budget."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from easi_jax.distribution import covariance
+from easi_jax.errors import UserError
+from easi_jax.machine import Machine
+from easi_jax.methods import (
+    Budget,
+    Dropo,
+    Easi,
+    Identified,
+    Method,
+    PairedCmaEs,
+    RandomSearch,
+    SimOpt,
+    Task,
+)
+from easi_jax.methods.simopt import reps_weights
+from easi_jax.rollout import collect, measured, policy_rollout
+from easi_jax.search_config import preset
+from easi_jax.segments import Segments
+from envs import make
+
+NAMES = ("cart_kp", "cart_kv", "pole_damping")
+BUDGET = Budget(300_000)
+STEPS = 40
+NOISE = jnp.array([5e-4, 2e-3, 1e-2, 2e-2])
+
+
+def controller(policy: jax.Array, obs: jax.Array, key: jax.Array) -> jax.Array:
+    u = obs @ jnp.array([3.75, 1.5, 7.5, 1.375])
+    return jnp.clip(u + policy * jax.random.normal(key), -1.0, 1.0)[None]
+
+
+def best(policy: jax.Array, obs: jax.Array, key: jax.Array) -> jax.Array:
+    return controller(0.0 * policy, obs, key)
+
+
+@pytest.fixture(scope="module")
+def task() -> Task:
+    """Three parameters of Cartpole; the search starts at 1.5 to 6 times the truth."""
+    env = make("cartpole")
+    env.episode_length = STEPS
+    space = env.space.select(NAMES).scaled(1.5, 6.0)
+    machine = Machine(env.mj_model, space, env.dt)
+    truth = env.model()
+
+    @jax.jit
+    def record(policy: jax.Array, keys: jax.Array) -> Segments:
+        def one(key: jax.Array) -> Segments:
+            return policy_rollout(
+                env, truth, lambda o, k: best(policy, o, k), key, STEPS
+            )
+
+        return jax.vmap(one)(keys)
+
+    return Task(
+        machine,
+        jnp.zeros(4),
+        env=env,
+        act=controller,
+        act_best=best,
+        policy=jnp.asarray(0.25),
+        record=record,
+        train=lambda space, distribution, key: jnp.asarray(0.25),
+    )
+
+
+@pytest.fixture(scope="module")
+def demonstrations(task: Task) -> Segments:
+    policy = jnp.asarray(0.25)
+    run = jax.jit(
+        lambda key: collect(
+            task.env,
+            task.env.model(),
+            lambda obs, k: controller(policy, obs, k),
+            key,
+            40,
+            STEPS,
+        )
+    )
+    return run(jax.random.key(0))
+
+
+def log_ratios(task: Task, found: Identified) -> np.ndarray:
+    """Of what was found to the truth."""
+    si = np.asarray(found.space.to_si(found.distribution.mean))
+    return np.log(si / np.asarray(task.env.space.select(NAMES).nominal))
+
+
+EASI = preset("default", population=100, segments=64)
+# Largest |log ratio| of the drive's stiffness, and of its damping.
+METHODS: dict[str, tuple[Method, tuple[float, float]]] = {
+    "cma_es": (PairedCmaEs(population=16, pieces=8, horizon=20), (0.02, 0.05)),
+    # It cannot leave where it starts, at 1.5 times the truth.
+    "random": (RandomSearch(pieces=8, horizon=20), (0.6, 1.5)),
+    "dropo": (Dropo(transitions=40, samples=4), (0.1, 0.3)),
+    "simopt": (SimOpt(iterations=2, trajectories=4), (0.3, 1.0)),
+    "easi": (Easi(EASI), (0.1, 0.3)),
+    "easi_refined": (Easi(EASI, refine=True), (0.01, 0.01)),
+}
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_the_truth_is_approached_from_a_start_that_excludes_it(
+    name: str, task: Task, demonstrations: Segments
+) -> None:
+    method, most = METHODS[name]
+    found = method.fit(task, demonstrations, BUDGET, jax.random.key(1))
+    assert 0.5 * BUDGET.simulated < found.simulated <= BUDGET.simulated
+    error = log_ratios(task, found)
+    # The middle of 1.5 to 6 times the truth is 3 times.
+    assert abs(error[0]) < most[0] < np.log(3), error
+    assert abs(error[1]) < most[1], error
+    spread = np.sqrt(np.diag(covariance(found.distribution)))
+    assert np.isfinite(spread).all() and (spread < 12.0**-0.5 + 0.1).all()
+    assert (found.measured > 0) == (name == "simopt")
+
+
+def test_noise_widens_what_is_likely(task: Task, demonstrations: Segments) -> None:
+    """DROPO's spread holds what the sensors add; without a floor it would vanish."""
+    noisy = measured(demonstrations, NOISE, jax.random.key(2))
+    method = Dropo(transitions=40, samples=4)
+    found = method.fit(replace(task, noise=NOISE), noisy, BUDGET, jax.random.key(1))
+    assert np.abs(log_ratios(task, found)[:2]).max() < 0.4
+
+
+def test_a_budget_that_buys_no_round_is_refused(
+    task: Task, demonstrations: Segments
+) -> None:
+    for method, _ in METHODS.values():
+        with pytest.raises(UserError, match="does not pay"):
+            method.fit(task, demonstrations, Budget(100), jax.random.key(0))
+    with pytest.raises(UserError, match="buys nothing"):
+        Budget(0)
+
+
+def test_reps_keeps_to_its_bound() -> None:
+    cost = jnp.asarray(np.random.default_rng(0).exponential(size=500))
+    for bound in (0.1, 1.0):
+        w = reps_weights(cost, bound, 1e-3)
+        divergence = float((w * jnp.log(jnp.maximum(w * len(cost), 1e-30))).sum())
+        assert divergence == pytest.approx(bound, rel=0.1)
+        assert float(w @ cost) < float(cost.mean())
+    even = reps_weights(jnp.ones(10), 1.0, 1e-3)
+    assert np.allclose(even, 0.1), "nothing to choose between"
