@@ -47,7 +47,7 @@ from easi_jax.windows import fitted_velocity
 
 _FITTED = (32, 96)  # windows that fits see
 _STEPS = 9_600  # physics steps in them
-_EXTREME = 4  # one of so many has large forces or speeds
+_EXTREME = 4  # for so many, one more that has large forces or speeds
 _BLOCKS = 10
 _MOST = 5  # effects
 _STAGES = 8  # of adding one and taking out what has become needless
@@ -554,16 +554,16 @@ def _reach(m: mujoco.MjModel, runs: Sequence[Run], windows: WindowSet) -> np.nda
 
 
 def _spread(windows: WindowSet, most: int, reach: np.ndarray) -> np.ndarray:
-    """Indices of at most ``most`` windows: a few with the largest forces and speeds,
-    where limits show, the others at even distances."""
+    """Indices of ``most`` windows at even distances, and of some more with the largest
+    forces and speeds, where limits show; all where there are no more."""
     count = len(windows)
     if count <= most:
         return np.arange(count)
-    even = np.linspace(0, count - 1, most - most // _EXTREME).round().astype(int)
-    chosen = set(even.tolist())
+    chosen = set(np.linspace(0, count - 1, most).round().astype(int).tolist())
+    whole = min(count, most + most // _EXTREME)
     for largest in np.argsort(-reach, axis=0, kind="stable"):
         for window in largest.tolist():
-            if len(chosen) < most:
+            if len(chosen) < whole:
                 chosen.add(window)
     return np.array(sorted(chosen))
 
