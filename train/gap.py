@@ -81,7 +81,9 @@ def run(config: Config) -> None:
         for note in problem.notes:
             say(f"note: {note}")
         outcome = analysis.run()
-        outcome.notes = problem.notes
+        for note in outcome.notes:
+            say(f"note: {note}")
+        outcome.notes = [*problem.notes, *outcome.notes]
         outcome.record_next = _record_next(analysis, outcome, problem, config.horizon)
         report = write_results(folder, config, problem, analysis, outcome)
         retrained = None
