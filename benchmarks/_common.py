@@ -1,6 +1,9 @@
 """What all benchmarks share: where figures go, and what they were made with."""
 
 import dataclasses
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -35,6 +38,21 @@ def command_of(module: str, config: Any) -> str:
             items = value if isinstance(value, tuple) else (value,)
             words += [f"--{flag}", *map(str, items)]
     return " ".join(words)
+
+
+def first_start(words: Sequence[str], folder: Path, limit: float) -> float:
+    """Seconds of ``python`` with ``words`` from the repository's root, in a process
+    and, in ``folder``, a compilation cache of its own."""
+    begin = time.monotonic()
+    subprocess.run(
+        [sys.executable, *words],
+        cwd=Path(__file__).parents[1],
+        env={**os.environ, "JAX_COMPILATION_CACHE_DIR": str(folder / "cache")},
+        stdout=subprocess.DEVNULL,
+        timeout=limit,
+        check=True,
+    )
+    return time.monotonic() - begin
 
 
 def write_result(

@@ -9,15 +9,12 @@ otherwise idle machine. Results go to ``benchmarks/results/gap_times.json``.
 import dataclasses
 import json
 import os
-import subprocess
-import sys
 import tempfile
-import time
 from pathlib import Path
 
+from benchmarks._common import first_start
 from train._command import main, say, show_table
 
-ROOT = Path(__file__).parents[1]
 GOALS = {"pendulum": 90, "cartpole": 180, "leg": 300, "arm6": 600}  # s, on two cores
 EFFECTS = ("coulomb_friction", "actuator_lag")
 _LIMIT = 3600  # s
@@ -78,21 +75,11 @@ def run(config: Config) -> None:
 def timed(case: Path, folder: Path) -> tuple[float, dict]:
     """Seconds of ``train.gap`` on a case, and its ``gap.json``."""
     words = [
-        *(sys.executable, "-m", "train.gap", "--model", str(case / "model.xml")),
+        *("-m", "train.gap", "--model", str(case / "model.xml")),
         *("--data", *map(str, sorted(case.glob("run*.csv")))),
         *("--out", str(folder / "gap")),
     ]
-    begin = time.monotonic()
-    subprocess.run(
-        words,
-        cwd=ROOT,
-        env={**os.environ, "JAX_COMPILATION_CACHE_DIR": f"{folder}/cache"},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        timeout=_LIMIT,
-        check=True,
-    )
-    seconds = time.monotonic() - begin
+    seconds = first_start(words, folder, _LIMIT)
     return seconds, json.loads((folder / "gap" / "gap.json").read_text())
 
 

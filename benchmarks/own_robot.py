@@ -7,12 +7,8 @@ Minutes; results go to ``benchmarks/results/own_robot.json``.
 
 import dataclasses
 import json
-import os
 import runpy
-import subprocess
-import sys
 import tempfile
-import time
 from pathlib import Path
 
 from train._command import main, say
@@ -30,28 +26,19 @@ class Config:
 
 def run(config: Config) -> None:
     """Runs the command in a process and a compilation cache of its own."""
-    from benchmarks._common import command_of, write_result
+    from benchmarks._common import command_of, first_start, write_result
 
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         words = [
-            *(sys.executable, "-m", "train.easi"),
+            *("-m", "train.easi"),
             *("--model", str(EXAMPLE / "model.xml")),
             *("--parameters", str(EXAMPLE / "parameters.yaml")),
             *("--data", str(EXAMPLE / "sweep.csv")),
             *("--held-out", str(EXAMPLE / "moves.csv")),
             *("--out", str(out)),
         ]
-        begin = time.monotonic()
-        subprocess.run(
-            words,
-            cwd=ROOT,
-            env={**os.environ, "JAX_COMPILATION_CACHE_DIR": f"{folder}/cache"},
-            stdout=subprocess.DEVNULL,
-            timeout=_LIMIT,
-            check=True,
-        )
-        seconds = time.monotonic() - begin
+        seconds = first_start(words, Path(folder), _LIMIT)
         found = json.loads((out / "distribution.json").read_text())
     truth = runpy.run_path(str(ROOT / EXAMPLE / "make_log.py"))["TRUTH"]
     first = found["seeds"]["0"]

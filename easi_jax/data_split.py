@@ -6,11 +6,10 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from easi_jax.drive_forces import drive_forces
+from easi_jax.drive_forces import exertion
 from easi_jax.errors import UserError
 from easi_jax.log_data import rows_of
 from easi_jax.recording import Run
-from easi_jax.windows import fitted_velocity
 
 HELD_OUT = 0.25  # of the rows, where whole runs are held out
 LAST = 0.3  # of a single run
@@ -73,8 +72,7 @@ def split_held_out(
 
 def _reach(m: mujoco.MjModel, run: Run) -> np.ndarray:
     """Largest drive forces and speeds but for two rows in 1,000, ``(nu + nv,)``."""
-    speed = fitted_velocity(run.qpos, run.dt, run.configuration)
-    return np.percentile(np.abs(np.c_[drive_forces(m, run), speed]), _REACHED, axis=0)
+    return np.percentile(exertion(m, run), _REACHED, axis=0)
 
 
 def _unlike(reach: np.ndarray, held: set[int]) -> float:

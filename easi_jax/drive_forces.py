@@ -27,3 +27,9 @@ def drive_forces(m: mujoco.MjModel, run: Run) -> np.ndarray:
         mujoco.mj_fwdActuation(m, d)
         out[t] = d.actuator_force
     return out
+
+
+def exertion(m: mujoco.MjModel, run: Run) -> np.ndarray:
+    """Sizes of drive forces and of speeds in each row, ``(T, nu + nv)``."""
+    speed = fitted_velocity(run.qpos, run.dt, run.configuration)
+    return np.abs(np.c_[drive_forces(m, run), speed])

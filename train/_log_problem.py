@@ -131,8 +131,8 @@ def read_runs(config: Any, mj_model: Any, horizon: float) -> MeasuredRuns:
     Raises:
         UserError: whatever is wrong with the files, or nothing is left to fit.
     """
+    from easi_jax.data_split import split_held_out
     from easi_jax.errors import UserError
-    from easi_jax.held_out import split_held_out
     from easi_jax.io.logs import read_logs
     from easi_jax.log_data import pooled_noise, to_common_step, without_odd_ends
 

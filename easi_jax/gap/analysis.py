@@ -13,7 +13,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from easi_jax.drive_forces import drive_forces
+from easi_jax.drive_forces import exertion
 from easi_jax.errors import UserError
 from easi_jax.gap import measure
 from easi_jax.gap.fit import bounds_of, window_weights
@@ -43,7 +43,6 @@ from easi_jax.gap.where import Conditions
 from easi_jax.parameters import ParameterSpace
 from easi_jax.quantities import scalar_dofs
 from easi_jax.recording import Run, physics_steps
-from easi_jax.windows import fitted_velocity
 
 _FITTED = (32, 96)  # windows that fits see
 _STEPS = 9_600  # physics steps in them
@@ -543,12 +542,7 @@ class Analysis:
 def _reach(m: mujoco.MjModel, runs: Sequence[Run], windows: WindowSet) -> np.ndarray:
     """Largest drive forces and speeds in each window, ``(W, nu + nv)``."""
     steps = windows.ctrl.shape[1]
-    sizes = [
-        np.abs(
-            np.c_[drive_forces(m, r), fitted_velocity(r.qpos, r.dt, r.configuration)]
-        )
-        for r in runs
-    ]
+    sizes = [exertion(m, run) for run in runs]
     parts = zip(windows.run, windows.row, strict=True)
     return np.array([sizes[r][row : row + steps + 1].max(0) for r, row in parts])
 

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from easi_jax.data_split import split_held_out
 from easi_jax.drive_forces import drive_forces
 from easi_jax.errors import UserError
-from easi_jax.held_out import split_held_out
 from tests.easi_jax.test_log_data import make_run
 
 SLIDE = mujoco.MjModel.from_xml_string("""
