@@ -103,20 +103,23 @@ def say(message: str) -> None:
 
 
 @contextlib.contextmanager
-def progress(name: str, total: int, done: int = 0) -> Iterator[Progress]:
+def progress(
+    name: str, total: int, done: int = 0, patience: float = 0.0
+) -> Iterator[Progress]:
     """Shows how far ``name`` is, its rate and the time left, on standard error.
 
     Args:
         name: of the stage, such as ``search``.
         total: steps in all.
         done: steps that an earlier process did.
+        patience: nothing is shown of what takes no longer [s].
     """
     meter = Meter(total, done)
     if sys.stderr.isatty():
-        with _bar(name, meter) as shown:
+        with _bar(name, meter, patience) as shown:
             yield shown
     else:
-        yield _Log(name, meter)
+        yield _Log(name, meter, patience)
 
 
 class Meter:
@@ -177,23 +180,25 @@ def duration(seconds: float) -> str:
 
 
 class _Log:
-    def __init__(self, name: str, meter: Meter) -> None:
+    def __init__(self, name: str, meter: Meter, patience: float) -> None:
         self._name = name
         self._meter = meter
-        self._last = -float("inf")
+        self._next = patience
+        self._shown = patience == 0
 
     def advance(self, n: int = 1, **fields: float | int | str) -> None:
         _interrupt.check()
         self._meter.advance(n)
-        due = self._meter.elapsed - self._last >= LOG_SECONDS
-        if due or self._meter.done >= self._meter.total:
-            self._last = self._meter.elapsed
+        ended = self._meter.done >= self._meter.total and self._shown
+        if ended or self._meter.elapsed >= self._next:
+            self._shown = True
+            self._next = self._meter.elapsed + LOG_SECONDS
             line = f"{self._name}  {self._meter.summary()}  {_fields(fields)}"
             print(line.rstrip(), file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager
-def _bar(name: str, meter: Meter) -> Iterator[Progress]:
+def _bar(name: str, meter: Meter, patience: float) -> Iterator[Progress]:
     from rich.progress import BarColumn, ProgressColumn, Task, TextColumn
     from rich.progress import Progress as Bar
     from rich.table import Column
@@ -215,6 +220,7 @@ def _bar(name: str, meter: Meter) -> Iterator[Progress]:
         console=_console(sys.stderr),
         refresh_per_second=4,
         expand=True,
+        transient=patience > 0,
     )
     task = bar.add_task(name, total=meter.total, completed=meter.done, values="")
 
@@ -223,9 +229,15 @@ def _bar(name: str, meter: Meter) -> Iterator[Progress]:
             _interrupt.check()
             meter.advance(n)
             bar.update(task, advance=n, values=_fields(fields))
+            if meter.elapsed >= patience:
+                bar.start()
 
-    with bar:
+    try:
+        if patience == 0:
+            bar.start()
         yield Shown()
+    finally:
+        bar.stop()
 
 
 def _console(stream: Any) -> Any:

@@ -1,12 +1,14 @@
 """``python -m train.gap``: which physical effect does the model lack?"""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from train._command import main, say, show_table
+from train._command import main, progress, say, show_table
 
 _HORIZON = 0.2
+_PATIENCE = 5.0  # s; a stage that takes no longer shows no progress
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +76,7 @@ def run(config: Config) -> None:
         config.horizon,
         tell=say,
         fixed=problem.model.fixed,
+        progress=partial(progress, patience=_PATIENCE),
     )
     with RunFolder.open(
         config.out, config, command="train.gap", overwrite=config.overwrite

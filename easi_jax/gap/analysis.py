@@ -41,6 +41,7 @@ from easi_jax.gap.selection import (
 from easi_jax.gap.table import REFITTED, Layout, Place, covered, places, ripples
 from easi_jax.gap.where import Conditions
 from easi_jax.parameters import ParameterSpace
+from easi_jax.progress import Progress, silent
 from easi_jax.quantities import scalar_dofs
 from easi_jax.recording import Run, physics_steps
 
@@ -79,6 +80,7 @@ class Analysis:
         horizon: float,
         tell: Tell = lambda _: None,
         fixed: Mapping[str, float] | None = None,
+        progress: Progress = silent,
     ) -> None:
         self.m, self.space, self.tell = mj_model, space, tell
         self.runs = [*fit, *held]
@@ -141,6 +143,7 @@ class Analysis:
             self.bounds,
             self.group,
             range(space.size),
+            progress,
         )
 
     def _cycles(self, j: int) -> list[float]:

@@ -182,11 +182,15 @@ def _step(
 
 
 def lockstep(
-    problems: Sequence[Asks], simulate: Simulate, most: int = 512
+    problems: Sequence[Asks],
+    simulate: Simulate,
+    most: int = 512,
+    ended: Callable[[], None] = lambda: None,
 ) -> list[Fitted]:
     """Runs all problems to their ends; each round is one call of ``simulate``.
 
-    ``simulate`` takes vectors ``(B, n)`` and returns whitened errors ``(B, W, m)``.
+    ``simulate`` takes vectors ``(B, n)`` and returns whitened errors ``(B, W, m)``;
+    ``ended`` is called at the end of each.
     """
     asks = {i: next(p) for i, p in enumerate(problems)}
     done: dict[int, Fitted] = {}
@@ -206,4 +210,5 @@ def lockstep(
                 asks[i] = problems[i].send(part)
             except StopIteration as end:
                 done[i] = end.value
+                ended()
     return [done[i] for i in range(len(problems))]

@@ -22,6 +22,7 @@ from easi_jax.gap.fit import (
 from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.residuals import Residuals
 from easi_jax.gap.table import RARE, Place
+from easi_jax.progress import Progress, silent
 
 _SHORTLIST = 7  # names that are fitted in full at each stage
 _STARTS = 2  # of each
@@ -90,6 +91,7 @@ class Selector:
         bounds: of the whole vector.
         group: block of cross-validation that each window is in, ``(count,)``.
         own: indices of the model's own parameters that may be refitted.
+        progress: told how far long stages are.
     """
 
     def __init__(
@@ -100,8 +102,9 @@ class Selector:
         bounds: Bounds,
         group: np.ndarray,
         own: Sequence[int],
+        progress: Progress = silent,
     ) -> None:
-        self.predictor = predictor
+        self.predictor, self.progress = predictor, progress
         self.residuals: Residuals
         self.floor = 0.0
         self.blocks, self.count, self.bounds = blocks, count, bounds
@@ -229,10 +232,13 @@ class Selector:
             out.append((cost, replace(c, ends=tuple(end))))
         return sorted(out, key=lambda item: item[0])
 
-    def _many(self, x: np.ndarray, most: int = 512) -> np.ndarray:
-        return np.concatenate(
-            [self.simulate(x[i : i + most]) for i in range(0, len(x), most)]
-        )
+    def _many(self, x: np.ndarray, most: int = 256) -> np.ndarray:
+        got = []
+        with self.progress("trying effects", len(x)) as shown:
+            for i in range(0, len(x), most):
+                got.append(self.simulate(x[i : i + most]))
+                shown.advance(len(got[-1]))
+        return np.concatenate(got)
 
     def fitted(
         self, places: list[Place], x: np.ndarray, chosen: Sequence[Candidate]
@@ -247,8 +253,10 @@ class Selector:
             )
             for c in chosen
         ]
+        with self.progress("fitting effects", len(problems)) as shown:
+            fits = lockstep(problems, self.simulate, ended=shown.advance)
         best: dict[str, tuple[float, Place, Fitted]] = {}
-        for c, f in zip(chosen, lockstep(problems, self.simulate), strict=True):
+        for c, f in zip(chosen, fits, strict=True):
             key = c.place.key
             if key not in best or f.cost < best[key][0]:
                 best[key] = (f.cost, c.place, f)

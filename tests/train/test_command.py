@@ -1,10 +1,12 @@
 import asyncio
 import contextlib
 import dataclasses
+import io
 import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Literal
 
@@ -202,6 +204,40 @@ def test_progress_log_is_rationed(capsys):
             shown.advance(1)
     lines = capsys.readouterr().err.splitlines()
     assert [line.split()[1] for line in lines] == ["1/100", "100/100"]
+
+
+def test_a_short_stage_shows_no_progress(capsys):
+    for patience, lines in ((60.0, 0), (0.0, 2)):
+        with progress("fitting effects", total=3, patience=patience) as shown:
+            for _ in range(3):
+                shown.advance()
+        assert len(capsys.readouterr().err.splitlines()) == lines
+
+
+def test_a_stage_that_outlasts_patience_shows_progress(capsys):
+    with progress("fitting effects", total=3, patience=0.01) as shown:
+        shown.advance()
+        time.sleep(0.02)
+        shown.advance()
+        shown.advance()
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split()[2] for line in lines] == ["2/3", "3/3"]
+
+
+def test_a_bar_is_shown_once_patience_is_over(monkeypatch):
+    told = _Terminal()
+    monkeypatch.setattr(sys, "stderr", told)
+    with progress("trying effects", total=2, patience=60.0) as shown:
+        shown.advance(2)
+    assert "trying effects" not in told.getvalue()
+    with progress("trying effects", total=2) as shown:
+        shown.advance(2)
+    assert "trying effects" in told.getvalue()
+
+
+class _Terminal(io.StringIO):
+    def isatty(self):
+        return True
 
 
 def test_rate_leaves_out_the_chunk_that_compiles():

@@ -190,6 +190,7 @@ def test_least_squares_finds_a_bent_valley() -> None:
     tight = Bounds(np.full(2, -5.0), np.array([0.5, 5.0]), size)
     start = np.array([[-1.2, 1.0], [-0.5, 0.4]])
     one = np.ones(1)
+    ends: list[None] = []
     best, cut, fixed = lockstep(
         [
             least_squares(start, [0, 1], free, one, 60),
@@ -197,7 +198,9 @@ def test_least_squares_finds_a_bent_valley() -> None:
             least_squares(start, [], free, one),
         ],
         simulate,
+        ended=lambda: ends.append(None),
     )
+    assert len(ends) == 3
     assert best.cost < 1e-3
     np.testing.assert_allclose(cut.x, [0.5, 0.25], atol=0.02)
     np.testing.assert_array_equal(fixed.x, start[1])
