@@ -25,6 +25,8 @@ class Cell:
             None.
         settings: of the search, ``NAME=VALUE``.
         policy: whether a policy is trained and tested, or only parameters are sought.
+        curves: keep how parameters and returns went on the way.
+        options: of the robot, ``NAME=VALUE``.
     """
 
     method: str
@@ -36,6 +38,8 @@ class Cell:
     start: tuple[float, float] | None = None
     settings: tuple[str, ...] = ()
     policy: bool = True
+    curves: bool = False
+    options: tuple[str, ...] = ()
 
     @property
     def key(self) -> str:
@@ -47,9 +51,11 @@ class Cell:
             words.append(f"{self.env_steps} steps")
         if self.start is not None:
             words.append(f"from {self.start[0]:g} to {self.start[1]:g}")
-        words += self.settings
+        words += [*self.settings, *self.options]
         if not self.policy:
             words.append("no policy")
+        if self.curves:
+            words.append("curves")
         return ", ".join(words)
 
 
@@ -105,63 +111,206 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
 
     Returns:
         ``return`` in the target (mean of `EPISODES` episodes) where there is a policy;
-        ``log_ratio`` of each parameter to the truth and unit-coordinate ``std`` where a
-        distribution was found; what was ``simulated`` and ``measured``, ``seconds``.
+        ``log_ratio`` of each parameter to the truth, ``error``, their RMS along the
+        directions that the demonstrations determine, and unit-coordinate ``std`` where
+        a distribution was found; what was ``simulated`` and ``measured``, ``seconds``.
+        With ``cell.curves``: ``curve`` (control steps, returns in the target) of the
+        last training, ``trace`` (mean, below, above) of each parameter by generation,
+        as ratios to the truth.
     """
     import jax
     import jax.numpy as jnp
     import numpy as np
 
-    from easi_jax import distribution
-    from easi_jax.methods import Budget, Practice, Task
-    from easi_jax.methods.policies import Learned, quiet, trained
-    from easi_jax.pipeline import (
-        Pipeline,
-        PipelineConfig,
-        seed_keys,
-        stage_keys,
-        target_parameters,
-    )
     from easi_jax.rl.evaluate import evaluate
     from easi_jax.rl.networks import act
-    from easi_jax.rollout import policy_rollout
-    from envs import make
-    from train._robots import load_udr, training_config
 
-    env = make(cell.robot)
-    training = quiet(training_config(env, cell.env_steps))
-    changes = (cell.target,) if cell.target else ()
-    theta = target_parameters(env.space, changes)
-    target = jnp.asarray(theta, jnp.float32)
-    udr = load_udr(udr_run(cell, folder))
-    state, policy = jax.tree.map(lambda x: x[0], (udr["states"], udr["policies"]))
-    pipe = Pipeline(
-        env,
-        PipelineConfig(training=training, trajectories=cell.trajectories),
-        start=cell.start,
-    )
-    keys = stage_keys(seed_keys([cell.seed]))
-    demos = jax.tree.map(
-        lambda x: x[0],
-        jax.jit(pipe.demonstrate)(udr["policies"], target, keys["demonstrate"]),
-    )
-    k_search, k_final = keys["search"][0], keys["final"][0]
-    row: dict[str, Any] = {"simulated": 0, "measured": 0}
+    bench = _Bench.open(cell, folder)
     begun = time.monotonic()
-    learned = policy
-
-    def train(space: Any, dist: Any, key: Any) -> Any:
-        return trained(
-            env, training, lambda d, k: distribution.draw(space, d, k), dist, key
-        )
-
+    policy, row = bench.policy, {"simulated": 0, "measured": 0}
     if cell.method in identifiers():
+        policy, found = bench.identified(begun)
+        row |= found
+    elif cell.method in learners():
+        policy, found = bench.learned()
+        row |= found
+    elif cell.curves:
+        row["curve"] = bench.first_curve()
+    if cell.policy:
+        jax.block_until_ready(policy)
+        row["seconds"] = time.monotonic() - begun
+        env = bench.env
+        returns = jax.jit(
+            lambda p, k: evaluate(env, env.model(bench.target), p, act, k)
+        )
+        resets = jax.random.split(bench.keys["evaluate"], EPISODES)
+        values = np.asarray(returns(policy, resets))
+        row["return"] = float(jnp.nanmean(values))
+        row["lost"] = int(np.isnan(values).sum())
+    return row
+
+
+@dataclasses.dataclass(frozen=True)
+class _Bench:
+    """What every cell starts from: a policy that does not transfer, and its logs.
+
+    Attributes:
+        pipe: stages for the robot, the search starting as the cell says.
+        target: parameters of the machine, SI.
+        run: folder of the UDR training; ``state`` and ``policy`` are its end.
+        demos: trajectories ``(B, T, 1, ...)``.
+        keys: one for each stage.
+    """
+
+    cell: Cell
+    env: Any
+    pipe: Any
+    training: Any
+    target: Any
+    run: Path
+    state: Any
+    policy: Any
+    demos: Any
+    keys: Any
+
+    @classmethod
+    def open(cls, cell: Cell, folder: Path) -> "_Bench":
+        """Trains the UDR policy where it is not there yet, and records it."""
+        import jax
+        import jax.numpy as jnp
+
+        from easi_jax.methods.policies import quiet
+        from easi_jax.pipeline import (
+            Pipeline,
+            PipelineConfig,
+            seed_keys,
+            stage_keys,
+            target_parameters,
+        )
+        from envs import open_env
+        from train._robots import load_udr, training_config
+
+        env = open_env(cell.robot, None, cell.options)
+        training = training_config(env, cell.env_steps)
+        training = training if cell.curves else quiet(training)
+        changes = (cell.target,) if cell.target else ()
+        target = jnp.asarray(target_parameters(env.space, changes), jnp.float32)
+        run = udr_run(cell, folder)
+        udr = load_udr(run)
+        pipe = Pipeline(
+            env,
+            PipelineConfig(training=training, trajectories=cell.trajectories),
+            start=cell.start,
+        )
+        keys = stage_keys(seed_keys([cell.seed]))
+        demos = jax.jit(pipe.demonstrate)(udr["policies"], target, keys["demonstrate"])
+        state, policy, demos, keys = jax.tree.map(
+            lambda x: x[0], (udr["states"], udr["policies"], demos, keys)
+        )
+        return cls(cell, env, pipe, training, target, run, state, policy, demos, keys)
+
+    def identified(self, begun: float) -> tuple[Any, dict[str, Any]]:
+        """A policy trained under the distribution that the method finds (UDR's where
+        none is asked for), and what was found."""
+        import jax
+        import numpy as np
+
+        from easi_jax import distribution
+        from easi_jax.methods import Budget
+        from easi_jax.methods.policies import watched
+
+        cell, curve = self.cell, []
+
+        def train(space: Any, dist: Any, key: Any) -> Any:
+            learned, returns = watched(
+                self.env,
+                self.training,
+                lambda d, k: distribution.draw(space, d, k),
+                dist,
+                distribution.point(space, self.target),
+                key,
+            )
+            curve.append(returns)
+            return learned
+
+        task = self._task(train)
+        method = identifiers()[cell.method](cell)
+        found = jax.block_until_ready(
+            method.fit(task, self.demos, Budget(), self.keys["search"])
+        )
+        truth = np.asarray(self.target, float)
+        off = self._off(found.space.to_si(found.distribution.mean))
+        spread = np.sqrt(np.diag(distribution.covariance(found.distribution)))
+        row = {
+            "identify_s": time.monotonic() - begun,
+            "simulated": found.simulated,
+            "measured": found.measured,
+            "parameters": list(found.space.names),
+            "log_ratio": off.tolist(),
+            "error": self._determined().error(off),
+            "std": spread.tolist(),
+        }
+        if cell.curves and found.trace is not None:
+            row["trace"] = _trace(found, truth)
+        if not cell.policy:
+            return self.policy, row
+        learned = train(found.space, found.distribution, self.keys["final"])
+        if cell.curves:
+            row["curve"] = self._curve(curve[-1])
+        return learned, row
+
+    def learned(self) -> tuple[Any, dict[str, Any]]:
+        """The policy of a method that ends with one."""
+        import jax.numpy as jnp
+
+        from easi_jax.methods import Practice
+        from easi_jax.methods.policies import watched
+
+        cell, env = self.cell, self.env
+        key = self.keys["oracle" if cell.method == "Oracle" else "final"]
+        if cell.method == "Oracle" and cell.curves:
+            # The same training, watched.
+            policy, returns = watched(
+                env, self.training, lambda x, _: x, self.target, self.target, key
+            )
+            measured = self.training.env_steps
+            return policy, {"measured": measured, "curve": self._curve(returns)}
+        nominal = jnp.asarray(env.space.nominal, jnp.float32)
+        practice = Practice(
+            env, nominal, env, self.target, self.training, self.state, self.policy
+        )
+        got = learners()[cell.method](cell).fit(practice, self.demos, key)
+        return got.policy, {"simulated": got.simulated, "measured": got.measured}
+
+    def first_curve(self) -> list[list[float]]:
+        """Returns of the UDR training on its way, in the nominal robot."""
+        from train._stages import training_curve
+
+        steps, returns = training_curve(self.run, "train", [self.cell.seed])
+        return [list(steps), [round(r[0], 2) for r in returns]]
+
+    def _curve(self, returns: Any) -> list[list[float]]:
+        import numpy as np
+
+        seen = np.flatnonzero(np.isfinite(returns))
+        steps = (seen + 1) * self.training.steps_per_iteration
+        return [steps.tolist(), np.asarray(returns)[seen].round(2).tolist()]
+
+    def _task(self, train: Any) -> Any:
+        import jax
+        import jax.numpy as jnp
+
+        from easi_jax.methods import Task
+        from easi_jax.rl.networks import act
+        from easi_jax.rollout import policy_rollout
+
+        env = self.env
 
         def record(policy: Any, resets: Any) -> Any:
             def one(key: Any) -> Any:
                 return policy_rollout(
                     env,
-                    env.model(target),
+                    env.model(self.target),
                     lambda obs, k: act(policy, obs, k, True),
                     key,
                     env.episode_length,
@@ -169,43 +318,60 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
 
             return jax.jit(jax.vmap(one))(resets)
 
-        task = Task(
-            machine=pipe.machine,
+        return Task(
+            machine=self.pipe.machine,
             noise=jnp.zeros(2 * env.mj_model.nv),
             env=env,
             act=lambda policy, obs, key: act(policy, obs, key),
             act_best=lambda policy, obs, key: act(policy, obs, key, True),
-            policy=policy,
+            policy=self.policy,
             record=record,
             train=train,
         )
-        method = identifiers()[cell.method](cell)
-        found = jax.block_until_ready(method.fit(task, demos, Budget(), k_search))
-        row["identify_s"] = time.monotonic() - begun
-        row |= {"simulated": found.simulated, "measured": found.measured}
-        si = np.asarray(found.space.to_si(found.distribution.mean))
-        row["log_ratio"] = np.log(np.maximum(si, 1e-30) / theta).tolist()
-        row["std"] = np.sqrt(
-            np.diag(distribution.covariance(found.distribution))
-        ).tolist()
-        if cell.policy:
-            learned = train(found.space, found.distribution, k_final)
-    elif cell.method in learners():
-        k = keys["oracle"][0] if cell.method == "Oracle" else k_final
-        nominal = jnp.asarray(env.space.nominal, jnp.float32)
-        practice = Practice(env, nominal, env, target, training, state, policy)
-        got: Learned = learners()[cell.method](cell).fit(practice, demos, k)
-        row |= {"simulated": got.simulated, "measured": got.measured}
-        learned = got.policy
-    if cell.policy:
-        jax.block_until_ready(learned)
-        row["seconds"] = time.monotonic() - begun
-        resets = jax.random.split(keys["evaluate"][0], EPISODES)
-        returns = jax.jit(lambda p, k: evaluate(env, env.model(target), p, act, k))
-        values = np.asarray(returns(learned, resets))
-        row["return"] = float(np.nanmean(values))
-        row["lost"] = int(np.isnan(values).sum())
-    return row
+
+    def _off(self, si: Any) -> Any:
+        """Log ratios to the truth, or shares of the range for linear parameters;
+        nothing is less than a thousandth of the truth."""
+        import numpy as np
+
+        space = self.env.space
+        least = np.where(space.log, 1e-3 * self.target, -np.inf)
+        unit = space.to_unit(np.maximum(si, least))
+        return np.asarray(unit - space.to_unit(self.target), float) * space.log_width
+
+    def _determined(self) -> Any:
+        """What the demonstrations can say, at the truth."""
+        import jax
+        import jax.numpy as jnp
+        import numpy as np
+
+        from easi_jax.identify import effective_noise
+        from easi_jax.information import PairedFit, identifiability
+        from easi_jax.refine import step_weights
+
+        machine, space = self.env.machine, self.env.space
+
+        @jax.jit
+        def hessian(demos: Any) -> Any:
+            pieces = self.pipe.pieces(demos)
+            zero = jnp.zeros(2 * self.env.mj_model.nv)
+            noise = effective_noise(machine, pieces, zero)
+            fit = PairedFit(machine, space, pieces, noise, free_starts=False)
+            still = jnp.zeros((pieces.count, len(noise)))
+            unit = space.to_unit(self.target)
+            return fit.normal(unit, still, step_weights(pieces, noise, None)).hessian
+
+        return identifiability(space, np.asarray(hessian(self.demos)))
+
+
+def _trace(found: Any, truth: Any) -> list[list[list[float]]]:
+    """Mean, and one standard deviation below and above, over the truth,
+    ``(3, G, n)``."""
+    import numpy as np
+
+    mean, std = found.trace
+    sides = [np.asarray(found.space.to_si(mean + k * std)) for k in (0.0, -1.0, 1.0)]
+    return (np.stack(sides) / truth).round(4).tolist()
 
 
 def udr_run(cell: Cell, folder: Path) -> Path:
@@ -213,7 +379,8 @@ def udr_run(cell: Cell, folder: Path) -> Path:
     from train import udr
 
     steps = "" if cell.env_steps is None else f"_{cell.env_steps}"
-    out = folder / f"udr_{cell.robot}{steps}_{cell.seed}"
+    words = "_".join(["udr", cell.robot, *cell.options]) + steps
+    out = folder / f"{words}_{cell.seed}"
     folder.mkdir(parents=True, exist_ok=True)
     # Another process may be at it: its result will do.
     with (folder / f"{out.name}.lock").open("w") as lock:
@@ -223,6 +390,7 @@ def udr_run(cell: Cell, folder: Path) -> Path:
         udr.run(
             udr.Config(
                 robot=cell.robot,
+                option=cell.options,
                 out=out,
                 seeds=(cell.seed,),
                 env_steps=cell.env_steps,

@@ -11,7 +11,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from benchmarks import gap_summary
+from benchmarks import gap_summary, paper_tables
 from benchmarks._common import RESULTS, markdown_table
 from benchmarks.physics import GOALS
 from benchmarks.recovery import CASES
@@ -47,10 +47,12 @@ def run(config: Config) -> None:
             _real,
         ),
         *(gap_summary.generated, gap_summary.real, gap_summary.times, gap_summary.loop),
+        paper_tables.sections,
     ):
         parts += section(config.results)
-    for name, text in gap_summary.figures(config.results).items():
-        atomic_write(config.results / name, text)
+    for drawn in (gap_summary.figures, paper_tables.figures):
+        for name, text in drawn(config.results).items():
+            atomic_write(config.results / name, text)
     path = config.results / "README.md"
     atomic_write(path, "\n\n".join(parts) + "\n")
     say(f"written: {path}")

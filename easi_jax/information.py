@@ -271,6 +271,12 @@ class Identifiability:
     null: np.ndarray
     scale: np.ndarray
 
+    def error(self, off: np.ndarray) -> float:
+        """RMS of the part of ``off (n,)``, scaled coordinates (log ratios), that lies
+        along the determined directions; NaN where there are none."""
+        seen = off - self.null @ (self.null.T @ off)
+        return float(np.sqrt((seen**2).sum() / self.rank)) if self.rank else np.nan
+
 
 def identifiability(
     space: ParameterSpace, hessian: np.ndarray, weak: float = _WEAK

@@ -46,12 +46,14 @@ class Easi:
         )
         noise, noisy = task.noise, bool(np.any(np.asarray(task.noise) > 0))
 
-        def found(key: jax.Array, policy: object) -> tuple[jax.Array, jax.Array]:
+        def found(key: jax.Array, policy: object) -> tuple[jax.Array, ...]:
             data = SearchData(pieces, noise, policy)
-            state, _ = search.run(search.init(key, data), data, rounds)
-            return state.result_mean, state.result_cov
+            state, info = search.run(search.init(key, data), data, rounds)
+            return state.result_mean, state.result_cov, info.mean, info.std
 
-        mean, cov = jax.jit(found, compiler_options=fast_loops())(key, task.policy)
+        mean, cov, *trace = jax.jit(found, compiler_options=fast_loops())(
+            key, task.policy
+        )
         steps_of = min(self.refine_horizon, demonstrations.weight.shape[1])
         longer = windows(demonstrations, steps_of, steps_of + 1)
 
@@ -70,4 +72,7 @@ class Easi:
             ).distribution
 
         distribution = jax.jit(result)(mean, cov)
-        return Identified(distribution, search.space, rounds * c.population * steps)
+        simulated = rounds * c.population * steps
+        return Identified(
+            distribution, search.space, simulated, trace=(trace[0], trace[1])
+        )

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import jax
+import jax.numpy as jnp
 
 from easi_jax.errors import UserError
 from easi_jax.rl.config import SacConfig
@@ -138,13 +139,29 @@ def trained(
 ) -> PolicyParams:
     """A policy trained under ``draw(dist, key) -> theta``, from the networks of
     ``start`` where given; PPO's environments are split over all devices."""
+    return watched(env, training, draw, dist, dist, key, start)[0]
+
+
+def watched(
+    env: Any,
+    training: TrainingConfig,
+    draw: Callable[[Any, jax.Array], Any],
+    dist: Any,
+    tested: Any,
+    key: jax.Array,
+    start: Any = None,
+) -> tuple[PolicyParams, jax.Array]:
+    """`trained`, with the mean return under ``tested`` after each of the training's
+    iterations ``(iterations,)``, NaN where it was not evaluated."""
     trainer = make_trainer(env, training, env.model, draw)
 
-    def run(key: jax.Array, dist: Any, start: Any) -> PolicyParams:
+    def run(key: jax.Array, dist: Any, tested: Any, start: Any) -> Any:
         states = init_seeds(trainer, key[None], dist)
         if start is not None:
             states = jax.vmap(trainer.continued, (0, None))(states, start)
-        states, _ = run_seeds(trainer, states, dist, training.iterations)
-        return trainer.policy(jax.tree.map(lambda x: x[0], states))
+        states, info = run_seeds(trainer, states, dist, training.iterations, tested)
+        state, info = jax.tree.map(lambda x: x[0], (states, info))
+        never = jnp.full(training.iterations, jnp.nan)
+        return trainer.policy(state), info.get("eval_return", never)
 
-    return jax.jit(run)(key, dist, start)
+    return jax.jit(run)(key, dist, tested, start)

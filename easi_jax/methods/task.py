@@ -102,12 +102,15 @@ class Identified:
         space: whose unit coordinates it is in.
         simulated: control steps simulated to identify it.
         measured: control steps of the real machine beyond the demonstrations.
+        trace: mean and standard deviation after each generation, unit coordinates,
+            ``(G, n)`` each; None where a method has no generations to show.
     """
 
     distribution: Distribution
     space: ParameterSpace
     simulated: int
     measured: int = 0
+    trace: tuple[jax.Array, jax.Array] | None = None
 
 
 class Method(Protocol):

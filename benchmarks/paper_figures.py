@@ -1,0 +1,91 @@
+"""Pictures that only the paper's figures need."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from easi_jax.io.figure_style import (
+    DASHED,
+    FAINT,
+    SERIES,
+    dash,
+    fit,
+    grid,
+    legend_above,
+    styled,
+    svg,
+)
+
+
+@styled
+def ratios_by_generation(
+    panels: Mapping[str, Mapping[str, Sequence[Sequence[Sequence[float]]]]],
+    columns: int,
+) -> str:
+    """Ratios to the truth by generation, a panel each, as the paper's Fig. 4.
+
+    Args:
+        panels: by title and method, for each seed the middle, the lower and the upper
+            edge by generation. Bands are of the first seed.
+        columns: panels side by side.
+    """
+    figure, axes = grid(len(panels), columns, height=1.9)
+    methods = list(next(iter(panels.values())))
+    for axis, (title, by_method) in zip(axes, panels.items(), strict=True):
+        seen = [np.ones(1)]
+        for i, method in enumerate(methods):
+            color = SERIES[i % len(SERIES)]
+            for k, (middle, low, high) in enumerate(by_method.get(method, ())):
+                generation = np.arange(1, len(middle) + 1)
+                if k == 0:
+                    axis.fill_between(
+                        generation, low, high, color=color, alpha=0.2, lw=0
+                    )
+                axis.plot(generation, middle, color=color, lw=1.2, ls=dash(i))
+                seen += [np.asarray(middle, float)]
+        axis.axhline(1.0, **DASHED)
+        fit(axis, np.clip(np.concatenate(seen), 0.05, 20.0), log=True)
+        axis.set_title(title)
+    figure.supxlabel("generation", color=FAINT, fontsize=9)
+    handles = [
+        Line2D([], [], color=SERIES[i % len(SERIES)], lw=1.6, ls=dash(i), label=m)
+        for i, m in enumerate(methods)
+    ]
+    legend_above(figure, [*handles, Line2D([], [], **DASHED, label="truth")])
+    return svg(figure)
+
+
+@styled
+def returns_by_factor(
+    returns: Mapping[str, Mapping[float, Sequence[float]]], xlabel: str
+) -> str:
+    """Return by the factor on a target's parameter, as the paper's Fig. 6: a dot a
+    seed, lines through the medians.
+
+    Args:
+        returns: by method and factor, of each seed.
+    """
+    figure, (axis,) = grid(1, 1, 3.2)
+    handles = []
+    for i, (method, by_factor) in enumerate(returns.items()):
+        color, shift = SERIES[i % len(SERIES)], 1.04 ** (i - 1)
+        factors = sorted(by_factor)
+        for x in factors:
+            values = by_factor[x]
+            axis.scatter(
+                [x * shift] * len(values), values, s=16, color=color, alpha=0.6, lw=0
+            )
+        middle = [float(np.nanmedian(by_factor[x])) for x in factors]
+        axis.plot(factors, middle, color=color, lw=1.8, ls=dash(i))
+        handles.append(Line2D([], [], color=color, lw=1.8, ls=dash(i), label=method))
+    axis.set_xscale("log")
+    ticks = sorted({x for by_factor in returns.values() for x in by_factor})
+    axis.xaxis.set_major_locator(FixedLocator(ticks))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.xaxis.set_minor_locator(NullLocator())
+    axis.set_xlabel(xlabel)
+    axis.set_ylabel("return in the target")
+    legend_above(figure, handles)
+    return svg(figure)

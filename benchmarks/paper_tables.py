@@ -1,0 +1,327 @@
+"""The paper's tables and figures from the cells that were run, as Markdown and SVG.
+
+Cells that were not run are shown as not run; trials with fewer steps than the robot's
+preset (``--env-steps``) are left out.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from statistics import mean, median, stdev
+from typing import Any
+
+from benchmarks._common import markdown_table
+from benchmarks.paper import CHANGED, MUST, SEARCHES, STARTS, read_rows
+from benchmarks.paper_cells import METHODS
+from benchmarks.paper_runtime import WAYS
+
+FLAT = 3.0  # times the best setting's error: no setting of the default is worse
+GOAL = 0.9  # share of the way from UDR to Oracle
+# Two a robot, as in the paper's Fig. 4: those that demonstrations determine best.
+SHOWN = {
+    "cartpole": ("cart_kp", "pole_armature"),
+    "ant": ("torso_mass", "foot_mass"),
+    "ballbalance": ("knee_kp", "ball_mass"),
+    "go2": ("thigh_kp", "base_mass"),
+}
+_NOT_RUN = "not run"
+
+Row = dict[str, Any]
+
+
+def sections(folder: Path) -> list[str]:
+    """Everything, as paragraphs of Markdown."""
+    rows = whole(read_rows(folder / "paper.jsonl"))
+    out = ["## The paper's tables and figures"]
+    if not rows:
+        return [*out, "Not run: `python -m benchmarks.paper table1`."]
+    commits = sorted({r["versions"]["commit"][:7] for r in rows})
+    out.append(f"`python -m benchmarks.paper NAME`, commits {', '.join(commits)}.")
+    for part in (_table1, _table3, _table4, _table5, _fig6, _runtime):
+        out += part(rows)
+    pictures = figures(folder)
+    for name in sorted(pictures):
+        out.append(f"![{_title(name)}]({name})")
+    return out
+
+
+def figures(folder: Path) -> dict[str, str]:
+    """Pictures by file name."""
+    rows = whole(read_rows(folder / "paper.jsonl"))
+    out = {}
+    for robot in CHANGED:
+        for name, draw in (
+            ("fig4", _drawn_fig4),
+            ("fig5", _drawn_fig5),
+            ("fig6", _drawn_fig6),
+        ):
+            text = draw([r for r in rows if r["robot"] == robot and not r["options"]])
+            if text:
+                out[f"paper_{name}_{robot}.svg"] = text
+    text = _drawn_appendix_a([r for r in rows if r["options"]])
+    if text:
+        out["paper_appendix_a.svg"] = text
+    return out
+
+
+def whole(rows: Iterable[Row]) -> list[Row]:
+    """Rows of whole trainings, not of trials."""
+    return [r for r in rows if r["env_steps"] is None]
+
+
+def _title(name: str) -> str:
+    words = name.removeprefix("paper_").removesuffix(".svg").split("_")
+    return {
+        "fig4": "Parameters by generation, as ratios to the truth (Fig. 4)",
+        "fig5": "Return in the target by training step (Fig. 5)",
+        "fig6": "Return by what the target's parameter is multiplied with (Fig. 6)",
+        "appendix": "25 parameters of Go2 (Appendix A)",
+    }[words[0]] + (f": {words[-1]}" if words[0] != "appendix" else "")
+
+
+def _returns(
+    rows: Sequence[Row], robot: str, target: str, trajectories: int = 200
+) -> dict[str, dict[int, float]]:
+    """Return by method and seed."""
+    out: dict[str, dict[int, float]] = defaultdict(dict)
+    for r in rows:
+        where = (r["robot"], r["target"], r["trajectories"])
+        plain = "return" in r and not r["settings"] and r["method"] in METHODS
+        if plain and where == (robot, target, trajectories):
+            out[r["method"]][r["seed"]] = r["return"]
+    return out
+
+
+def told(values: Sequence[float], digits: int = 1) -> str:
+    """Mean and standard deviation over seeds, and every seed."""
+    if not values:
+        return _NOT_RUN
+    each = ", ".join(f"{v:.{digits}f}" for v in values)
+    if len(values) == 1:
+        return each
+    return f"{mean(values):.{digits}f} ± {stdev(values):.{digits}f} ({each})"
+
+
+def _share(of: dict[int, float], udr: dict[int, float], best: dict[int, float]) -> str:
+    """Of the way from UDR to Oracle, seeds that all three have."""
+    seeds = sorted(of.keys() & udr.keys() & best.keys())
+    way = sum(best[s] - udr[s] for s in seeds)
+    if not seeds or way <= 0:
+        return ""
+    return f"{sum(of[s] - udr[s] for s in seeds) / way:.2f}"
+
+
+def _table1(rows: Sequence[Row]) -> list[str]:
+    out = ["### Table 1: return in the target"]
+    for robot in CHANGED:
+        lines = []
+        by_target = {
+            x: _returns(rows, robot, f"{CHANGED[robot]}*{x:g}") for x in (0.25, 0.5)
+        }
+        others = [m for m in METHODS if any(m in found for found in by_target.values())]
+        for method in dict.fromkeys((*MUST, *others)):
+            cells: list[str] = []
+            for found in by_target.values():
+                mine = found.get(method, {})
+                cells.append(told([mine[s] for s in sorted(mine)]))
+                ends = (found.get("UDR", {}), found.get("Oracle", {}))
+                cells.append(_share(mine, *ends))
+            lines.append((method, *cells))
+        if all(c in (_NOT_RUN, "") for line in lines for c in line[1:]):
+            out.append(f"Not run: `python -m benchmarks.paper table1 --robot {robot}`.")
+            continue
+        name = CHANGED[robot]
+        head = ("method", f"{name}*0.25", "share", f"{name}*0.5", "share")
+        out += [
+            f"{robot}: mean ± standard deviation (every seed); share of the way from "
+            f"UDR to Oracle, goal of EASI default {GOAL}:",
+            markdown_table(head, lines),
+        ]
+    return out
+
+
+def _table3(rows: Sequence[Row]) -> list[str]:
+    out, lines = ["### Table 3: return by number of demonstrations"], []
+    for robot in CHANGED:
+        target = f"{CHANGED[robot]}*0.5"
+        udr = _returns(rows, robot, target).get("UDR", {})
+        cells = [told([udr[s] for s in sorted(udr)])]
+        for count in (1, 50, 100, 200):
+            mine = _returns(rows, robot, target, count).get("EASI default", {})
+            cells.append(told([mine[s] for s in sorted(mine)]))
+        if any(c != _NOT_RUN for c in cells[1:4]):
+            lines.append((f"{robot}, {target}", *cells))
+        else:
+            out.append(f"Not run: `python -m benchmarks.paper table3 --robot {robot}`.")
+    if lines:
+        head = ("target", "UDR", "1", "50", "100", "200")
+        out.append(markdown_table(head, lines))
+    return out
+
+
+def _table4(rows: Sequence[Row]) -> list[str]:
+    return _swept(rows, "table4", "Table 4", "elite_ratio", "μ/λ")
+
+
+def _table5(rows: Sequence[Row]) -> list[str]:
+    name = "discriminator_updates"
+    return _swept(rows, "table5", "Table 5", name, "discriminator updates")
+
+
+def _swept(
+    rows: Sequence[Row], command: str, title: str, setting: str, shown: str
+) -> list[str]:
+    out, lines = [f"### {title}: parameter error by {shown}"], []
+    for robot in CHANGED:
+        found: dict[str, dict[float, list[float]]] = {m: {} for m in SEARCHES}
+        for r in sorted(rows, key=lambda r: r["seed"]):
+            if r["robot"] != robot or r["method"] not in found:
+                continue
+            for word in r["settings"]:
+                name, _, value = word.partition("=")
+                if name == setting:
+                    errors = found[r["method"]].setdefault(float(value), [])
+                    errors.append(r["error"])
+        for method, by_value in found.items():
+            if not by_value:
+                continue
+            middle = {v: median(e) for v, e in by_value.items()}
+            ratio = max(middle.values()) / min(middle.values())
+            verdict = f"{ratio:.1f}"
+            if method != SEARCHES[0]:
+                verdict += ", met" if ratio <= FLAT else ", **missed**"
+            cells = "; ".join(
+                f"{v:g}: {middle[v]:.3f} ({', '.join(f'{e:.3f}' for e in by_value[v])})"
+                for v in sorted(by_value)
+            )
+            lines.append((robot, method, cells, verdict))
+    if not lines:
+        return [*out, f"Not run: `python -m benchmarks.paper {command}`."]
+    head = (
+        "robot",
+        "search",
+        "median error (every seed)",
+        f"worst/best (goal {FLAT:g})",
+    )
+    return [
+        *out,
+        "RMS of the log ratio to the truth along the directions that the "
+        "demonstrations determine.",
+        markdown_table(head, lines),
+    ]
+
+
+def _fig6(rows: Sequence[Row]) -> list[str]:
+    if any(_drawn_fig6([r for r in rows if r["robot"] == x]) for x in CHANGED):
+        return []
+    return ["Not run: `python -m benchmarks.paper fig6`."]
+
+
+def _runtime(rows: Sequence[Row]) -> list[str]:
+    out = ["### Run time: one program beside separate programs"]
+    lines = [
+        (
+            f"{r['robot']}, seed {r['seed']}",
+            r["method"],
+            f"{r['seconds']:.0f}",
+            f"{r['compile_s']:.0f}",
+            r["programs"],
+            f"{r['transfers']} ({r['bytes'] / 1e6:.1f} MB)",
+            f"{r['return']:.1f}",
+        )
+        for r in rows
+        if r["method"] in WAYS
+    ]
+    if not lines:
+        return [*out, "Not run: `python -m benchmarks.paper runtime`."]
+    head = (
+        *("chain", "as", "seconds in all", "of them compiling"),
+        *("programs compiled", "transfers to the host", "return"),
+    )
+    return [*out, markdown_table(head, lines)]
+
+
+def _drawn_fig4(rows: Sequence[Row]) -> str:
+    from benchmarks.paper_figures import ratios_by_generation
+
+    traced = [r for r in rows if "trace" in r and not r["policy"]]
+    if not traced:
+        return ""
+    names = traced[0]["parameters"]
+    shown = SHOWN[traced[0]["robot"]]
+    panels = {}
+    for name in shown:
+        for start in STARTS:
+            mine = [r for r in traced if _start(r) == start]
+            panels[f"{name}, {_from(start)}"] = {
+                m: [_column(r, names.index(name)) for r in mine if r["method"] == m]
+                for m in SEARCHES
+            }
+    return ratios_by_generation(panels, columns=len(STARTS))
+
+
+def _start(row: Row) -> tuple[float, float] | None:
+    return None if row["start"] is None else tuple(row["start"])
+
+
+def _from(start: tuple[float, float] | None) -> str:
+    return "from UDR's range" if start is None else f"from {start[0]:g} to {start[1]:g}"
+
+
+def _column(row: Row, i: int) -> list[list[float]]:
+    return [[g[i] for g in side] for side in row["trace"]]
+
+
+def _drawn_fig5(rows: Sequence[Row]) -> str:
+    from easi_jax.io.figures import returns_by_step
+
+    found: dict[str, list[list[list[float]]]] = defaultdict(list)
+    for r in rows:
+        if r["curves"] and r["policy"] and "curve" in r:
+            found[r["method"]].append(r["curve"])
+    curves = {
+        m: (c[0][0], list(zip(*(returns for _, returns in c), strict=True)))
+        for m, c in found.items()
+    }
+    return returns_by_step(curves) if curves else ""
+
+
+def _drawn_fig6(rows: Sequence[Row]) -> str:
+    from benchmarks.paper_figures import returns_by_factor
+
+    if not rows:
+        return ""
+    robot = rows[0]["robot"]
+    found: dict[str, dict[float, list[float]]] = {}
+    for x in (0.25, 0.5, 2.0, 4.0):
+        by_method = _returns(rows, robot, f"{CHANGED[robot]}*{x:g}")
+        for m in ("UDR", "EASI default", "Oracle"):
+            if m in by_method:
+                found.setdefault(m, {})[x] = list(by_method[m].values())
+    # A line needs more than what table 1 runs.
+    if all(x < 1 for by_factor in found.values() for x in by_factor):
+        return ""
+    return returns_by_factor(found, f"factor on {CHANGED[robot]}")
+
+
+def _drawn_appendix_a(rows: Sequence[Row]) -> str:
+    import numpy as np
+
+    from benchmarks.paper_figures import ratios_by_generation
+
+    traced = [r for r in rows if "trace" in r]
+    if not traced:
+        return ""
+
+    def typical(row: Row) -> list[list[float]]:
+        off = np.abs(np.log(np.maximum(np.array(row["trace"][0]), 1e-3)))
+        return [np.exp(np.quantile(off, q, axis=1)).tolist() for q in (0.5, 0.25, 0.75)]
+
+    panels = {
+        f"factor off, {_from(start)}": {
+            m: [typical(r) for r in traced if r["method"] == m and _start(r) == start]
+            for m in SEARCHES
+        }
+        for start in STARTS
+    }
+    return ratios_by_generation(panels, columns=len(STARTS))

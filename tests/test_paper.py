@@ -1,0 +1,163 @@
+"""Cells of the paper's experiments, and tables made from what they leave."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks import paper, paper_tables
+from benchmarks.paper import Config, cells
+from envs import make
+from train._command import main
+
+VERSIONS = {"commit": "0123456789"}
+
+
+@pytest.mark.parametrize("name", paper.EXPERIMENTS)
+def test_each_cell_has_a_name_of_its_own(name: str) -> None:
+    every = cells(Config(name, seeds=(0, 1)))
+    assert len({c.key for c in every}) == len(every) >= 4
+
+
+def test_tables_share_cells() -> None:
+    """What table 1 has run, table 3 and figure 6 need not run again."""
+    keys = {n: {c.key for c in cells(Config(n, seeds=(0,)))} for n in paper.EXPERIMENTS}
+    assert len(keys["table1"] & keys["fig6"]) == 6
+    assert len(keys["table1"] & keys["table3"]) == 2
+
+
+def test_shards_are_all_and_apart(tmp_path: Path, monkeypatch: Any) -> None:
+    ran: list[str] = []
+
+    def solve(cell: Any, folder: Path) -> dict[str, Any]:
+        ran.append(cell.key)
+        return {"return": 1.0, "seconds": 0.0}
+
+    monkeypatch.setattr("benchmarks.paper_cells.solve", solve)
+    out = tmp_path / "paper.jsonl"
+    for shard in ("1/3", "2/3", "3/3", "1/1"):
+        paper.run(Config("table1", seeds=(0, 1), shard=shard, out=out))
+    assert sorted(ran) == sorted(c.key for c in cells(Config("table1", seeds=(0, 1))))
+    assert [json.loads(x)["key"] for x in out.read_text().splitlines()] == ran
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["tabel1"], "table1"),
+        (["table1", "--robot", "cartpol"], "cartpole"),
+        (["table1", "--methods", "GARATT"], "GARAT"),
+        (["table1", "--shard", "3/2"], "2/4"),
+        (["table1", "--only", "nothing"], "--list"),
+        (["runtime", "--methods", "GARAT"], "--methods"),
+    ],
+)
+def test_mistakes_are_one_line(words: list[str], said: str, capsys: Any) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(Config, paper.run, args=words, name="benchmarks.paper")
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
+def row(method: str, target: str, seed: int, **values: Any) -> dict[str, Any]:
+    given = {"trajectories": 200, "env_steps": None, "start": None, "settings": []}
+    given |= {"policy": True, "curves": False, "options": []}
+    return {
+        **given,
+        **{"method": method, "robot": "cartpole", "target": target, "seed": seed},
+        **values,
+        "versions": VERSIONS,
+    }
+
+
+def page(folder: Path, *rows: dict[str, Any]) -> str:
+    text = "".join(json.dumps(r) + "\n" for r in rows)
+    (folder / "paper.jsonl").write_text(text)
+    return "\n\n".join(paper_tables.sections(folder))
+
+
+def test_table_1_shows_every_seed_and_the_share_of_the_way(tmp_path: Path) -> None:
+    values = {"UDR": (100, 110), "Oracle": (180, 190), "EASI default": (172, 182)}
+    rows = [
+        row(m, "cart_kp*0.25", s, **{"return": x})
+        for m, both in values.items()
+        for s, x in enumerate(both)
+    ]
+    trial = row("GARAT", "cart_kp*0.25", 0, env_steps=3000, **{"return": 55.0})
+    text = page(tmp_path, *rows, trial)
+    line = next(x for x in text.splitlines() if x.startswith("| EASI default |"))
+    assert line.split(" | ")[1:4] == ["177.0 ± 7.1 (172.0, 182.0)", "0.90", "not run"]
+    assert next(x for x in text.splitlines() if "| GARAT" in x).count("not run") == 2
+    assert "table1 --robot ant" in text
+
+
+@pytest.mark.parametrize(("worst", "verdict"), [(0.29, "met"), (0.31, "**missed**")])
+def test_a_jagged_setting_is_a_miss(tmp_path: Path, worst: float, verdict: str) -> None:
+    rows = [
+        row(
+            "EASI default, not refined",
+            "",
+            seed,
+            settings=[f"elite_ratio={x:g}"],
+            policy=False,
+            error=e,
+        )
+        for x, e in ((0.1, worst), (0.5, 0.1))
+        for seed in (0, 1, 2)
+    ]
+    assert f", {verdict} |" in page(tmp_path, *rows)
+
+
+def test_pictures_come_from_the_rows_alone(tmp_path: Path) -> None:
+    names = [*paper_tables.SHOWN["cartpole"], "pole_mass"]
+    trace = [[[1.5, 0.7, 1.0]] * 4, [[1.2, 0.6, 0.9]] * 4, [[1.9, 0.8, 1.1]] * 4]
+    rows = [
+        row(m, "", 0, start=s, policy=False, curves=True, trace=trace, parameters=names)
+        for m in paper.SEARCHES
+        for s in paper.STARTS
+    ]
+    rows += [
+        row(m, "", s, curves=True, curve=[[1000, 2000], [50.0, 90.0 + s]])
+        for m in ("UDR", "EASI default", "Oracle")
+        for s in (0, 1)
+    ]
+    rows += [
+        row(m, f"cart_kp*{x:g}", s, **{"return": 100.0 + 10 * x})
+        for m in ("UDR", "EASI default", "Oracle")
+        for x in (0.25, 0.5, 2.0, 4.0)
+        for s in (0, 1)
+    ]
+    big = row("EASI paper", "", 0, curves=True, trace=trace, parameters=names)
+    big |= {"robot": "go2", "options": ["parameters=full"], "policy": False}
+    text = page(tmp_path, *rows, big)
+    drawn = paper_tables.figures(tmp_path)
+    assert sorted(drawn) == [
+        "paper_appendix_a.svg",
+        *(f"paper_fig{k}_cartpole.svg" for k in (4, 5, 6)),
+    ]
+    for name, svg in drawn.items():
+        assert svg.lstrip().startswith("<?xml") or svg.startswith("<svg")
+        assert f"]({name})" in text
+
+
+def test_nothing_run_is_said(tmp_path: Path) -> None:
+    assert "Not run" in paper_tables.sections(tmp_path)[-1]
+    assert paper_tables.figures(tmp_path) == {}
+
+
+def test_one_program_and_separate_ones_are_shown_side_by_side(tmp_path: Path) -> None:
+    cost = {"compile_s": 60.0, "programs": 3, "transfers": 9, "bytes": 1e6}
+    rows = [
+        row(way, "cart_kp*0.5", 0, seconds=100.0, **cost, **{"return": 190.0})
+        for way in paper.WAYS
+    ]
+    lines = page(tmp_path, *rows).splitlines()
+    assert sum("| 9 (1.0 MB) | 190.0 |" in x for x in lines) == 2
+
+
+@pytest.mark.parametrize("robot", paper.CHANGED)
+def test_what_is_changed_and_shown_exists(robot: str) -> None:
+    names = make(robot).space.names
+    assert {paper.CHANGED[robot], *paper_tables.SHOWN[robot]} <= set(names)
