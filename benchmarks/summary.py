@@ -11,7 +11,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from benchmarks import gap_summary, paper_tables
+from benchmarks import coverage_summary, gap_summary, paper_tables
 from benchmarks._common import RESULTS, markdown_table
 from benchmarks.physics import GOALS
 from benchmarks.recovery import CASES
@@ -43,6 +43,7 @@ def run(config: Config) -> None:
             _own_robot,
             _policies,
             _recovery,
+            coverage_summary.section,
             _transfer,
             _real,
         ),

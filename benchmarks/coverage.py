@@ -1,0 +1,165 @@
+"""Whether the spread that a search returns means what it says.
+
+    python -m benchmarks.coverage
+
+Many Cartpoles, each with parameters drawn from UDR's range, are recorded with realistic
+sensor noise under a rough controller; the search (`default`) and its least-squares
+finish say where the parameters are, and how sure they are. Counted is how often the
+truth lies inside the 50 % and the 90 % regions along the directions that the data
+determine, and how large the error is beside the Cramer-Rao bound of the same data. One
+line a target is added to ``coverage.jsonl``; a run that was stopped goes on.
+"""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+from benchmarks._common import RESULTS
+from benchmarks.recovery import NOISE, WEIGHED, controller
+from train._command import main, progress, say
+
+WAYS = ("search, own spread", "search", "refined")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Searches for many synthetic targets and counts what their regions cover."""
+
+    targets: int = 100
+    """Synthetic targets, one seed each."""
+    trajectories: int = 50
+    """Demonstration trajectories of each: 200 s."""
+    generations: int = 50
+    """Generations of each search."""
+    out: Path = RESULTS / "coverage.jsonl"
+    """Where a line for each target is added."""
+
+
+def run(config: Config) -> None:
+    """Runs the targets that are not there yet."""
+    from benchmarks._common import command_of
+    from easi_jax.io.versions import versions
+
+    done = set()
+    if config.out.exists():
+        rows = [json.loads(line) for line in config.out.read_text().splitlines()]
+        done = {row["seed"] for row in rows}
+    seeds = [s for s in range(config.targets) if s not in done]
+    if not seeds:
+        return say(f"all {config.targets} targets are in {config.out}")
+    solve = _solver(config)
+    given = {"command": command_of("benchmarks.coverage", config)}
+    given |= {"versions": versions()}
+    with progress("coverage", config.targets, len(done)) as shown:
+        for seed in seeds:
+            row = {"seed": seed, **solve(seed), **given}
+            with config.out.open("a") as file:
+                file.write(json.dumps(row) + "\n")
+            shown.advance(1, refined=row["refined"]["distance"] / max(row["rank"], 1))
+    say(f"written: {config.out}")
+
+
+def _solver(config: Config) -> Any:
+    import functools
+
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from easi_jax import distribution
+    from easi_jax.identify import estimate
+    from easi_jax.information import PairedFit, identifiability
+    from easi_jax.machine import Machine
+    from easi_jax.refine import step_weights
+    from easi_jax.rollout import collect, measured
+    from easi_jax.runtime import fast_loops
+    from easi_jax.search import Search, SearchData
+    from easi_jax.search_config import preset
+    from easi_jax.segments import windows
+    from envs import make
+
+    env = make("cartpole")
+    space = env.space.select([n for n in env.space.names if n not in WEIGHED])
+    machine = Machine(env.mj_model, space, env.dt)
+    search = Search(
+        machine, preset("default", generations=config.generations, horizon=8)
+    )
+    noise = jnp.asarray(NOISE)
+
+    @functools.partial(jax.jit, compiler_options=fast_loops())
+    def find(key: jax.Array, truth: jax.Array) -> Any:
+        k_run, k_noise, k_search = jax.random.split(key, 3)
+        model = machine.model(space.to_si(truth))
+        runs = collect(
+            *(env, model, controller, k_run, config.trajectories, env.episode_length)
+        )
+        demos = measured(runs, noise, k_noise)
+        data = SearchData(windows(demos, 8, 4), noise, ())
+        state, info = search.run(search.init(k_search, data), data, config.generations)
+        return demos, state.result_mean, state.result_cov, info.non_finite.sum()
+
+    @jax.jit
+    def judge(demos: Any, mean: jax.Array, cov: jax.Array, truth: jax.Array) -> Any:
+        pieces = windows(demos, 25, 26)
+        found = [
+            estimate(machine, search.space, mean, cov, pieces, noise, *how).distribution
+            for how in ((False, False), (False, True), (True, True))
+        ]
+        still = jnp.zeros((pieces.count, len(noise)))
+        fit = PairedFit(machine, space, pieces, noise)
+        bound = fit.normal(truth, still, step_weights(pieces, noise)).hessian
+        return found, bound
+
+    def solve(seed: int) -> dict[str, Any]:
+        k_truth, k_rest = jax.random.split(jax.random.key(seed))
+        truth = jax.random.uniform(k_truth, (space.size,))
+        demos, mean, cov, lost = find(k_rest, truth)
+        found, bound = judge(demos, mean, cov, truth)
+        known = identifiability(space, np.asarray(bound))
+        row: dict[str, Any] = {
+            "truth": np.asarray(space.to_si(truth), float).tolist(),
+            "rank": known.rank,
+            "determined": known.determined.tolist(),
+            "non_finite": int(lost),
+        }
+        for way, d in zip(WAYS, found, strict=True):
+            off = (np.asarray(d.mean, float) - np.asarray(truth, float)) * known.scale
+            spread = distribution.covariance(d)
+            cov_log = spread * np.outer(known.scale, known.scale)
+            row[way] = {
+                "off": off.tolist(),
+                "std": np.sqrt(np.diag(cov_log)).tolist(),
+                **distances(off, cov_log, known),
+            }
+        return row
+
+    return solve
+
+
+def distances(off: Any, cov: Any, known: Any) -> dict[str, float]:
+    """Squared Mahalanobis distances of an error along the determined directions.
+
+    Args:
+        off: errors in log ratios, ``(n,)``.
+        cov: covariance that was stated, ``(n, n)``.
+        known: `easi_jax.information.Identifiability` at the truth.
+
+    Returns:
+        ``distance`` in the stated covariance, ``bound`` in that of Cramer and Rao;
+        chi-squared with ``known.rank`` degrees of freedom where they are right.
+    """
+    import numpy as np
+
+    whole = np.linalg.svd(known.null, full_matrices=True)[0]
+    seen = whole[:, known.null.shape[1] :]  # basis of the determined directions
+    d = seen.T @ off
+    least = known.covariance * np.outer(known.scale, known.scale)
+    return {
+        "distance": float(d @ np.linalg.solve(seen.T @ cov @ seen, d)),
+        "bound": float(d @ np.linalg.solve(seen.T @ least @ seen, d)),
+    }
+
+
+if __name__ == "__main__":
+    main(Config, run, name="benchmarks.coverage")

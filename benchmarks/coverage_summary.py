@@ -1,0 +1,64 @@
+"""Section of the results page on the spread that a search returns."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks._common import markdown_table
+from benchmarks.coverage import WAYS
+from benchmarks.gap_score import wilson
+
+REGION = (0.85, 0.95)  # share of truths inside the 90 % region
+BOUND = 2.0  # times the Cramer-Rao bound
+TARGETS = 100
+
+
+def section(folder: Path) -> list[str]:
+    """Coverage of the regions, and errors beside the Cramer-Rao bound."""
+    out = ["## What the stated spread is worth"]
+    path = folder / "coverage.jsonl"
+    rows = []
+    if path.is_file():
+        rows = [json.loads(line) for line in path.read_text().splitlines()]
+    if not rows:
+        return [*out, "Not run: `python -m benchmarks.coverage`."]
+    lines = []
+    for way in WAYS:
+        inside = {q: covered(rows, way, q) for q in (0.5, 0.9)}
+        ratio = float(np.median(beside_bound(rows, way)))
+        cells = []
+        for hit in inside.values():
+            low, high = wilson(int(hit.sum()), len(hit))
+            cells.append(f"{hit.mean():.0%} [{low:.0%}, {high:.0%}]")
+        if way == WAYS[-1]:
+            good = REGION[0] <= inside[0.9].mean() <= REGION[1] and len(rows) >= TARGETS
+            cells[1] += ", met" if good else ", **missed**"
+        met = "met" if ratio <= BOUND else "**missed**"
+        told = f"{ratio:.2f}" + (f", {met}" if way == WAYS[-1] else "")
+        lines.append((way, *cells, told))
+    commits = sorted({r["versions"]["commit"][:7] for r in rows})
+    return [
+        *out,
+        f"`python -m benchmarks.coverage`, {len(rows)} Cartpoles with parameters drawn "
+        f"from UDR's range, sensor noise, commits {', '.join(commits)}. Share of "
+        "truths inside the stated regions along the directions that the data "
+        f"determine (95 % interval); goal {REGION[0]:.0%} to {REGION[1]:.0%} in the 90 % region. Error "
+        f"as a multiple of the Cramer-Rao bound, median; goal at most {BOUND:g}.",
+        markdown_table(("", "50 % region", "90 % region", "error / bound"), lines),
+    ]
+
+
+def covered(rows: list[dict[str, Any]], way: str, share: float) -> np.ndarray:
+    """Whether the truth lies inside the region of that probability, ``(targets,)``."""
+    from scipy.stats import chi2
+
+    rank = np.array([r["rank"] for r in rows])
+    distance = np.array([r[way]["distance"] for r in rows])
+    return distance <= chi2.ppf(share, rank)
+
+
+def beside_bound(rows: list[dict[str, Any]], way: str) -> np.ndarray:
+    """RMS errors in units of the Cramer-Rao bound, ``(targets,)``."""
+    return np.array([(r[way]["bound"] / max(r["rank"], 1)) ** 0.5 for r in rows])

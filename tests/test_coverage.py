@@ -1,0 +1,75 @@
+"""Regions that cover what they say, and how the benchmark counts it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import coverage, coverage_summary
+from easi_jax.information import identifiability
+from envs import make
+
+
+@pytest.fixture(scope="module")
+def known():
+    """Five of Cartpole's parameters; what the data say of the last is next to nothing,
+    and the first two are seen through their sum alone."""
+    space = make("cartpole").space
+    space = space.select(list(space.names[:5]))
+    rng = np.random.default_rng(0)
+    slope = rng.normal(size=(40, 5)) * np.array([30.0, 30.0, 10.0, 50.0, 1e-4])
+    slope[:, 0] = slope[:, 1]
+    scaled = slope.T @ slope
+    return identifiability(space, scaled * np.outer(space.log_width, space.log_width))
+
+
+def test_distances_are_chi_squared_where_all_is_right(known) -> None:
+    assert known.rank == 3
+    rng = np.random.default_rng(1)
+    cov = known.covariance * np.outer(known.scale, known.scale)
+    wide = cov + 4.0 * known.null @ known.null.T  # nothing is known of those
+    root = np.linalg.svd(cov)
+    root = root[0] * np.sqrt(root[1])
+    found = [
+        coverage.distances(
+            root @ rng.normal(size=5) + known.null @ rng.normal(size=2), wide, known
+        )
+        for _ in range(2000)
+    ]
+    for name in ("distance", "bound"):
+        mean = np.mean([f[name] for f in found])
+        assert mean == pytest.approx(3.0, rel=0.1), "chi-squared of 3 degrees"
+
+
+def test_half_the_spread_covers_less(known) -> None:
+    cov = known.covariance * np.outer(known.scale, known.scale)
+    off = np.linalg.svd(cov)[0][:, 0] * 0.01
+    whole = coverage.distances(off, cov + known.null @ known.null.T, known)
+    half = coverage.distances(off, cov / 4 + known.null @ known.null.T, known)
+    assert half["distance"] == pytest.approx(4 * whole["distance"])
+    assert half["bound"] == whole["bound"]
+
+
+def test_the_page_counts_what_is_inside(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    lines = []
+    for seed in range(200):
+        row: dict = {"seed": seed, "rank": 4, "versions": {"commit": "0123456789"}}
+        for way, size in zip(coverage.WAYS, (3.0, 0.2, 1.0), strict=True):
+            square = float((rng.normal(size=4) ** 2).sum())
+            row[way] = {"distance": size**2 * square, "bound": 2.25 * square}
+        lines.append(json.dumps(row))
+    (tmp_path / "coverage.jsonl").write_text("\n".join(lines) + "\n")
+    text = "\n".join(coverage_summary.section(tmp_path))
+    rows = {
+        w: next(x for x in text.splitlines() if f"| {w} |" in x) for w in coverage.WAYS
+    }
+    assert ", met | 1." in rows["refined"] and rows["refined"].endswith(", met |")
+    assert "| 100% [" in rows["search"]
+    inside = coverage_summary.covered([json.loads(x) for x in lines], "refined", 0.5)
+    assert inside.mean() == pytest.approx(0.5, abs=0.08)
+
+
+def test_nothing_run_is_said(tmp_path: Path) -> None:
+    assert "Not run" in coverage_summary.section(tmp_path)[-1]
