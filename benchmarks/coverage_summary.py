@@ -44,8 +44,9 @@ def section(folder: Path) -> list[str]:
         f"`python -m benchmarks.coverage`, {len(rows)} Cartpoles with parameters drawn "
         f"from UDR's range, sensor noise, commits {', '.join(commits)}. Share of "
         "truths inside the stated regions along the directions that the data "
-        f"determine (95 % interval); goal {REGION[0]:.0%} to {REGION[1]:.0%} in the 90 % region. Error "
-        f"as a multiple of the Cramer-Rao bound, median; goal at most {BOUND:g}.",
+        f"determine (95 % interval); goal {REGION[0]:.0%} to {REGION[1]:.0%} in the "
+        "90 % region. Error as a multiple of the Cramer-Rao bound, median; goal at "
+        f"most {BOUND:g}.",
         markdown_table(("", "50 % region", "90 % region", "error / bound"), lines),
     ]
 

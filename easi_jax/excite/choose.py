@@ -18,8 +18,9 @@ from easi_jax.excite.separation import (
     soft_minimum,
 )
 from easi_jax.gap.fit import bounds_of
+from easi_jax.gap.places import places, ripples
 from easi_jax.gap.scales import scales_of
-from easi_jax.gap.table import EFFECTS, Place, Scales, covered, places, ripples
+from easi_jax.gap.table import EFFECTS, Place, Scales, covered
 from easi_jax.parameters import ParameterSpace
 from easi_jax.physics import WRITTEN_OUT
 from easi_jax.quantities import scalar_dofs

@@ -8,9 +8,11 @@ import numpy as np
 from easi_jax.excite.separation import Design
 from easi_jax.gap import measure
 from easi_jax.gap.fit import Bounds
-from easi_jax.gap.predictor import Predictor, WindowSet, join, window_set
+from easi_jax.gap.layout import Layout
+from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.residuals import make_residuals, start_sensitivity, velocity_slack
-from easi_jax.gap.table import Layout, Place, Scales
+from easi_jax.gap.table import Place, Scales
+from easi_jax.gap.window_set import WindowSet, join, window_set
 from easi_jax.parameters import ParameterSpace
 from easi_jax.recording import Run
 

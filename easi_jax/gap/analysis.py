@@ -13,33 +13,34 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from easi_jax.drive_forces import exertion
 from easi_jax.errors import UserError
 from easi_jax.gap import measure
+from easi_jax.gap.evidence import (
+    GOAL,
+    HELPS,
+    better,
+    explained,
+    probability,
+    rank,
+    simplest,
+)
 from easi_jax.gap.fit import bounds_of, window_weights
-from easi_jax.gap.outcome import Figures, Found, Outcome, for_people
-from easi_jax.gap.predictor import BLOCK, Predictor, WindowSet, join, window_set
+from easi_jax.gap.layout import Layout
+from easi_jax.gap.models import Candidate, Model
+from easi_jax.gap.numbers import Numbers
+from easi_jax.gap.outcome import Figures, Found, Outcome
+from easi_jax.gap.places import places, ripples
+from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.residuals import (
     make_residuals,
     start_sensitivity,
     velocity_slack,
 )
 from easi_jax.gap.scales import scales_of
-from easi_jax.gap.selection import (
-    GOAL,
-    HELPS,
-    Candidate,
-    Model,
-    Selector,
-    better,
-    explained,
-    probability,
-    rank,
-    shortlist,
-    simplest,
-)
-from easi_jax.gap.table import REFITTED, Layout, Place, covered, places, ripples
+from easi_jax.gap.selection import Selector, shortlist
+from easi_jax.gap.table import REFITTED, Place, covered
 from easi_jax.gap.where import Conditions
+from easi_jax.gap.window_set import join, reach, spread, window_set
 from easi_jax.parameters import ParameterSpace
 from easi_jax.progress import Progress, silent
 from easi_jax.quantities import scalar_dofs
@@ -47,7 +48,6 @@ from easi_jax.recording import Run, physics_steps
 
 _FITTED = (32, 96)  # windows that fits see
 _STEPS = 9_600  # physics steps in them
-_EXTREME = 4  # for so many, one more that has large forces or speeds
 _BLOCKS = 10
 _MOST = 5  # effects
 _STAGES = 8  # of adding one and taking out what has become needless
@@ -105,7 +105,7 @@ class Analysis:
             )
         physics = fitted.ctrl.shape[1] * physics_steps(dt, mj_model.opt.timestep)
         most = min(max(_STEPS // physics, _FITTED[0]), _FITTED[1])
-        chosen = _spread(fitted, most, _reach(mj_model, fit, fitted))
+        chosen = spread(fitted, most, reach(mj_model, fit, fitted))
         self.fit_windows, self.held = fitted.take(chosen), kept
         pad = -len(self.fit_windows) % BLOCK
         repeated = np.r_[np.arange(len(chosen)), np.full(pad, len(chosen) - 1)]
@@ -404,7 +404,7 @@ class Analysis:
         floor_gap = float(measure.gap(floor, scale))
         share = explained(refit.gap, after.gap, floor_gap)
         found = []
-        deviation = self.deviations(model)
+        numbers = Numbers(self.selector, model)
         for k, place in enumerate(model.places):
             part = model.places[: k + 1]
             if k + 1 == len(model.places):
@@ -426,11 +426,11 @@ class Analysis:
             found.append(
                 Found(
                     place,
-                    self.values(model, place, deviation),
+                    numbers.values(place),
                     share / (1.0 + odds),
                     same,
                     figures.gap,
-                    self.column_deviations(model, place, deviation),
+                    numbers.deviations(place),
                 )
             )
         goal = GOAL * floor_gap
@@ -455,7 +455,9 @@ class Analysis:
         return Outcome(
             verdict=verdict,
             found=found,
-            refitted=self.refitted(base, model if found else base),
+            refitted=Numbers(self.selector, model if found else base).refitted(
+                self.space
+            ),
             before=before,
             refit=refit,
             after=after,
@@ -479,90 +481,6 @@ class Analysis:
         )
         # Twins differ by rounding alone.
         return bool(np.quantile(d, 0.025) <= _ROUNDING * mine.gap)
-
-    def deviations(self, model: Model) -> np.ndarray:
-        """Standard deviations of a fit's active entries, from its windows."""
-        f, w = model.fit, self.selector.weight
-        if not len(f.active):
-            return np.zeros(0)
-        size = self.bounds.size[f.active]
-        j = f.slope * size
-        normal = np.einsum("w,wma,wmb->ab", w, j, j, optimize=True)
-        score = np.einsum("w,wma,wm->wa", w, j, f.residual, optimize=True)
-        inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
-        # Windows as they scatter, and no better than what their noise allows.
-        scattered = inverse @ (score.T @ score) @ inverse
-        cov = np.where(np.diag(scattered) > np.diag(inverse), scattered, inverse)
-        return np.sqrt(np.maximum(np.diag(cov), 0.0)) * size
-
-    def column_deviations(
-        self, model: Model, place: Place, deviation: np.ndarray
-    ) -> dict[int, float]:
-        """Of a place's columns that the fit moved, by number."""
-        index = self.selector.columns(place, fitted=False).tolist()
-        active = model.fit.active.tolist()
-        return {
-            k: float(deviation[active.index(i)])
-            for k, i in enumerate(index)
-            if i in active
-        }
-
-    def values(
-        self, model: Model, place: Place, deviation: np.ndarray
-    ) -> dict[str, tuple[float, float, str]]:
-        """Parameters of an effect as the table names them."""
-        index = self.selector.columns(place, fitted=False)
-        std = self.column_deviations(model, place, deviation)
-        got = {}
-        for k, (i, c) in enumerate(zip(index, place.columns, strict=True)):
-            if c.parameter:
-                got[c.parameter] = (
-                    c.of * float(model.fit.x[i]),
-                    c.of * std.get(k, 0.0),
-                    c.unit,
-                )
-        return for_people(place, got)
-
-    def refitted(self, base: Model, model: Model) -> list[dict]:
-        """The model's own parameters that moved."""
-        deviation = self.deviations(model)
-        active = model.fit.active.tolist()
-        out = []
-        for i in base.own:
-            p = self.space.parameters[i]
-            out += [
-                {
-                    "address": a,
-                    "from": float(p.nominal),
-                    "to": float(model.fit.x[i]),
-                    "std": float(deviation[active.index(i)]),
-                }
-                for a in p.addresses
-            ]
-        return out
-
-
-def _reach(m: mujoco.MjModel, runs: Sequence[Run], windows: WindowSet) -> np.ndarray:
-    """Largest drive forces and speeds in each window, ``(W, nu + nv)``."""
-    steps = windows.ctrl.shape[1]
-    sizes = [exertion(m, run) for run in runs]
-    parts = zip(windows.run, windows.row, strict=True)
-    return np.array([sizes[r][row : row + steps + 1].max(0) for r, row in parts])
-
-
-def _spread(windows: WindowSet, most: int, reach: np.ndarray) -> np.ndarray:
-    """Indices of ``most`` windows at even distances, and of some more with the largest
-    forces and speeds, where limits show; all where there are no more."""
-    count = len(windows)
-    if count <= most:
-        return np.arange(count)
-    chosen = set(np.linspace(0, count - 1, most).round().astype(int).tolist())
-    whole = min(count, most + most // _EXTREME)
-    for largest in np.argsort(-reach, axis=0, kind="stable"):
-        for window in largest.tolist():
-            if len(chosen) < whole:
-                chosen.add(window)
-    return np.array(sorted(chosen))
 
 
 def _keys(model: Model) -> frozenset[str]:

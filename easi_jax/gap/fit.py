@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from easi_jax.gap.table import Layout
+from easi_jax.gap.layout import Layout
 from easi_jax.parameters import ParameterSpace
 
 _ROUNDS = 12

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from easi_jax.gap.predictor import WindowSet
 from easi_jax.gap.residuals import noise_rows
+from easi_jax.gap.window_set import WindowSet
 from easi_jax.quantities import joint_name
 from easi_jax.recording import Run
 

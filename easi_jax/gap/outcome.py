@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from easi_jax.gap.measure import Channels
-from easi_jax.gap.predictor import WindowSet
 from easi_jax.gap.table import Place
 from easi_jax.gap.where import Conditions
+from easi_jax.gap.window_set import WindowSet
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,7 @@ one size.
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -24,20 +23,18 @@ from easi_jax import backlash, effects
 from easi_jax.backlash import Rotor
 from easi_jax.effect_quantities import EFFECT_TABLE
 from easi_jax.effects import Effects
-from easi_jax.gap.table import Layout
+from easi_jax.gap.layout import Layout
+from easi_jax.gap.window_set import Rows, WindowSet
 from easi_jax.machine import Machine
 from easi_jax.mesh import make_mesh, sharded_map
 from easi_jax.model import Model, full_structure
 from easi_jax.parameters import ParameterSpace
 from easi_jax.physics import Physics, arrived_step
 from easi_jax.quantities import scalar_places
-from easi_jax.recording import Run
 from easi_jax.runtime import fast_loops, quick_compile
-from easi_jax.windows import fitted_velocity, make_windows
 
 BLOCK = 16  # windows
 _ITEMS = 4  # that a device works on together: many requests ask for few
-_BEFORE = 0.6  # s before a window in which a drive with play finds its side
 _ROW = 0.01  # s of it at a time
 
 
@@ -59,112 +56,6 @@ def opened(m: mujoco.MjModel) -> mujoco.MjModel:
 _PLAY = ("width", "rotor", "felt")
 # Most predictions have no use for drives of their own.
 _RIGID = tuple(f for f in Effects.__dataclass_fields__ if f not in _PLAY)
-
-
-@dataclass(frozen=True)
-class WindowSet:
-    """Windows of several runs; all arrays have a leading axis W.
-
-    Attributes:
-        run: index of the run.
-        row: row of the run where the window starts.
-        start_qpos: measured positions at the start, ``(W, nq)``.
-        ctrl: ``(W, H, nu)``.
-        past: commands before, oldest first, ``(W, D, nu)``; before a run's first row
-            its first command.
-        past_qpos: positions in those rows, ``(W, D, nq)``.
-        past_qvel: fitted velocities there, ``(W, D, nv)``; at rest before a run.
-        read: way from the start to the positions of the rows from ``L + 1`` before it
-            to ``H + L`` after, tangents ``(W, 2 L + 2 + H, nv)``, where readings can be
-            L rows late; beyond a run its first or last.
-        speed: fitted velocities from ``L + 1`` rows before the start to L after,
-            ``(W, 2 L + 2, nv)``; at rest before a run.
-        led: whether the run has as many rows before the window as readings can be late.
-    """
-
-    run: np.ndarray
-    row: np.ndarray
-    start_qpos: np.ndarray
-    ctrl: np.ndarray
-    past: np.ndarray
-    past_qpos: np.ndarray
-    past_qvel: np.ndarray
-    read: np.ndarray
-    speed: np.ndarray
-    led: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.run)
-
-    def take(self, index: np.ndarray) -> "WindowSet":
-        """Some of the windows."""
-        return WindowSet(*(getattr(self, f)[index] for f in self.__dataclass_fields__))
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Rows of a run, to the nearest, that predictions of windows are about; some may
-    lie beyond its ends.
-
-    Attributes:
-        readings: those of each degree of freedom, ``(W, H + 1, nv)``.
-        commands: that act in the meantime, ``(W, H)``.
-    """
-
-    readings: np.ndarray
-    commands: np.ndarray
-
-
-def join(sets: Sequence[WindowSet]) -> WindowSet:
-    """All windows of several sets."""
-    names = WindowSet.__dataclass_fields__
-    return WindowSet(*(np.concatenate([getattr(s, f) for s in sets]) for f in names))
-
-
-def window_set(
-    runs: Sequence[Run], horizon_s: float, longest: float, first_run: int = 0
-) -> WindowSet | None:
-    """Windows every half horizon, each inside one run; None where there are none.
-
-    Args:
-        longest: delay of commands and readings that predictions allow for [s].
-        first_run: index of the first of ``runs``.
-    """
-    sets = [
-        _windows_of(run, first_run + i, horizon_s, longest)
-        for i, run in enumerate(runs)
-    ]
-    sets = [s for s in sets if len(s)]
-    return join(sets) if sets else None
-
-
-def _windows_of(run: Run, number: int, horizon_s: float, longest: float) -> WindowSet:
-    late = math.ceil(longest / run.dt - 1e-9)
-    past = math.ceil(max(2 * longest, _BEFORE) / run.dt) + 2
-    w = make_windows(run, horizon_s)
-    velocity = fitted_velocity(run.qpos, run.dt, run.configuration)
-    start, steps = w.start_row[:, None], w.ctrl.shape[1]
-
-    def inside(rows: np.ndarray) -> np.ndarray:
-        return np.clip(rows, 0, len(run) - 1)
-
-    def moving(rows: np.ndarray) -> np.ndarray:
-        return np.where(rows[..., None] < 0, 0.0, velocity[inside(rows)])
-
-    before = start + np.arange(-past, 0)
-    seen = start + np.arange(-late - 1, steps + late + 1)
-    return WindowSet(
-        run=np.full(len(w.start_row), number),
-        row=w.start_row,
-        start_qpos=run.qpos[w.start_row],
-        ctrl=w.ctrl,
-        past=run.ctrl[inside(before)],
-        past_qpos=run.qpos[inside(before)],
-        past_qvel=moving(before),
-        read=run.configuration.difference(run.qpos[start], run.qpos[inside(seen)]),
-        speed=moving(start + np.arange(-late - 1, late + 1)),
-        led=w.start_row >= late,
-    )
 
 
 class Predictor:

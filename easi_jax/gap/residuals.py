@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from easi_jax.gap.predictor import Predictor, WindowSet
+from easi_jax.gap.predictor import Predictor
+from easi_jax.gap.window_set import WindowSet
 from easi_jax.recording import Run
 from easi_jax.windows import (
     FIT_ROWS,

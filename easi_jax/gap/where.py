@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.gap.measure import Channels
-from easi_jax.gap.predictor import Rows, WindowSet
+from easi_jax.gap.window_set import Rows, WindowSet
 from easi_jax.quantities import actuator_name, body_name, scalar_dofs
 from easi_jax.recording import Run
 from easi_jax.windows import fitted_velocity

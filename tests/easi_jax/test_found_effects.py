@@ -21,9 +21,11 @@ from easi_jax.found_effects import (
     joined,
     machine_with,
 )
-from easi_jax.gap.predictor import Predictor, window_set
+from easi_jax.gap.layout import Layout
+from easi_jax.gap.places import places
+from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.scales import scales_of
-from easi_jax.gap.table import Layout, places
+from easi_jax.gap.window_set import window_set
 from easi_jax.log_data import segments_from_runs
 from easi_jax.machine import Machine
 from easi_jax.parameters import Parameter, ParameterSpace

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from easi_jax.configuration import Configuration
-from easi_jax.gap.predictor import Predictor, window_set
+from easi_jax.gap.layout import Layout
+from easi_jax.gap.places import places
+from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.scales import scales_of
-from easi_jax.gap.table import Layout, places
+from easi_jax.gap.window_set import window_set
 from easi_jax.parameters import ParameterSpace
 from easi_jax.recording import Run
 from easi_jax.windows import fitted_velocity

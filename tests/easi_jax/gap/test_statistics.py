@@ -8,6 +8,14 @@ import pytest
 
 from easi_jax.configuration import Configuration
 from easi_jax.gap import measure
+from easi_jax.gap.evidence import (
+    advantage,
+    better,
+    explained,
+    probability,
+    rank,
+    simplest,
+)
 from easi_jax.gap.fit import (
     Bounds,
     Fitted,
@@ -16,24 +24,17 @@ from easi_jax.gap.fit import (
     lockstep,
     window_weights,
 )
+from easi_jax.gap.layout import Layout
+from easi_jax.gap.models import Candidate, Model
 from easi_jax.gap.outcome import for_people
-from easi_jax.gap.predictor import Predictor, window_set
+from easi_jax.gap.places import places, ripples
+from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.residuals import make_residuals, start_sensitivity, step_groups
 from easi_jax.gap.scales import scales_of
-from easi_jax.gap.selection import (
-    Candidate,
-    Model,
-    Selector,
-    advantage,
-    better,
-    explained,
-    probability,
-    rank,
-    shortlist,
-    simplest,
-)
-from easi_jax.gap.table import EFFECTS, Layout, Place, places, ripples
+from easi_jax.gap.selection import Selector, shortlist
+from easi_jax.gap.table import EFFECTS, Place
 from easi_jax.gap.velocities import velocity_lags
+from easi_jax.gap.window_set import window_set
 from easi_jax.parameters import ParameterSpace
 from easi_jax.recording import Run
 from easi_jax.windows import fitted_velocity

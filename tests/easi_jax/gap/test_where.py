@@ -8,8 +8,8 @@ import pytest
 
 from easi_jax.configuration import Configuration
 from easi_jax.gap.measure import Channels
-from easi_jax.gap.predictor import Rows, WindowSet
 from easi_jax.gap.where import Conditions, condition_errors, where
+from easi_jax.gap.window_set import Rows, WindowSet
 from easi_jax.recording import Run
 
 # A weight on a vertical slide that reaches the floor, and an arm beside it.

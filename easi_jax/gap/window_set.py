@@ -1,0 +1,144 @@
+"""Windows of measured runs with what predictions need of the time around them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from easi_jax.drive_forces import exertion
+from easi_jax.recording import Run
+from easi_jax.windows import fitted_velocity, make_windows
+
+_BEFORE = 0.6  # s before a window in which a drive with play finds its side
+_EXTREME = 4  # for so many, one more that has large forces or speeds
+
+
+@dataclass(frozen=True)
+class WindowSet:
+    """Windows of several runs; all arrays have a leading axis W.
+
+    Attributes:
+        run: index of the run.
+        row: row of the run where the window starts.
+        start_qpos: measured positions at the start, ``(W, nq)``.
+        ctrl: ``(W, H, nu)``.
+        past: commands before, oldest first, ``(W, D, nu)``; before a run's first row
+            its first command.
+        past_qpos: positions in those rows, ``(W, D, nq)``.
+        past_qvel: fitted velocities there, ``(W, D, nv)``; at rest before a run.
+        read: way from the start to the positions of the rows from ``L + 1`` before it
+            to ``H + L`` after, tangents ``(W, 2 L + 2 + H, nv)``, where readings can be
+            L rows late; beyond a run its first or last.
+        speed: fitted velocities from ``L + 1`` rows before the start to L after,
+            ``(W, 2 L + 2, nv)``; at rest before a run.
+        led: whether the run has as many rows before the window as readings can be late.
+    """
+
+    run: np.ndarray
+    row: np.ndarray
+    start_qpos: np.ndarray
+    ctrl: np.ndarray
+    past: np.ndarray
+    past_qpos: np.ndarray
+    past_qvel: np.ndarray
+    read: np.ndarray
+    speed: np.ndarray
+    led: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.run)
+
+    def take(self, index: np.ndarray) -> "WindowSet":
+        """Some of the windows."""
+        return WindowSet(*(getattr(self, f)[index] for f in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of a run, to the nearest, that predictions of windows are about; some may
+    lie beyond its ends.
+
+    Attributes:
+        readings: those of each degree of freedom, ``(W, H + 1, nv)``.
+        commands: that act in the meantime, ``(W, H)``.
+    """
+
+    readings: np.ndarray
+    commands: np.ndarray
+
+
+def join(sets: Sequence[WindowSet]) -> WindowSet:
+    """All windows of several sets."""
+    names = WindowSet.__dataclass_fields__
+    return WindowSet(*(np.concatenate([getattr(s, f) for s in sets]) for f in names))
+
+
+def window_set(
+    runs: Sequence[Run], horizon_s: float, longest: float, first_run: int = 0
+) -> WindowSet | None:
+    """Windows every half horizon, each inside one run; None where there are none.
+
+    Args:
+        longest: delay of commands and readings that predictions allow for [s].
+        first_run: index of the first of ``runs``.
+    """
+    sets = [
+        _windows_of(run, first_run + i, horizon_s, longest)
+        for i, run in enumerate(runs)
+    ]
+    sets = [s for s in sets if len(s)]
+    return join(sets) if sets else None
+
+
+def _windows_of(run: Run, number: int, horizon_s: float, longest: float) -> WindowSet:
+    late = math.ceil(longest / run.dt - 1e-9)
+    past = math.ceil(max(2 * longest, _BEFORE) / run.dt) + 2
+    w = make_windows(run, horizon_s)
+    velocity = fitted_velocity(run.qpos, run.dt, run.configuration)
+    start, steps = w.start_row[:, None], w.ctrl.shape[1]
+
+    def inside(rows: np.ndarray) -> np.ndarray:
+        return np.clip(rows, 0, len(run) - 1)
+
+    def moving(rows: np.ndarray) -> np.ndarray:
+        return np.where(rows[..., None] < 0, 0.0, velocity[inside(rows)])
+
+    before = start + np.arange(-past, 0)
+    seen = start + np.arange(-late - 1, steps + late + 1)
+    return WindowSet(
+        run=np.full(len(w.start_row), number),
+        row=w.start_row,
+        start_qpos=run.qpos[w.start_row],
+        ctrl=w.ctrl,
+        past=run.ctrl[inside(before)],
+        past_qpos=run.qpos[inside(before)],
+        past_qvel=moving(before),
+        read=run.configuration.difference(run.qpos[start], run.qpos[inside(seen)]),
+        speed=moving(start + np.arange(-late - 1, late + 1)),
+        led=w.start_row >= late,
+    )
+
+
+def reach(m: mujoco.MjModel, runs: Sequence[Run], windows: WindowSet) -> np.ndarray:
+    """Largest drive forces and speeds in each window, ``(W, nu + nv)``."""
+    steps = windows.ctrl.shape[1]
+    sizes = [exertion(m, run) for run in runs]
+    parts = zip(windows.run, windows.row, strict=True)
+    return np.array([sizes[r][row : row + steps + 1].max(0) for r, row in parts])
+
+
+def spread(windows: WindowSet, most: int, reach: np.ndarray) -> np.ndarray:
+    """Indices of ``most`` windows at even distances, and of some more with the largest
+    forces and speeds, where limits show; all where there are no more."""
+    count = len(windows)
+    if count <= most:
+        return np.arange(count)
+    chosen = set(np.linspace(0, count - 1, most).round().astype(int).tolist())
+    whole = min(count, most + most // _EXTREME)
+    for largest in np.argsort(-reach, axis=0, kind="stable"):
+        for window in largest.tolist():
+            if len(chosen) < whole:
+                chosen.add(window)
+    return np.array(sorted(chosen))
