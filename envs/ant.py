@@ -17,14 +17,16 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import support
 
+from easi_jax.action_map import ActionMap
 from easi_jax.env import EnvState, advance, start
 from easi_jax.machine import Machine
 from easi_jax.model import Model
 from easi_jax.physics import Physics
 from envs.frames import matrix, roll_yaw
-from envs.robot import Robot, not_finite
+from envs.robot import Robot, not_finite, vector
 
 LEGS = ("front_left", "front_right", "back_left", "back_right")
+JOINTS = tuple(f"{joint}_{i}" for i in (1, 2, 3, 4) for joint in ("hip", "ankle"))
 START_HEIGHT = 0.44  # m
 FALLEN = 0.31  # m
 _JOINTS = slice(7, 15)
@@ -66,6 +68,22 @@ class Ant(Robot):
     episode_length = 200
     dt = 1 / 60
     default_target = ("torso_mass*0.5",)
+    action_map = ActionMap()
+    obs_names = (
+        "height",
+        *vector("velocity"),
+        *vector("rate"),
+        *("yaw", "roll", "angle_to_target", "up", "heading"),
+        *(f"{joint}.angle" for joint in JOINTS),
+        *(f"{joint}.speed" for joint in JOINTS),
+        *(
+            f"{leg}_foot.{what}.{axis}"
+            for leg in LEGS
+            for what in ("force", "torque")
+            for axis in "xyz"
+        ),
+        *(f"last.{joint}" for joint in JOINTS),
+    )
 
     def __init__(self) -> None:
         super().__init__(ADDRESSES)
@@ -93,8 +111,7 @@ class Ant(Robot):
 
     def control(self, state: EnvState, action: jax.Array) -> jax.Array:
         """Motor commands ``(8,)`` for an action in [-1, 1]."""
-        del state
-        return jnp.clip(action, -1.0, 1.0)
+        return self.action_map(state.obs, action)
 
     def observe(self, physics: Physics, last: jax.Array) -> jax.Array:
         """Observation ``(60,)`` of a physics state after the action ``last``."""

@@ -10,10 +10,11 @@ ball comes back with a third of its speed).
 import jax
 import jax.numpy as jnp
 
+from easi_jax.action_map import ActionMap
 from easi_jax.env import EnvState, advance, start
 from easi_jax.model import Model
 from easi_jax.physics import Physics
-from envs.robot import Robot, not_finite
+from envs.robot import Robot, not_finite, vector
 
 RATE = 2.0  # rad of target at action 1, in a step
 LOWEST = 0.30  # m, of the ball
@@ -48,11 +49,20 @@ class Ballbalance(Robot):
     episode_length = 500
     dt = 0.1
     default_target = ("ball_mass*0.5",)
+    obs_names = (
+        *(f"knee_{i}.angle" for i in (1, 2, 3)),
+        *(f"knee_{i}.speed" for i in (1, 2, 3)),
+        *vector("ball.position"),
+        *vector("ball.velocity"),
+        *(f"knee_{i}.target" for i in (1, 2, 3)),
+    )
 
     def __init__(self, episode_length: int = 500) -> None:
         super().__init__(ADDRESSES)
         self.episode_length = episode_length
-        self._low, self._high = self.mj_model.actuator_ctrlrange.T
+        low, high = self.mj_model.actuator_ctrlrange.T
+        targets = tuple(range(self.obs_size - self.action_size, self.obs_size))
+        self.action_map = ActionMap(RATE, low=low, high=high, added=targets)
 
     def reset(self, model: Model, key: jax.Array) -> EnvState:
         """The tray at its place; a ball is thrown at it from above.
@@ -77,8 +87,7 @@ class Ballbalance(Robot):
 
     def control(self, state: EnvState, action: jax.Array) -> jax.Array:
         """The knee targets ``(3,)`` [rad] that an action in [-1, 1] leads to."""
-        moved = state.memory + RATE * jnp.clip(action, -1.0, 1.0)
-        return jnp.clip(moved, self._low, self._high)
+        return self.action_map(state.obs, action)
 
     def observe(self, physics: Physics, targets: jax.Array) -> jax.Array:
         """Observation ``(15,)`` of a physics state."""

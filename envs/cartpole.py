@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from easi_jax.action_map import ActionMap
 from easi_jax.env import EnvState, advance, start
 from easi_jax.machine import Machine
 from easi_jax.model import Model
@@ -71,6 +72,7 @@ class Cartpole:
     episode_length = 200
     dt = 0.02
     default_target = ("cart_kp*0.5",)
+    action_map = ActionMap(scale=TARGET_RANGE)
 
     def __init__(self) -> None:
         path = resources.files("envs") / "assets" / "cartpole.xml"
@@ -94,8 +96,7 @@ class Cartpole:
 
     def control(self, state: EnvState, action: jax.Array) -> jax.Array:
         """The actuator's ctrl ``(1,)`` [m] for an action in [-1, 1]."""
-        del state
-        return TARGET_RANGE * jnp.clip(action, -1.0, 1.0)
+        return self.action_map(state.obs, action)
 
     def observe(self, physics: Physics) -> jax.Array:
         """Observation ``(4,)`` of a physics state."""

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from easi_jax.action_map import ActionMap
 from easi_jax.drives import TorqueSpeed
 from easi_jax.env import EnvState, advance, start
 from easi_jax.errors import UserError, nearest
@@ -20,7 +21,7 @@ from easi_jax.machine import Machine
 from easi_jax.model import Model
 from easi_jax.physics import Physics
 from envs.frames import from_yaw, matrix
-from envs.robot import Robot, not_finite
+from envs.robot import Robot, not_finite, vector
 
 LEGS = ("FL", "FR", "RL", "RR")
 JOINTS = ("hip", "thigh", "calf")
@@ -116,6 +117,15 @@ class Go2(Robot):
     dt = 0.02
     k = 2.0
     default_target = ("thigh_kp*0.5",)
+    obs_names = (
+        *vector("velocity"),
+        *vector("rate"),
+        *vector("gravity"),
+        *(f"{leg}_{joint}.angle" for leg in LEGS for joint in JOINTS),
+        *(f"{leg}_{joint}.speed" for leg in LEGS for joint in JOINTS),
+        *(f"last.{leg}_{joint}" for leg in LEGS for joint in JOINTS),
+        *("command.forward", "command.sideways", "command.turn"),
+    )
 
     def __init__(
         self,
@@ -148,7 +158,8 @@ class Go2(Robot):
         m = self.mj_model
         self._stand = m.key_qpos[0].copy()
         self._pose = self._stand[7:]
-        self._low, self._high = m.actuator_ctrlrange.T
+        low, high = m.actuator_ctrlrange.T
+        self.action_map = ActionMap(ACTION_SCALE, self._pose, low, high)
         self._limit = m.actuator_forcerange[:, 1]
         if torque_speed:
             self.machine = Machine(m, self.space, self.dt, torque_speed=motor_curve())
@@ -182,11 +193,7 @@ class Go2(Robot):
 
     def control(self, state: EnvState, action: jax.Array) -> jax.Array:
         """Joint targets ``(12,)`` [rad] for an action in [-1, 1]."""
-        del state
-        return self._targets(jnp.clip(action, -1.0, 1.0))
-
-    def _targets(self, action: jax.Array) -> jax.Array:
-        return jnp.clip(self._pose + ACTION_SCALE * action, self._low, self._high)
+        return self.action_map(state.obs, action)
 
     def observe(self, physics: Physics, memory: Memory) -> jax.Array:
         """Observation ``(48,)`` of a physics state."""
@@ -250,7 +257,7 @@ class Go2(Robot):
         track = 0.5 * (near + progress)
         turn = jnp.exp(-((command[2] - rate[2]) ** 2) / 0.25)
         gain = model.mjx.actuator_gainprm[:, 0], model.mjx.actuator_biasprm[:, 2]
-        target = self._targets(memory.last)
+        target = self.action_map(None, memory.last)
         torque = gain[0] * (target - q[7:]) + gain[1] * v[6:]
         torque = jnp.clip(torque, -self._limit, self._limit)
         shift = jnp.linalg.norm(memory.feet[:, :2] - before.feet[:, :2], axis=1)

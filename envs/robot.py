@@ -100,6 +100,11 @@ def parameter_space(
     return ParameterSpace(tuple(one(n, a) for n, a in addresses.items()))
 
 
+def vector(name: str) -> tuple[str, ...]:
+    """Names of its entries, for ``obs_names``."""
+    return tuple(f"{name}.{axis}" for axis in "xyz")
+
+
 def not_finite(*arrays: jax.Array) -> jax.Array:
     """Whether any number is not finite, ``()`` bool."""
     return ~jnp.stack([jnp.isfinite(a).all() for a in arrays]).all()

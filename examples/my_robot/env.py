@@ -14,6 +14,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
+from easi_jax.action_map import ActionMap
 from easi_jax.env import EnvState, advance, start
 from easi_jax.model import Model
 from easi_jax.physics import Physics
@@ -39,6 +40,12 @@ class TwoLink(Robot):
     dt = 0.02  # s, a control step; the model's timestep divides it
     k = 2.0  # UDR and the search start in [nominal / k, nominal k]
     default_target = ("upper_mass*1.5", "shoulder_damping*2")
+    # For train.export: what the policy reads, and what the actuators are sent.
+    obs_names = (
+        *("shoulder.sin", "elbow.sin", "shoulder.cos", "elbow.cos"),
+        *("shoulder.speed/10", "elbow.speed/10"),
+    )
+    action_map = ActionMap()
     training: Mapping[str, TrainingConfig] = {
         "sac": SacConfig(
             env_steps=40_000,
@@ -77,8 +84,7 @@ class TwoLink(Robot):
 
     def control(self, state: EnvState, action: jax.Array) -> jax.Array:
         """Torques as the actuators take them."""
-        del state
-        return jnp.clip(action, -1.0, 1.0)
+        return self.action_map(state.obs, action)
 
     def step(self, model: Model, state: EnvState, action: jax.Array) -> EnvState:
         """One control step; never resets."""

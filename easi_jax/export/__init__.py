@@ -1,0 +1,1 @@
+"""Results for others: policies as ONNX and StableHLO, parameters as MJCF and ranges."""
