@@ -61,7 +61,14 @@ class Cell:
 
 def identifiers() -> dict[str, Callable[[Cell], Any]]:
     """Methods that find a distribution over parameters."""
-    from easi_jax.methods import Dropo, Easi, PairedCmaEs, RandomSearch, SimOpt
+    from easi_jax.methods import (
+        Dropo,
+        Easi,
+        MujocoSysid,
+        PairedCmaEs,
+        RandomSearch,
+        SimOpt,
+    )
     from train._robots import search_config
 
     def easi(preset: str, refine: bool) -> Callable[[Cell], Any]:
@@ -75,6 +82,7 @@ def identifiers() -> dict[str, Callable[[Cell], Any]]:
         "CMA-ES": lambda _: PairedCmaEs(),
         "DROPO": lambda _: Dropo(),
         "random search": lambda _: RandomSearch(),
+        "mujoco.sysid": lambda _: MujocoSysid(),
     }
 
 
@@ -93,7 +101,7 @@ def learners() -> dict[str, Callable[[Cell], Any]]:
 METHODS = (
     *("UDR", "Oracle", "FineTune", "FineTune, no random actions", "GARAT"),
     *("EASI paper", "EASI default", "EASI default, not refined"),
-    *("SimOpt", "CMA-ES", "DROPO", "random search"),
+    *("SimOpt", "CMA-ES", "DROPO", "random search", "mujoco.sysid"),
 )
 
 

@@ -110,7 +110,7 @@ def put_model(
     except NotImplementedError as error:
         reason = " ".join(str(error).split())
         raise UserError(f"MJX cannot simulate this model: {reason}") from error
-    if any(w.quantity in _MOVES_CENTERS for w in writers):
+    if any(w.quantity in MOVES_CENTERS for w in writers):
         put = full_structure(put)
     n = len(per_parameter)
     lasting = [replace(w, parameter=w.parameter - n) for w in writers]
@@ -130,7 +130,7 @@ def put_model(
     )
 
 
-_MOVES_CENTERS = ("com_x", "com_y", "com_z", "length", "com.0", "com.1", "com.2")
+MOVES_CENTERS = ("com_x", "com_y", "com_z", "length", "com.0", "com.1", "com.2")
 
 
 def full_structure(m: mjx.Model) -> mjx.Model:

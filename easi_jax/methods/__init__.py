@@ -10,6 +10,7 @@ from easi_jax.methods.garat import Garat
 from easi_jax.methods.paired import PairedCmaEs, RandomSearch
 from easi_jax.methods.policies import FineTune, Learned, Oracle, PolicyMethod, Practice
 from easi_jax.methods.simopt import SimOpt
+from easi_jax.methods.sysid import MujocoSysid
 from easi_jax.methods.task import Budget, Identified, Method, Task
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "Identified",
     "Learned",
     "Method",
+    "MujocoSysid",
     "Oracle",
     "PairedCmaEs",
     "PolicyMethod",

@@ -83,17 +83,24 @@ def some_pieces(demonstrations: Segments, horizon: int, count: int) -> Segments:
     return found.spread(count) if count < found.count else found
 
 
-def paired_cost(task: Task, pieces: Segments) -> Callable[[jax.Array], jax.Array]:
-    """``cost(population (P, n)) -> (P,)``, pure: mean squared error of predictions of
-    ``pieces``, each channel in units of its RMS motion or, where that is more, its
-    noise; `_LOST` where a simulation is not finite."""
-    machine, space = task.machine, task.space
-    moved = replay.motion(machine, pieces)
+def channel_scale(task: Task, pieces: Segments) -> jax.Array:
+    """RMS motion of each channel or, where that is more, its noise, ``(2 nv,)``."""
     w = pieces.weight[:, None, None]
     total = jnp.maximum(w.sum() * pieces.horizon, 1.0)
+    moved = replay.motion(task.machine, pieces)
     rms = jnp.sqrt((w * moved**2).sum((0, 1)) / total)
-    noise = effective_noise(machine, pieces, jnp.asarray(task.noise))
-    scale = jnp.maximum(rms, noise)
+    noise = effective_noise(task.machine, pieces, jnp.asarray(task.noise))
+    return jnp.maximum(rms, noise)
+
+
+def paired_cost(task: Task, pieces: Segments) -> Callable[[jax.Array], jax.Array]:
+    """``cost(population (P, n)) -> (P,)``, pure: mean squared error of predictions of
+    ``pieces``, each channel in units of `channel_scale`; `_LOST` where a simulation is
+    not finite."""
+    machine, space = task.machine, task.space
+    w = pieces.weight[:, None, None]
+    total = jnp.maximum(w.sum() * pieces.horizon, 1.0)
+    scale = channel_scale(task, pieces)
 
     def costs(population: jax.Array, pieces: Segments) -> jax.Array:
         def one(unit: jax.Array) -> jax.Array:

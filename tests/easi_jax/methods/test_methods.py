@@ -9,12 +9,10 @@ import pytest
 
 from easi_jax.distribution import covariance
 from easi_jax.errors import UserError
-from easi_jax.machine import Machine
 from easi_jax.methods import (
     Budget,
     Dropo,
     Easi,
-    Identified,
     Method,
     PairedCmaEs,
     RandomSearch,
@@ -22,79 +20,13 @@ from easi_jax.methods import (
     Task,
 )
 from easi_jax.methods.simopt import reps_weights
-from easi_jax.rollout import collect, measured, policy_rollout
+from easi_jax.rollout import measured
 from easi_jax.search_config import preset
 from easi_jax.segments import Segments
-from envs import make
+from tests.easi_jax.methods.small import log_ratios
 
-NAMES = ("cart_kp", "cart_kv", "pole_damping")
 BUDGET = Budget(300_000)
-STEPS = 40
 NOISE = jnp.array([5e-4, 2e-3, 1e-2, 2e-2])
-
-
-def controller(policy: jax.Array, obs: jax.Array, key: jax.Array) -> jax.Array:
-    u = obs @ jnp.array([3.75, 1.5, 7.5, 1.375])
-    return jnp.clip(u + policy * jax.random.normal(key), -1.0, 1.0)[None]
-
-
-def best(policy: jax.Array, obs: jax.Array, key: jax.Array) -> jax.Array:
-    return controller(0.0 * policy, obs, key)
-
-
-@pytest.fixture(scope="module")
-def task() -> Task:
-    """Three parameters of Cartpole; the search starts at 1.5 to 6 times the truth."""
-    env = make("cartpole")
-    env.episode_length = STEPS
-    space = env.space.select(NAMES).scaled(1.5, 6.0)
-    limit = {"joint.cart.speed_limit": 0.6}  # MJCF has no word for it
-    machine = Machine(env.mj_model, space, env.dt, fixed=limit)
-    truth = env.model()
-
-    @jax.jit
-    def record(policy: jax.Array, keys: jax.Array) -> Segments:
-        def one(key: jax.Array) -> Segments:
-            return policy_rollout(
-                env, truth, lambda o, k: best(policy, o, k), key, STEPS
-            )
-
-        return jax.vmap(one)(keys)
-
-    return Task(
-        machine,
-        jnp.zeros(4),
-        env=env,
-        act=controller,
-        act_best=best,
-        policy=jnp.asarray(0.25),
-        record=record,
-        train=lambda space, distribution, key: jnp.asarray(0.25),
-    )
-
-
-@pytest.fixture(scope="module")
-def demonstrations(task: Task) -> Segments:
-    policy = jnp.asarray(0.25)
-    run = jax.jit(
-        lambda key: collect(
-            task.env,
-            task.env.model(),
-            lambda obs, k: controller(policy, obs, k),
-            key,
-            40,
-            STEPS,
-        )
-    )
-    return run(jax.random.key(0))
-
-
-def log_ratios(task: Task, found: Identified) -> np.ndarray:
-    """Of what was found to the truth."""
-    si = np.asarray(found.space.to_si(found.distribution.mean))
-    return np.log(si / np.asarray(task.env.space.select(NAMES).nominal))
-
-
 EASI = preset("default", population=100, segments=64)
 # Largest |log ratio| of the drive's stiffness, and of its damping.
 METHODS: dict[str, tuple[Method, tuple[float, float]]] = {

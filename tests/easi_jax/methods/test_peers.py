@@ -1,0 +1,84 @@
+"""Methods of other packages; skipped where those are not installed."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from easi_jax.distribution import covariance
+from easi_jax.errors import UserError
+from easi_jax.methods import Budget, MujocoSysid, Task
+from easi_jax.methods.sysid import toolbox
+from easi_jax.rollout import measured
+from easi_jax.segments import Segments
+from tests.easi_jax.methods.small import NAMES, log_ratios
+
+BUDGET = Budget(300_000)
+NOISE = jnp.array([5e-4, 2e-3, 1e-2, 2e-2])
+
+
+def needs(*modules: str) -> Callable[[], None]:
+    def skip() -> None:
+        for name in modules:
+            pytest.importorskip(name, reason=f"{name} (easi-jax[peers]) is missing")
+
+    return skip
+
+
+needs_sysid = needs("colorama", "tabulate", "plotly", "imageio")
+
+
+def test_sysid_finds_the_truth_where_nothing_is_noisy(
+    task: Task, demonstrations: Segments
+) -> None:
+    needs_sysid()
+    method = MujocoSysid(pieces=8, horizon=20)
+    found = method.fit(task, demonstrations, BUDGET, jax.random.key(1))
+    # From three times the truth, by another simulator in double precision.
+    np.testing.assert_allclose(log_ratios(task, found), 0.0, atol=1e-4)
+    assert 0 < found.simulated <= BUDGET.simulated
+    assert np.diag(covariance(found.distribution)).max() < 1e-6
+
+
+def test_sysid_says_how_sure_it_is(task: Task, demonstrations: Segments) -> None:
+    needs_sysid()
+    noisy = measured(demonstrations, NOISE, jax.random.key(2))
+    method = MujocoSysid(pieces=8, horizon=20)
+    found = method.fit(replace(task, noise=NOISE), noisy, BUDGET, jax.random.key(1))
+    assert np.abs(log_ratios(task, found)[:2]).max() < 0.1
+    spread = np.sqrt(np.diag(covariance(found.distribution)))
+    assert (spread > 1e-4).all() and (spread < 12.0**-0.5).all()
+
+
+def test_sysid_leaves_what_mujoco_has_no_word_for(
+    task: Task, demonstrations: Segments
+) -> None:
+    needs_sysid()
+    names = (*NAMES[:2], "cart_speed_limit")
+    space = task.env.space.select(names).scaled(1.5, 6.0)
+    other = replace(task, machine=task.machine.rebuilt(space=space, fixed={}))
+    method = MujocoSysid(pieces=8, horizon=20)
+    found = method.fit(other, demonstrations, BUDGET, jax.random.key(1))
+    assert found.distribution.mean[2] == 0.5
+    assert covariance(found.distribution)[2, 2] == pytest.approx(1 / 12)
+    error = found.space.to_si(found.distribution.mean)[:2] / np.array([20.0, 0.3])
+    assert np.abs(np.log(error)).max() < 0.2
+
+
+def test_a_missing_toolbox_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    from mujoco import sysid
+
+    monkeypatch.delattr(sysid, "optimize", raising=False)
+    with pytest.raises(UserError, match=r"easi-jax\[peers\]"):
+        toolbox()
+
+
+def test_a_budget_that_buys_no_step_is_refused(
+    task: Task, demonstrations: Segments
+) -> None:
+    needs_sysid()
+    with pytest.raises(UserError, match="does not pay"):
+        MujocoSysid().fit(task, demonstrations, Budget(1_000), jax.random.key(0))
