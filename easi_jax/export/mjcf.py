@@ -1,0 +1,56 @@
+"""An identified machine as MJCF that plain MuJoCo loads."""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from easi_jax.errors import UserError
+from easi_jax.found_effects import EffectEntry
+from easi_jax.in_mujoco import InMujoco
+from easi_jax.io.repaired_model import repaired_xml
+from easi_jax.machine import Machine
+
+
+def identified_xml(
+    source: Path,
+    machine: Machine,
+    theta: np.ndarray,
+    entries: Sequence[EffectEntry] = (),
+) -> tuple[str, list[str]]:
+    """The MJCF of ``source`` with parameters ``theta (n,)``, SI, and effects in it.
+
+    Args:
+        source: file that the machine's model came from.
+        machine: whose parameters they are.
+        entries: effects that the machine has besides.
+
+    Returns:
+        The text, and names of the parameters and effects that MJCF has no word for.
+
+    Raises:
+        UserError: ``source`` is another model than the machine's.
+    """
+    unit = np.asarray(machine.space.to_unit(theta), float)
+    write = InMujoco(machine)
+    model = write.at(unit)
+    # MuJoCo writes numbers of a model back into the text that it read last.
+    read = mujoco.MjModel.from_xml_path(str(source))
+    if _sizes(read) != _sizes(model):
+        raise UserError(f"{source} is not the model that these parameters are of")
+    lost = [
+        name
+        for name, reached in zip(machine.space.names, write.reaches, strict=True)
+        if not reached
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.xml"
+        mujoco.mj_saveLastXML(str(path), model)
+        text, left = repaired_xml(path, entries, {})
+    return text, [*lost, *left]
+
+
+def _sizes(m: mujoco.MjModel) -> tuple[object, ...]:
+    return (m.nq, m.nv, m.nu, m.nbody, m.ngeom, m.names)

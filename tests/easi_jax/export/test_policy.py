@@ -1,0 +1,158 @@
+"""Exported policies are the policy: every robot, 10,000 observations."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+
+from easi_jax.export.policy import interface_of, to_onnx, to_stablehlo
+from easi_jax.rl.networks import PolicyParams, act, make_networks
+from envs import REGISTRY, load, make
+
+ROOT = Path(__file__).parents[3]
+COUNT = 10_000
+
+
+def policy_of(env: Any, hidden: tuple[int, ...] = (256, 256)) -> PolicyParams:
+    networks = make_networks(env.obs_size, env.action_size, hidden)
+    k_net, k_mean, k_std = jax.random.split(jax.random.key(0), 3)
+    return PolicyParams(
+        mean=jax.random.normal(k_mean, (env.obs_size,)),
+        std=jnp.exp(jax.random.normal(k_std, (env.obs_size,))),
+        network=networks.policy_network.init(k_net),
+    )
+
+
+def observations(env: Any, policy: PolicyParams) -> np.ndarray:
+    """As a trained policy sees them, and some far beyond."""
+    rng = np.random.default_rng(1)
+    size = np.exp(rng.normal(0.0, 0.5, (COUNT, 1)))
+    z = size * rng.normal(size=(COUNT, env.obs_size))
+    return np.asarray(policy.mean + policy.std * z, np.float32)
+
+
+def ran(content: bytes, obs: np.ndarray) -> dict[str, np.ndarray]:
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    names = [o.name for o in session.get_outputs()]
+    values = session.run(names, {"observation": obs})
+    return {n: np.asarray(v) for n, v in zip(names, values, strict=True)}
+
+
+def wanted(env: Any, policy: PolicyParams, obs: np.ndarray) -> dict[str, np.ndarray]:
+    action = act(policy, jnp.asarray(obs), deterministic=True)
+    return {
+        "action": np.asarray(action),
+        "ctrl": np.asarray(env.action_map(jnp.asarray(obs), action)),
+    }
+
+
+@pytest.mark.parametrize("name", REGISTRY)
+def test_onnx_is_the_policy(name: str) -> None:
+    env = make(name)
+    policy = policy_of(env)
+    obs = observations(env, policy)
+    got = ran(to_onnx(policy, interface_of(env), env.action_map), obs)
+    want = wanted(env, policy, obs)
+    assert got.keys() == want.keys()
+    for key, value in want.items():
+        np.testing.assert_allclose(got[key], value, atol=1e-5, err_msg=key)
+    assert np.ptp(want["action"], axis=0).min() > 0.1, "the policy does something"
+
+
+def test_stablehlo_is_the_policy() -> None:
+    env = make("cartpole")
+    policy = policy_of(env, (32,))
+    obs = observations(env, policy)
+    program, text = to_stablehlo(policy, interface_of(env), env.action_map)
+    exported = jax.export.deserialize(bytearray(program))
+    assert {"cpu", "cuda", "tpu"} <= set(exported.platforms)
+    assert "stablehlo" in text
+    for part in (obs[:1], obs):
+        got, want = exported.call(part), wanted(env, policy, part)
+        for key, value in want.items():
+            np.testing.assert_allclose(got[key], value, atol=1e-5, err_msg=key)
+
+
+@pytest.mark.parametrize("name", [*REGISTRY, "examples/my_robot/env.py"])
+def test_action_map_is_the_environments_own_control(name: str) -> None:
+    env = load(ROOT / name) if name.endswith(".py") else make(name)
+    state = jax.jit(env.reset)(env.model(), jax.random.key(3))
+    step = jax.jit(env.step)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        action = jnp.asarray(rng.uniform(-1.3, 1.3, env.action_size), jnp.float32)
+        ctrl = env.control(state, action)
+        np.testing.assert_allclose(env.action_map(state.obs, action), ctrl, atol=1e-6)
+        state = step(env.model(), state, action)
+    assert len(interface_of(env).ctrl) == len(ctrl) == env.mj_model.nu
+
+
+@pytest.mark.parametrize("name", REGISTRY)
+def test_every_observation_has_a_name_of_its_own(name: str) -> None:
+    env = make(name)
+    names = interface_of(env).observation
+    assert len(set(names)) == env.obs_size
+    assert not any(n.startswith("observation.") for n in names)
+
+
+def test_named_joints_are_those_observed() -> None:
+    """A joint that is turned moves the entry that bears its name, and no other."""
+    for name in ("ant", "go2"):
+        env = make(name)
+        physics = env.reset(env.model(), jax.random.key(0)).physics
+        memory = env.reset(env.model(), jax.random.key(0)).memory
+        names = np.array(env.obs_names)
+        before = np.asarray(env.observe(physics, memory))
+        for j in range(1, env.mj_model.njnt):
+            joint = env.mj_model.joint(j).name
+            moved = physics.replace(qpos=physics.qpos.at[6 + j].add(0.01))
+            change = np.asarray(env.observe(moved, memory)) != before
+            assert names[change].tolist() == [f"{joint}.angle"]
+
+
+def test_a_robot_without_an_action_map_exports_its_action() -> None:
+    env = make("cartpole")
+    policy = policy_of(env, (8,))
+    got = ran(to_onnx(policy, interface_of(env)), observations(env, policy))
+    assert list(got) == ["action"]
+
+
+def test_the_example_loop_drives_a_robot(tmp_path: Path) -> None:
+    """In a process that has neither jax nor this package."""
+    env = make("cartpole")
+    policy = policy_of(env, (16,))
+    model = to_onnx(policy, interface_of(env), env.action_map)
+    (tmp_path / "policy.onnx").write_bytes(model)
+    onnx.checker.check_model(str(tmp_path / "policy.onnx"))
+    (tmp_path / "robot.py").write_text(
+        "import json, sys, time\n"
+        "sent = open('sent.jsonl', 'w')\n"
+        "def read():\n"
+        "    return {'rate': 0.4, 'angle': 0.3, 'v': -0.2, 'x': 0.1, 'else': 1.0}\n"
+        "def send(commands):\n"
+        "    assert 'jax' not in sys.modules and 'easi_jax' not in sys.modules\n"
+        "    print(json.dumps([time.monotonic(), commands]), file=sent, flush=True)\n"
+    )
+    loop = ROOT / "examples" / "onnx_policy" / "loop.py"
+    subprocess.run(
+        [sys.executable, str(loop), "policy.onnx", "robot.py", "6"],
+        cwd=tmp_path,
+        timeout=60,
+        check=True,
+    )
+    rows = [json.loads(x) for x in (tmp_path / "sent.jsonl").read_text().splitlines()]
+    obs = np.array([[0.1, -0.2, 0.3, 0.4]], np.float32)
+    want = wanted(env, policy, obs)["ctrl"][0]
+    assert len(rows) == 6
+    for _, commands in rows:
+        assert list(commands) == ["cart"]
+        np.testing.assert_allclose(commands["cart"], want[0], atol=1e-6)
+    assert rows[-1][0] - rows[0][0] == pytest.approx(5 * env.dt, abs=0.05)

@@ -1,0 +1,220 @@
+"""``python -m train.export``: what a run found, for those who have not this package."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from train._command import main, say
+
+_FORMS = ("onnx", "stablehlo", "mjcf", "randomization")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Writes a run's policy and parameters for other programs.
+
+    onnx: the policy with its normalizer and action scaling, for onnxruntime
+    (examples/onnx_policy/loop.py drives a robot with it). stablehlo: the same as
+    jax.export writes it. mjcf: the model with the identified parameters and effects,
+    for plain MuJoCo. randomization: ranges and covariance as YAML, for domain
+    randomization in brax, MuJoCo Playground (easi_jax.export.randomization) and others
+    (docs/export.md).
+    """
+
+    run_folder: Annotated[Path, tyro.conf.Positional]
+    """Finished run of train.udr, train.easi or train.pipeline."""
+    to: tuple[str, ...] = ()
+    """onnx, stablehlo, mjcf, randomization; not given: all that the run has."""
+    out: Path | None = None
+    """Folder for the files; RUN_FOLDER/export where not given."""
+    method: str | None = None
+    """Policy to export: UDR, Fixed, EASI or Oracle; the run's own where not given."""
+    seed: int | None = None
+    """Seed whose policy and parameters are exported; not given: the first, for a
+    search in logs the one that predicts best."""
+    env: Path | None = None
+    """The environment file that the run was made with."""
+    model: Path | None = None
+    """MJCF that the robot's model came from, for mjcf; a built-in robot's own, and that
+    of a search in logs, where not given."""
+
+
+def run(config: Config) -> None:
+    """Reads, converts, writes."""
+    from easi_jax.errors import UserError, nearest
+
+    for form in config.to:
+        if form not in _FORMS:
+            known = ", ".join(_FORMS)
+            raise UserError(f'--to "{form}": {known}{nearest(form, _FORMS)}')
+    from easi_jax.io.files import atomic_write, read_json
+    from easi_jax.io.runs import read_config
+
+    settings, results = read_config(config.run_folder), {}
+    if (config.run_folder / "results.json").exists():
+        results = read_json(config.run_folder / "results.json")
+    policies = "methods" in results
+    identified = (config.run_folder / "distribution.json").exists()
+    has = {"onnx": policies, "stablehlo": policies}
+    has |= {"mjcf": identified, "randomization": identified}
+    if not any(has.values()):
+        raise UserError(f"{config.run_folder} holds no finished run")
+    for form in config.to:
+        if not has[form]:
+            what = (
+                "policy" if form in ("onnx", "stablehlo") else "identified parameters"
+            )
+            raise UserError(f"--to {form}: {config.run_folder} holds no {what}")
+    chosen = config.to or tuple(form for form in _FORMS if has[form])
+    files: dict[str, str | bytes] = {}
+    if {"onnx", "stablehlo"} & {*chosen}:
+        files |= _policy_files(config, chosen)
+    if {"mjcf", "randomization"} & {*chosen}:
+        files |= _parameter_files(config, {**settings, **results}, chosen)
+    out = config.out or config.run_folder / "export"
+    for name, content in files.items():
+        atomic_write(out / name, content)
+        say(f"written: {out / name}")
+
+
+def _policy_files(config: Config, chosen: tuple[str, ...]) -> dict[str, str | bytes]:
+    import jax
+
+    from easi_jax.errors import UserError
+    from easi_jax.export.policy import interface_of, to_onnx, to_stablehlo
+    from easi_jax.io.files import to_json
+    from train._robots import load_policies
+
+    found = load_policies(config.run_folder, config.method, config.env)
+    seeds, env = found["seeds"], found["env"]
+    if config.seed is not None and config.seed not in seeds:
+        known = ", ".join(map(str, seeds))
+        raise UserError(f"--seed {config.seed}: the run has {known}")
+    at = 0 if config.seed is None else seeds.index(config.seed)
+    policy = jax.tree.map(lambda x: x[at], found["policies"])
+    interface, mapped = interface_of(env), getattr(env, "action_map", None)
+    told = {**dataclasses.asdict(interface), "method": found["method"]}
+    files: dict[str, str | bytes] = {
+        "policy.json": to_json({**told, "seed": seeds[at]})
+    }
+    if "onnx" in chosen:
+        files["policy.onnx"] = to_onnx(policy, interface, mapped)
+    if "stablehlo" in chosen:
+        program, text = to_stablehlo(policy, interface, mapped)
+        files |= {"policy.stablehlo": program, "policy.mlir": text}
+    if mapped is None:
+        say(f"note: {env.name} has no action_map: the policy's output is its action")
+    return files
+
+
+def _parameter_files(
+    config: Config, settings: dict[str, Any], chosen: tuple[str, ...]
+) -> dict[str, str | bytes]:
+    from easi_jax.errors import UserError
+    from easi_jax.export.randomization import to_yaml
+    from easi_jax.io.files import read_json
+
+    found = read_json(config.run_folder / "distribution.json")
+    first = str(found.get("best_seed", next(iter(found["seeds"]))))
+    seed = first if config.seed is None else str(config.seed)
+    if seed not in found["seeds"]:
+        raise UserError(f"--seed {seed}: the run has {', '.join(found['seeds'])}")
+    robot = str(settings.get("robot") or settings.get("model") or "robot")
+    files: dict[str, str | bytes] = {}
+    if "randomization" in chosen:
+        files["randomization.yaml"] = to_yaml(found, seed, Path(robot).stem)
+    if "mjcf" in chosen:
+        files["model.xml"] = _model_text(config, settings, found, seed)
+    return files
+
+
+def _model_text(
+    config: Config, settings: dict[str, Any], found: dict[str, Any], seed: str
+) -> str:
+    import numpy as np
+
+    from easi_jax.export.mjcf import identified_xml
+
+    values = dict(
+        zip(
+            (p["name"] for p in found["parameters"]),
+            found["seeds"][seed]["mean"],
+            strict=True,
+        )
+    )
+    source, machine, entries = _machine_of(config, settings, found, values)
+    theta = np.array([values[name] for name in machine.space.names], float)
+    text, lost = identified_xml(source, machine, theta, entries)
+    if lost:
+        say(f"note: MJCF has no word for {', '.join(lost)}: not in model.xml")
+    return text
+
+
+def _machine_of(
+    config: Config,
+    settings: dict[str, Any],
+    found: dict[str, Any],
+    values: dict[str, float],
+) -> tuple[Path, Any, list[Any]]:
+    """File of the model, a machine with the identified parameters but those of effects,
+    and the effects as identified."""
+    from easi_jax.machine import Machine
+    from easi_jax.parameters import Parameter, ParameterSpace
+    from train._effects import found_in
+
+    effects = found_in(settings.get("effects"))
+    space, by_address = [], {}
+    for p in found["parameters"]:
+        by_address |= {address: values[p["name"]] for address in p["addresses"]}
+        if not p["addresses"][0].startswith("effect."):
+            space.append(
+                Parameter(
+                    name=p["name"],
+                    addresses=tuple(p["addresses"]),
+                    nominal=p["nominal"],
+                    initial=tuple(p["initial"]),
+                    bounds=tuple(p["bounds"]),
+                    unit=p["unit"],
+                    log=p["scale"] == "log",
+                )
+            )
+    own = {a: v for a, v in (effects.own or {}).items() if a not in by_address}
+    entries = [
+        dataclasses.replace(
+            e,
+            columns={c: by_address.get(e.address(c), v) for c, v in e.columns.items()},
+        )
+        for e in effects.entries
+    ]
+    source, mj_model, dt = _model_of(config, settings)
+    machine = Machine(mj_model, ParameterSpace(tuple(space)), dt, fixed=own)
+    return source, machine, entries
+
+
+def _model_of(config: Config, settings: dict[str, Any]) -> tuple[Path, Any, Any]:
+    """File of the run's model, the model, and its control step where there is one."""
+    from importlib import resources
+
+    from easi_jax.errors import UserError
+    from envs import REGISTRY
+    from train._log_problem import load_model
+    from train._robots import env_of
+
+    if settings.get("model"):  # of measured logs
+        path = Path(config.model or settings["model"])
+        return path, load_model(path), None
+    env = env_of(config.run_folder, settings, config.env)
+    if config.model is not None:
+        return config.model, env.mj_model, env.dt
+    if env.name not in REGISTRY:
+        raise UserError(
+            f"{env.name} does not say which file its model is from: give --model M.xml"
+        )
+    path = resources.files("envs") / "assets" / f"{env.name}.xml"
+    return Path(str(path)), env.mj_model, env.dt
+
+
+if __name__ == "__main__":
+    main(Config, run, name="train.export")
