@@ -402,7 +402,7 @@ class Analysis:
         after = self.figures(model.fit.x) if model.places else refit
         floor = self.floor(model.fit.x if model.places else base.fit.x)
         floor_gap = float(measure.gap(floor, scale))
-        share = explained(refit.gap, after.gap, floor_gap)
+        trust = explained(refit.gap, after.gap, floor_gap)
         found = []
         numbers = Numbers(self.selector, model)
         for k, place in enumerate(model.places):
@@ -427,7 +427,7 @@ class Analysis:
                 Found(
                     place,
                     numbers.values(place),
-                    share / (1.0 + odds),
+                    trust / (1.0 + odds),
                     same,
                     figures.gap,
                     numbers.deviations(place),
@@ -448,6 +448,15 @@ class Analysis:
                 f"data alone, which the model misses by {fitted:.3g} times their "
                 "noise; hold out other runs to see it confirmed"
             )
+        if found and after.gap >= refit.gap:
+            names = ", ".join(f.place.key for f in found)
+            notes.append(
+                f"{names}: seen in the fitting data, but the held-out data are "
+                "predicted no better with it, so it is not named; the recordings "
+                "differ, or are too few"
+            )
+            verdict = "no_gap" if refit.gap <= goal else "unexplained"
+            found, after = [], refit
         if verdict == "no_gap":
             found = []
             after = refit

@@ -168,9 +168,12 @@ def probability(model: Model, rival: Model) -> float:
 
 
 def explained(before: float, after: float, floor: float) -> float:
-    """Share of the squared gap that effects close: the rest may be of something that
-    they stand in for."""
+    """How far to trust that effects are what they seem, by the share of the gap that
+    they close: the rest may be of something that they stand in for.
+
+    Squared, which is what makes the confidence come true (`benchmarks.gap`).
+    """
     if after <= GOAL * floor:
         return 1.0
-    left = (after**2 - floor**2) / max(before**2 - floor**2, after**2 - floor**2)
-    return 1.0 - left
+    left = (after - floor) / max(before - floor, after - floor)
+    return (1.0 - left) ** 2

@@ -177,6 +177,8 @@ class Selector:
             size = np.concatenate([self.bounds.size[base.fit.active], np.abs(step)])
             end = ask[0].copy()
             end[index] += move * size
+            if c.place.effect == "torque_ripple":
+                end[cols] = as_sine(ask[0][cols], end[cols])
             # Not the others: a force limit that is off lies outside its bounds.
             end[index] = np.clip(
                 end[index], self.bounds.low[index], self.bounds.high[index]
@@ -247,6 +249,13 @@ class Selector:
                 break
             model = best
         return model
+
+
+def as_sine(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Amplitude and phase where a step from a small sine of phase 0 leads: it is linear
+    in the sine's and the cosine's share, not in the phase."""
+    cosine = start[0] * (end[1] - start[1])
+    return np.array([np.hypot(end[0], cosine), np.arctan2(cosine, end[0])])
 
 
 def shortlist(screened: Sequence[tuple[float, Candidate]]) -> list[Candidate]:

@@ -40,9 +40,18 @@ def _effects(
         first, second = drawn
         alike = f"{second.name}@{second.at}" in twins(machine, first)
         frictions = {first.name, second.name} <= FRICTIONS and first.at == second.at
-        if alike or frictions:
+        if alike or frictions or is_one_spring(machine, first, second):
             raise CaseError("the two are one")
     return drawn
+
+
+def is_one_spring(machine: Mechanism, first: Effect, second: Effect) -> bool:
+    """Whether one is a spring and the other moves where it rests."""
+    for spring, force in ((first, second), (second, first)):
+        names = {f"{force.name}@{force.at}", *twins(machine, force)}
+        if spring.name == "joint_stiffness" and f"constant_force@{spring.at}" in names:
+            return True
+    return False
 
 
 def _recipe(

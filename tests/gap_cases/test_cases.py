@@ -9,7 +9,7 @@ import pytest
 
 from tests.gap_cases import CaseError, Effect, Stated, draw_case, make_case
 from tests.gap_cases.commands import Deadband, Delayed, Dropped, Gain, Lag
-from tests.gap_cases.draw import CASE_KINDS
+from tests.gap_cases.draw import CASE_KINDS, is_one_spring
 from tests.gap_cases.effects import KINDS, OUTSIDE
 from tests.gap_cases.gap import half_width, measure, slope
 from tests.gap_cases.logs import Log, Noise
@@ -470,6 +470,14 @@ def test_every_effect_has_a_place_and_a_strength() -> None:
         model = mujoco.MjModel.from_xml_string(machine.xml())
         assert model.nq == len(machine.joints)
         assert model.nu == len(machine.driven)
+
+
+def test_a_spring_and_what_moves_its_rest_are_one() -> None:
+    machine, spring = carriage(), Effect("joint_stiffness", "slider")
+    for one in (Effect("constant_force", "carriage"), Effect("gravity_tilt", "")):
+        assert is_one_spring(machine, spring, one)
+        assert is_one_spring(machine, one, spring)
+    assert not is_one_spring(machine, spring, Effect("coulomb_friction", "slider"))
 
 
 def test_twins_of_a_slide() -> None:

@@ -31,7 +31,7 @@ from easi_jax.gap.places import places, ripples
 from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.residuals import make_residuals, start_sensitivity, step_groups
 from easi_jax.gap.scales import scales_of
-from easi_jax.gap.selection import Selector, shortlist
+from easi_jax.gap.selection import Selector, as_sine, shortlist
 from easi_jax.gap.table import EFFECTS, Place
 from easi_jax.gap.velocities import velocity_lags
 from easi_jax.gap.window_set import window_set
@@ -405,9 +405,29 @@ def test_what_acts_in_few_windows_is_judged_in_those(
     assert not better(worse, base, 0.1), "mends some windows and spoils others"
 
 
+def test_a_step_from_a_small_sine_leads_to_the_right_phase() -> None:
+    """Least squares in a sine's amplitude and phase is linear in its two shares."""
+    angle = np.linspace(0.0, 5.0, 50)
+    wanted = 0.8 * np.sin(angle + 2.2)
+    start = np.array([0.05, 0.0])
+    slope = np.stack([np.sin(angle), 0.05 * np.cos(angle)], 1)
+    step = np.linalg.lstsq(slope, wanted - 0.05 * np.sin(angle), rcond=None)[0]
+    np.testing.assert_allclose(as_sine(start, start + step), [0.8, 2.2], rtol=1e-6)
+
+
+def test_a_bias_may_be_as_large_as_the_motion(
+    model: mujoco.MjModel, runs: list[Run]
+) -> None:
+    s = scales_of(model, runs)
+    for p in places(model, s):
+        if p.effect == "sensor_bias":
+            (column,) = p.columns
+            assert column.high == -column.low >= s.position[column.index[0]]
+
+
 def test_confidence_falls_with_what_is_left() -> None:
     assert explained(1.0, 0.12, 0.1) == 1.0
-    assert explained(1.0, 0.5, 0.1) == pytest.approx(1 - 0.24 / 0.99)
+    assert explained(1.0, 0.5, 0.1) == pytest.approx((1 - 0.4 / 0.9) ** 2)
     assert explained(0.1, 0.5, 0.1) == 0.0
 
 
