@@ -65,6 +65,7 @@ def identifiers() -> dict[str, Callable[[Cell], Any]]:
         Dropo,
         Easi,
         MujocoSysid,
+        NeuralPosterior,
         PairedCmaEs,
         RandomSearch,
         SimOpt,
@@ -83,6 +84,7 @@ def identifiers() -> dict[str, Callable[[Cell], Any]]:
         "DROPO": lambda _: Dropo(),
         "random search": lambda _: RandomSearch(),
         "mujoco.sysid": lambda _: MujocoSysid(),
+        "NPE": lambda _: NeuralPosterior(),
     }
 
 
@@ -101,7 +103,8 @@ def learners() -> dict[str, Callable[[Cell], Any]]:
 METHODS = (
     *("UDR", "Oracle", "FineTune", "FineTune, no random actions", "GARAT"),
     *("EASI paper", "EASI default", "EASI default, not refined"),
-    *("SimOpt", "CMA-ES", "DROPO", "random search", "mujoco.sysid"),
+    *("SimOpt", "CMA-ES", "DROPO", "random search"),
+    *("mujoco.sysid", "NPE"),
 )
 
 

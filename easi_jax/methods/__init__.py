@@ -7,6 +7,7 @@ key)``; the published settings and their source are in its docstring.
 from easi_jax.methods.dropo import Dropo
 from easi_jax.methods.easi import Easi
 from easi_jax.methods.garat import Garat
+from easi_jax.methods.npe import NeuralPosterior
 from easi_jax.methods.paired import PairedCmaEs, RandomSearch
 from easi_jax.methods.policies import FineTune, Learned, Oracle, PolicyMethod, Practice
 from easi_jax.methods.simopt import SimOpt
@@ -23,6 +24,7 @@ __all__ = [
     "Learned",
     "Method",
     "MujocoSysid",
+    "NeuralPosterior",
     "Oracle",
     "PairedCmaEs",
     "PolicyMethod",

@@ -10,7 +10,9 @@ import pytest
 
 from easi_jax.distribution import covariance
 from easi_jax.errors import UserError
-from easi_jax.methods import Budget, MujocoSysid, Task
+from easi_jax.methods import Budget, MujocoSysid, NeuralPosterior, Task
+from easi_jax.methods.npe import summary
+from easi_jax.methods.paired import some_pieces
 from easi_jax.methods.sysid import toolbox
 from easi_jax.rollout import measured
 from easi_jax.segments import Segments
@@ -82,3 +84,40 @@ def test_a_budget_that_buys_no_step_is_refused(
     needs_sysid()
     with pytest.raises(UserError, match="does not pay"):
         MujocoSysid().fit(task, demonstrations, Budget(1_000), jax.random.key(0))
+
+
+def test_npe_learns_the_posterior(task: Task, demonstrations: Segments) -> None:
+    needs("sbi", "torch")()
+    noisy = measured(demonstrations, NOISE, jax.random.key(2))
+    method = NeuralPosterior(pieces=4, horizon=10, density="mdn")
+    budget = Budget(16_000)
+    found = method.fit(replace(task, noise=NOISE), noisy, budget, jax.random.key(1))
+    error = log_ratios(task, found)
+    # The prior's mean is three times the truth, its spread a factor of e^0.4.
+    assert abs(error[0]) < 0.5 and abs(error[1]) < 1.0, error
+    assert found.simulated == 16_000
+    spread = np.sqrt(np.diag(covariance(found.distribution)))
+    assert (spread < 12.0**-0.5 + 0.1).all() and spread[0] < 0.5 * 12.0**-0.5
+
+
+def test_summary_is_of_all_steps_that_count(
+    task: Task, demonstrations: Segments
+) -> None:
+    pieces = some_pieces(demonstrations, 10, 4)
+    pieces = pieces.replace(weight=pieces.weight.at[0].set(0.0))
+    noise = jnp.zeros((4, 10, 4))
+    got = summary(task.machine, pieces, pieces.next_qpos, pieces.next_qvel, noise)
+    q = np.concatenate([pieces.qpos[:, None], pieces.next_qpos], 1)[1:]
+    v = np.concatenate([pieces.qvel[:, None], pieces.next_qvel], 1)[1:]
+    d = np.diff(np.concatenate([q, v], -1), axis=1).reshape(-1, 4)
+    a = np.asarray(pieces.ctrl[1:]).reshape(-1)
+    want = np.concatenate([(d * a[:, None]).mean(0), d.mean(0), d.var(0)])
+    np.testing.assert_allclose(got, want, rtol=1e-3, atol=1e-6)
+
+
+def test_missing_sbi_is_one_line(
+    task: Task, demonstrations: Segments, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("easi_jax.methods.npe.find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"easi-jax\[peers\]"):
+        NeuralPosterior().fit(task, demonstrations, BUDGET, jax.random.key(0))
