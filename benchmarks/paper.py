@@ -33,6 +33,7 @@ CHANGED = {
     "go2": "thigh_kp",
 }
 MUST = METHODS[:7]
+ON_HARDWARE = ("UDR", "EASI paper", "EASI default")
 SEARCHES = ("EASI paper", "EASI default, not refined")
 
 
@@ -41,7 +42,8 @@ class Config:
     """Runs the cells of one of the paper's tables or figures."""
 
     experiment: Annotated[str, tyro.conf.Positional]
-    """table1, table3, table4, table5, fig6."""
+    """table1, table2, table3, table4, table5, fig6, fig7; table2 is of cartpole's and
+    fig7 of go2's twin, simulations in place of hardware, whatever --robot says."""
     robot: str = "cartpole"
     """Built-in robot."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
@@ -64,7 +66,7 @@ class Config:
 
 def run(config: Config) -> None:
     """Runs the cells that are not there yet."""
-    from benchmarks.paper_cells import solve
+    from benchmarks import paper_cells, paper_twin
     from easi_jax.errors import UserError
     from easi_jax.io.versions import versions
 
@@ -82,7 +84,8 @@ def run(config: Config) -> None:
     for c in every[part - 1 :: parts]:
         if c.key in done:
             continue
-        row = solve(c, config.folder)
+        where = paper_twin if c.target == paper_twin.TWIN else paper_cells
+        row = where.solve(c, config.folder)
         row = {"key": c.key, **dataclasses.asdict(c), **row, "versions": versions()}
         add_row(config.out, row)
         told = f"return {row['return']:.1f}" if "return" in row else "identified"
@@ -143,6 +146,20 @@ def _fig6(config: Config, seed: int) -> list[Cell]:
     return _returns(config, seed, (0.25, 0.5, 2.0, 4.0))
 
 
+def _table2(config: Config, seed: int) -> list[Cell]:
+    """In the paper on a real Cartpole; here in a twin (`benchmarks.twin`)."""
+    return [
+        Cell(m, "cartpole", "twin", seed, trajectories=50)
+        for m in config.methods or ON_HARDWARE
+    ]
+
+
+def _fig7(config: Config, seed: int) -> list[Cell]:
+    """In the paper on a real Go2; here in a twin (`benchmarks.twin`)."""
+    methods = config.methods or ON_HARDWARE
+    return [Cell(m, "go2", "twin", seed, trajectories=1) for m in methods]
+
+
 def _table3(config: Config, seed: int) -> list[Cell]:
     target = f"{CHANGED[config.robot]}*0.5"
     found = [Cell("UDR", config.robot, target, seed)]
@@ -170,10 +187,12 @@ def _table5(config: Config, seed: int) -> list[Cell]:
 
 EXPERIMENTS = {
     "table1": _table1,
+    "table2": _table2,
     "table3": _table3,
     "table4": _table4,
     "table5": _table5,
     "fig6": _fig6,
+    "fig7": _fig7,
 }
 
 

@@ -19,8 +19,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from envs import make
-from envs.go2 import KNEE_REDUCTION, MOTOR, Commands
+from envs.go2 import KNEE_REDUCTION, MOTOR
 
 
 def _nothing(model: mujoco.MjModel) -> None:
@@ -171,16 +170,6 @@ _DIVERGED = (
 GAPS = {"cartpole": CARTPOLE, "go2": GO2}
 
 
-def walker(forward: float) -> Any:
-    """The Go2 of the paper's real experiment: 7 parameters, one forward command."""
-    still = (0.0, 0.0)
-    return make(
-        "go2",
-        parameters="real",
-        commands=Commands((forward, forward), still, still, 0.0),
-    )
-
-
 @dataclass
 class Episode:
     """A twin in motion.
@@ -217,7 +206,9 @@ class Twin:
         m.dof_damping[self._dof] += gap.viscous
         gap.change(m)
         mujoco.mj_setConst(m, mujoco.MjData(m))
-        self._own_friction = m.dof_frictionloss[self._dof].copy()
+        self._friction, self._limits = m.dof_frictionloss, m.actuator_forcerange
+        self._kinetic = m.dof_frictionloss[self._dof] + gap.kinetic
+        self._further = np.subtract(gap.static, gap.kinetic)
         self._rubs = bool(np.any(gap.static) or np.any(gap.kinetic))
         # MuJoCo has no speed limit: the model's is a clip, a motor's is its curve.
         self._clip = None
@@ -242,7 +233,7 @@ class Twin:
 
     def advance(self, episode: Episode, ctrl: np.ndarray) -> None:
         """One control step with ``ctrl (nu,)`` sent at its beginning."""
-        m, data, gap = self.model, episode.data, self.gap
+        data, gap = episode.data, self.gap
         whole, rest = self._late
         episode.sent.append(np.asarray(ctrl, float))
         episode.sent.popleft()
@@ -252,12 +243,11 @@ class Twin:
             data.ctrl[:] = episode.sent[-1 - whole - (part < rest)]
             speed = data.qvel[self._dof]
             if self._rubs:
-                fast = 1.0 - np.exp(-((speed / gap.stribeck) ** 2))
-                level = gap.static + (gap.kinetic - np.asarray(gap.static)) * fast
-                m.dof_frictionloss[self._dof] = self._own_friction + level
+                slow = np.exp(-((speed / gap.stribeck) ** 2))
+                self._friction[self._dof] = self._kinetic + self._further * slow
             if gap.motor is not None:
-                m.actuator_forcerange[:] = gap.motor.limits(speed)
-            mujoco.mj_step(m, data)
+                self._limits[:] = gap.motor.limits(speed)
+            mujoco.mj_step(self.model, data)
             if self._clip is not None:
                 np.clip(data.qvel, -self._clip, self._clip, out=data.qvel)
         if any(data.warning[w].number for w in _DIVERGED):

@@ -96,7 +96,7 @@ def play(
     episodes: int,
     steps: int,
     deterministic: bool = True,
-    start: Callable[[Any], EnvState] | None = None,
+    start: Callable[[jax.Array], EnvState] | None = None,
 ) -> Recording:
     """Episodes of a policy in the twin.
 
@@ -105,12 +105,13 @@ def play(
 
     Args:
         seed: of starts, actions and sensors; the same for every policy.
-        start: ``start(key) -> state``; the environment's reset where not given.
+        start: ``start(keys) -> states``, one for each of ``keys (episodes,)``; the
+            environment's reset where not given.
     """
     env = twin.env
-    begin = start or (lambda key: env.reset(env.model(), key))
+    begin = start or jax.vmap(lambda key: env.reset(env.model(), key))
     k_reset, k_act = jax.random.split(jax.random.key(seed))
-    true = jax.jit(jax.vmap(begin))(jax.random.split(k_reset, episodes))
+    true = jax.jit(begin)(jax.random.split(k_reset, episodes))
     starts = zip(*map(np.asarray, (true.physics.qpos, true.physics.qvel)), strict=True)
     bodies = [twin.start(qpos, qvel) for qpos, qvel in starts]
     rngs = np.random.default_rng(seed).spawn(episodes)
