@@ -17,28 +17,23 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.paper_cells import EPISODES, Cell, udr_run
+from benchmarks.paper_cells import Cell, udr_run
 
 TWIN = "twin"
 COMMAND = 1.4  # m/s, of the Go2's logs
 LOGGED = 2000  # control steps of them: 40 s
 TRIES = 20  # starts of the Go2 for its logs, if it falls
-COMMANDS = (0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6)  # m/s; training has up to 1 m/s
-TRACKED = (4, 500, 100)  # episodes a command, their steps, steps until speed counts
-JOINTS = ("hip", "thigh", "calf")
 _PRESETS = {"EASI paper": "paper", "EASI default": "default"}
-_WELCH = 200  # control steps of a piece: 0.25 Hz apart
-_HIGHEST = 10.0  # Hz
 
 
 def solve(cell: Cell, folder: Path) -> dict[str, Any]:
     """Runs a cell; trainings go on where they were stopped.
 
     Returns:
-        What `on_cartpole` or `on_go2` says of the policy in the twin; ``logged``
-        control steps; for EASI ``mean`` (SI) and unit-coordinate ``std`` of the
-        parameters, ``identify_s`` and, for the default, ``held_out`` open-loop errors;
-        ``seconds`` of this process.
+        What `balancing` or `tracking` (and `spectra`) say of the policy in the twin;
+        ``logged`` control steps; for EASI ``mean`` (SI) and unit-coordinate ``std`` of
+        the parameters, ``identify_s`` and, for the default, ``held_out`` open-loop
+        errors; ``seconds`` of this process.
 
     Raises:
         UserError: a method without a cell here.
@@ -46,6 +41,7 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
     import jax
 
     from benchmarks.twin import GAPS, Twin
+    from benchmarks.twin_measures import balancing, spectra, tracking
     from easi_jax.errors import UserError
     from envs import make
     from train._robots import load_udr
@@ -69,11 +65,13 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
         found = identified(cell, place, env, first, twin, logs)
         policy = trained(cell, place, env, found)
         row |= {k: v for k, v in found.items() if k not in ("unit_mean", "unit_cov")}
+    seed = 2 * cell.seed + 1  # other starts than those that were logged
     if cell.robot == "cartpole":
-        row |= on_cartpole(twin, policy, cell.seed)
+        row |= balancing(twin, policy, seed)
     else:
-        row |= on_go2(twin, policy, cell.seed)
-        row["spectrum"] = spectra(first, cell.seed, logs, found)
+        row |= tracking(twin, policy, seed)
+        theta = None if found is None else found["mean"]
+        row["spectrum"] = spectra(walker(), first, seed, LOGGED, logs, theta)
     return row | {"seconds": time.monotonic() - begun}
 
 
@@ -87,7 +85,7 @@ def record(twin: Any, policy: Any, cell: Cell) -> list[Any]:
     Go2: one walk at `COMMAND` by the policy's mode; where it falls it is set up again
     until the time is full, as people would, at most `TRIES` times.
     """
-    from benchmarks.twin_runs import play
+    from benchmarks.twin_runs import commanded, play
 
     env, seed = twin.env, 2 * cell.seed
     if cell.robot == "cartpole":
@@ -100,20 +98,6 @@ def record(twin: Any, policy: Any, cell: Cell) -> list[Any]:
         if left <= 0:
             break
     return logs
-
-
-def commanded(env: Any, forward: Any) -> Any:
-    """Starts of the Go2 with these commands [m/s], one for each key."""
-    import jax
-    import jax.numpy as jnp
-
-    def one(key: Any, command: Any) -> Any:
-        state = env.reset(env.model(), key)
-        memory = state.memory._replace(command=jnp.array([1.0, 0, 0]) * command)
-        obs = env.observe(state.physics, memory)
-        return dataclasses.replace(state, memory=memory, obs=obs)
-
-    return lambda keys: jax.vmap(one)(keys, jnp.asarray(forward, jnp.float32))
 
 
 def walker() -> Any:
@@ -138,6 +122,7 @@ def identified(
         ``names``; ``mean`` in SI, ``std``, ``unit_mean``, ``unit_cov`` in unit
         coordinates of the preset's space; ``identify_s``; ``held_out`` where known.
     """
+    from benchmarks.twin_measures import rounded
     from easi_jax.io.files import atomic_write, read_json, to_json
 
     path = place / "found.json"
@@ -162,6 +147,7 @@ def _by_command(
     cell: Cell, place: Path, env: Any, policy: Any, twin: Any, logs: list[Any]
 ) -> dict[str, Any]:
     """``train.easi --data``, as for logs of a real machine."""
+    from benchmarks.twin_measures import rounded
     from easi_jax.io.files import read_json
     from easi_jax.io.logs import write_log
     from easi_jax.io.parameter_file import write_parameter_file
@@ -243,11 +229,7 @@ def _flat(x: Any) -> Any:
 
 
 def trained(cell: Cell, place: Path, env: Any, found: dict[str, Any]) -> Any:
-    """The policy of a whole training under what was found, in chunks.
-
-    Parameters that were not searched (the Go2's ground friction) keep the middle and
-    the spread that UDR has, so that nothing else differs from UDR's training.
-    """
+    """The policy of a whole training under what was found, in chunks."""
     import jax
     import jax.numpy as jnp
 
@@ -261,9 +243,7 @@ def trained(cell: Cell, place: Path, env: Any, found: dict[str, Any]) -> Any:
     training = quiet(training_config(env, cell.env_steps))
     search = search_config(_PRESETS[cell.method], cell.settings)
     pipe = Pipeline(env, PipelineConfig(search=search, training=training))
-    at = [pipe.space.names.index(name) for name in found["names"]]
-    mean, cov = np.full(pipe.space.size, 0.5), np.eye(pipe.space.size) / 12
-    mean[at], cov[np.ix_(at, at)] = found["unit_mean"], found["unit_cov"]
+    mean, cov = whole(pipe.space, found)
     dist = pipe.spread(distribution.gaussian(pipe.space, mean, cov), 1)
     nominal = jnp.asarray(env.space.nominal, jnp.float32)
     step = jit_chunks(lambda s, d, theta, n: pipe.train_chunk(s, d, theta, n))
@@ -286,136 +266,13 @@ def trained(cell: Cell, place: Path, env: Any, found: dict[str, Any]) -> Any:
     return jax.tree.map(lambda x: x[0], pipe.policies(states))
 
 
-# -- tests in the twin -------------------------------------------------------
+def whole(space: Any, found: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of what was found, over all of the robot's parameters.
 
-
-def on_cartpole(twin: Any, policy: Any, seed: int) -> dict[str, Any]:
-    """Table 2's errors over `EPISODES` episodes of the policy's mode in the twin.
-
-    Returns:
-        ``angle_error`` [0.01 rad] and ``speed`` [0.1 m/s], mean sizes of the pole's
-        angle and the cart's velocity over all steps; ``return``; ``fallen`` episodes,
-        which end and then count in the return alone.
+    Those that were not searched (the Go2's ground friction) keep the middle and the
+    spread that UDR has, so that nothing else differs from UDR's training.
     """
-    from benchmarks.twin_runs import play
-
-    got = play(twin, policy, 2 * seed + 1, EPISODES, twin.env.episode_length)
-    angle, speed = np.abs(got.true_qpos[:, 1:, 1]), np.abs(got.true_qvel[:, 1:, 0])
-    return {
-        "angle_error": float(angle[got.alive].mean() / 1e-2),
-        "speed": float(speed[got.alive].mean() / 1e-1),
-        "return": float(got.returns.mean()),
-        "fallen": int(got.fallen.sum()),
-    }
-
-
-def on_go2(twin: Any, policy: Any, seed: int) -> dict[str, Any]:
-    """Fig. 7b: speed over forward commands, of the policy's mode in the twin.
-
-    Returns:
-        ``commands`` [m/s]; ``speed`` mean and ``speed_std`` over the episodes that did
-        not fall, None where all did; ``fallen`` of each command's; ``tracking_error``,
-        RMS over all that stood [m/s]; ``return`` of all episodes.
-    """
-    import jax
-
-    from benchmarks.twin_runs import play
-    from envs.frames import matrix
-
-    episodes, steps, settled = TRACKED
-    commands = np.repeat(COMMANDS, episodes)
-    start = commanded(twin.env, commands)
-    got = play(twin, policy, 2 * seed + 1, len(commands), steps, True, start)
-    rotation = np.asarray(jax.vmap(jax.vmap(matrix))(got.true_qpos[..., 3:7]))
-    forward = np.einsum("btw,btw->bt", rotation[..., 0], got.true_qvel[..., :3])
-    speed = forward[:, settled:].mean(1).reshape(-1, episodes)
-    stood = ~got.fallen.reshape(-1, episodes)
-    error = (speed - np.reshape(commands, speed.shape))[stood]
-    each = [v[s] for v, s in zip(speed, stood, strict=True)]
-    return {
-        "commands": COMMANDS,
-        "speed": [rounded(v.mean()) if len(v) else None for v in each],
-        "speed_std": [rounded(v.std()) if len(v) else None for v in each],
-        "fallen": (~stood).sum(1).tolist(),
-        "tracking_error": rounded(np.sqrt(np.mean(error**2))) if error.size else None,
-        "return": float(got.returns.mean()),
-    }
-
-
-def spectra(
-    policy: Any, seed: int, logs: list[Any], found: dict[str, Any] | None
-) -> dict[str, Any]:
-    """Fig. 7a: joint motion of the UDR policy at `COMMAND`, twin and simulation.
-
-    The simulation is nominal before identification (``found`` None), at EASI's mean
-    after; the same policy walks as long in it as in the twin.
-
-    Returns:
-        ``frequency`` [Hz]; for ``twin`` and ``simulation`` the amplitude density
-        [rad / sqrt(Hz)] of each kind of joint, over four legs; ``distance_db``, RMS of
-        their ratio; None where one fell too soon.
-    """
-    import jax
-    import jax.numpy as jnp
-
-    from easi_jax.rl.networks import act
-    from easi_jax.rollout import policy_rollout
-
-    env = walker()
-    theta = env.space.nominal if found is None else found["mean"]
-    walked = jax.jit(
-        lambda policy, theta, key: policy_rollout(
-            env,
-            env.model(theta),
-            lambda obs, k: act(policy, obs, k, True),
-            key,
-            LOGGED,
-        )
-    )(policy, jnp.asarray(theta, jnp.float32), jax.random.key(2 * seed))
-    frequency, twin = spectrum([log.qpos[0, : log.steps[0], 7:] for log in logs])
-    alone = np.asarray(walked.qpos)[: int(walked.weight.sum()), 7:]
-    _, simulated = spectrum([alone])
-    distance = None
-    if twin is not None and simulated is not None:
-        ratio = 20 * np.log10(simulated / twin)
-        distance = rounded(np.sqrt(np.mean(ratio**2)))
-
-    def told(s: Any) -> Any:
-        return None if s is None else dict(zip(JOINTS, rounded(s), strict=True))
-
-    return {
-        "frequency": rounded(frequency),
-        "twin": told(twin),
-        "simulation": told(simulated),
-        "distance_db": distance,
-    }
-
-
-def spectrum(joints: list[Any]) -> tuple[Any, Any]:
-    """Amplitude density by frequency and kind of joint (Welch, Hann windows of 4 s).
-
-    Args:
-        joints: angles of walks at 50 Hz, ``(T, 12)`` each; the first two seconds, and
-            walks with nothing beyond one window after them, are left out.
-
-    Returns:
-        Frequencies ``(F,)`` [Hz]; ``(3, F)`` [rad / sqrt(Hz)], None without a walk.
-    """
-    from scipy.signal import welch
-
-    frequency = np.fft.rfftfreq(_WELCH, 0.02)
-    kept = (frequency > 0) & (frequency <= _HIGHEST)
-    long = [q[100:] for q in joints if len(q) >= 100 + _WELCH]
-    if not long:
-        return frequency[kept], None
-    power = [welch(q, 50.0, nperseg=_WELCH, axis=0)[1] for q in long]
-    mean = np.average(power, axis=0, weights=[len(q) for q in long])
-    kinds = mean[kept].reshape(-1, 4, len(JOINTS)).mean(1)
-    return frequency[kept], np.sqrt(kinds.T)
-
-
-def rounded(x: Any) -> Any:
-    """Numbers, in lists of lists, with four digits."""
-    if np.ndim(x):
-        return [rounded(v) for v in x]
-    return float(f"{float(x):.4g}")
+    at = [space.names.index(name) for name in found["names"]]
+    mean, cov = np.full(space.size, 0.5), np.eye(space.size) / 12
+    mean[at], cov[np.ix_(at, at)] = found["unit_mean"], found["unit_cov"]
+    return mean, cov

@@ -142,6 +142,18 @@ def play(
     return Recording(*measured, ctrl, reward, counts, env.dt)
 
 
+def commanded(env: Any, forward: Any) -> Callable[[jax.Array], EnvState]:
+    """Starts of the Go2 with these commands [m/s], one for each key."""
+
+    def one(key: jax.Array, command: jax.Array) -> EnvState:
+        state = env.reset(env.model(), key)
+        memory = state.memory._replace(command=jnp.array([1.0, 0, 0]) * command)
+        obs = env.observe(state.physics, memory)
+        return replace(state, memory=memory, obs=obs)
+
+    return lambda keys: jax.vmap(one)(keys, jnp.asarray(forward, jnp.float32))
+
+
 class _Rows(NamedTuple):
     qpos: np.ndarray
     qvel: np.ndarray
