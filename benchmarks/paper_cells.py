@@ -405,7 +405,7 @@ def udr_run(cell: Cell, folder: Path) -> Path:
                 out=out,
                 seeds=(cell.seed,),
                 env_steps=cell.env_steps,
-                overwrite=True,
+                resume=True,
             )
         )
     return out
