@@ -175,8 +175,22 @@ for direction in told.undetermined:
     print(describe(direction))
 
 # %% [markdown]
-# So the test of a result is not the distance of parameters but prediction: open loop
-# over 0.2 s, on fresh episodes that no search has seen.
+# So a value by itself may be off and the simulation still right. What motion does show
+# is ratios, such as the drive's stiffness against the cart's mass; whoever weighs the
+# cart then knows all the others.
+
+# %%
+kp, mass = names.index("cart_kp"), names.index("cart_mass")
+stiffness = {
+    label: float(values[kp] / values[mass])
+    for label, values in (("model", nominal), ("found", center), ("machine", target))
+}
+for label, ratio in stiffness.items():
+    print(f"{label:8} {ratio:.2f} N/m per kg of cart")
+
+# %% [markdown]
+# The test of a result is prediction: open loop over 0.2 s, on fresh episodes that no
+# search has seen.
 
 # %%
 fresh = demonstrate(policies["UDR"], target, keys["evaluate"])
