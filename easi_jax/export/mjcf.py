@@ -1,5 +1,6 @@
 """An identified machine as MJCF that plain MuJoCo loads."""
 
+import re
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,6 +49,8 @@ def identified_xml(
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.xml"
         mujoco.mj_saveLastXML(str(path), model)
+        # MuJoCo writes it and then warns that it is of no use.
+        path.write_text(re.sub(r'\s*meaninertia="[^"]*"', "", path.read_text()))
         text, left = repaired_xml(path, entries, {})
     return text, [*lost, *left]
 

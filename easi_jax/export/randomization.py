@@ -162,8 +162,10 @@ def domain_randomizer(path: Path | str, mj_model: mujoco.MjModel) -> Randomizer:
         model = with_parameters(base, given.draw(key)).mjx
         return {name: _leaf(model, name) for name in names}
 
+    drawn = jax.jit(jax.vmap(one))
+
     def randomize(model: Any, keys: jax.Array) -> tuple[Any, Any]:
-        values = jax.vmap(one)(keys)
+        values = drawn(keys)
         axes = jax.tree.map(lambda _: None, model)
         return (
             model.tree_replace(values),

@@ -1,0 +1,180 @@
+"""Exported parameters: the model moves as identified, randomization has its spread."""
+
+import dataclasses
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from mujoco import mjx
+
+from easi_jax import distribution
+from easi_jax.errors import UserError
+from easi_jax.export.mjcf import identified_xml
+from easi_jax.export.randomization import (
+    domain_randomizer,
+    read_randomization,
+    to_yaml,
+)
+from easi_jax.found_effects import EffectEntry
+from easi_jax.in_mujoco import InMujoco
+from easi_jax.machine import Machine
+from easi_jax.parameters import ParameterSpace, declare
+from envs import make
+from train._results import distribution_json, seed_result
+
+FRICTION = EffectEntry("coulomb_friction", "pole", "joint", {"coulomb": 0.05}, {})
+LATE = EffectEntry("sensor_delay", "cart", "joint", {"late": 0.01}, {})
+
+
+def source(robot: str) -> Path:
+    return Path(str(resources.files("envs") / "assets" / f"{robot}.xml"))
+
+
+def moved(m: mujoco.MjModel, seed: int = 0) -> np.ndarray:
+    rng, d = np.random.default_rng(seed), mujoco.MjData(m)
+    d.qpos[:] = m.key_qpos[0] if m.nkey else m.qpos0
+    d.qvel[:] = rng.uniform(-0.5, 0.5, m.nv)
+    rows = []
+    for _ in range(60):
+        d.ctrl[:] = rng.uniform(*m.actuator_ctrlrange.T)
+        mujoco.mj_step(m, d, 2)
+        rows.append(np.concatenate([d.qpos, d.qvel]))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("robot", ["cartpole", "ant", "ballbalance", "go2"])
+def test_the_model_moves_as_identified(robot: str, tmp_path: Path) -> None:
+    env = make(robot)
+    unit = np.random.default_rng(0).uniform(0.2, 0.8, env.space.size)
+    theta = np.asarray(env.space.to_si(unit), float)
+    text, lost = identified_xml(source(robot), env.machine, theta)
+    assert lost == (["cart_speed_limit"] if robot == "cartpole" else [])
+    (tmp_path / "model.xml").write_text(text)
+    got = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    want = InMujoco(env.machine).at(np.asarray(env.space.to_unit(theta), float))
+    given = mujoco.MjModel.from_xml_path(str(source(robot)))
+    given.opt.timestep = want.opt.timestep
+    np.testing.assert_allclose(moved(got)[:20], moved(want)[:20], atol=2e-3)
+    assert np.abs(moved(given) - moved(want))[:20].max() > 2e-2
+
+
+def test_effects_are_in_the_model_where_mjcf_has_a_word() -> None:
+    env = make("cartpole")
+    theta = np.asarray(env.space.nominal, float)
+    text, lost = identified_xml(
+        source("cartpole"), env.machine, theta, [FRICTION, LATE]
+    )
+    assert lost == ["cart_speed_limit", "sensor_delay@cart"]
+    m = mujoco.MjModel.from_xml_string(text)
+    own = theta[env.space.names.index("pole_friction")]
+    assert m.joint("pole").frictionloss[0] == pytest.approx(own + 0.05, rel=1e-4)
+
+
+def test_a_foreign_model_is_refused() -> None:
+    env = make("cartpole")
+    with pytest.raises(UserError, match="not the model"):
+        identified_xml(source("ant"), env.machine, np.asarray(env.space.nominal))
+
+
+def found(space: ParameterSpace, mean: Any, cov: Any) -> dict[str, Any]:
+    result = seed_result(space, mean, cov, np.eye(space.size))
+    return distribution_json(space, [3], [result])
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory) -> tuple[ParameterSpace, Any, Path]:
+    """Three of Cartpole's parameters, two of them correlated; one is linear."""
+    m = make("cartpole").mj_model
+    space = ParameterSpace(
+        (
+            declare(m, "cart_kp", "actuator.cart.kp"),
+            declare(m, "pole_mass", "body.pole.mass", bounds=(0.01, 1.0)),
+            declare(m, "damping", "joint.pole.damping", initial=(0, 0.01), log=False),
+        )
+    )
+    mean = np.array([0.4, 0.6, 0.3])
+    root = np.array([[0.05, 0.0, 0.0], [0.04, 0.02, 0.0], [0.0, 0.0, 0.03]])
+    path = tmp_path_factory.mktemp("random") / "randomization.yaml"
+    path.write_text(to_yaml(found(space, mean, root @ root.T), "3", "cartpole"))
+    return space, distribution.gaussian(space, mean, root @ root.T), path
+
+
+def test_draws_are_those_of_the_distribution(given) -> None:
+    space, dist, path = given
+    read = read_randomization(path)
+    keys = jax.random.split(jax.random.key(0), 20_000)
+    ours = np.asarray(jax.vmap(lambda k: distribution.draw(space, dist, k))(keys))
+    theirs = np.asarray(jax.vmap(read.draw)(keys))
+    np.testing.assert_allclose(theirs.mean(0), ours.mean(0), rtol=0.01)
+    spread = ours.std(0)  # covariances in units of it
+    got, want = (np.cov((x / spread).T) for x in (theirs, ours))
+    np.testing.assert_allclose(got, want, atol=0.03)
+
+
+def test_draws_stay_inside_the_bounds(given) -> None:
+    read = read_randomization(given[2])
+    middle = np.exp(read.mean[1])
+    bounds = read.bounds.copy()
+    bounds[:, 1] = 0.999 * middle, 1.001 * middle
+    tight = dataclasses.replace(read, bounds=bounds)
+    keys = jax.random.split(jax.random.key(0), 100)
+    drawn = np.asarray(jax.vmap(tight.draw)(keys))[:, 1]
+    np.testing.assert_allclose([drawn.min(), drawn.max()], bounds[:, 1], rtol=1e-5)
+
+
+def test_brax_and_playground_take_the_function(given) -> None:
+    """A batched model and its axes; only what is randomized has an axis."""
+    space, _, path = given
+    m = make("cartpole").mj_model
+    randomize = domain_randomizer(path, m)
+    model = mjx.put_model(m, impl="jax")
+    keys = jax.random.split(jax.random.key(1), 6)
+    batched, axes = randomize(model, keys)
+    drawn = np.asarray(jax.vmap(read_randomization(path).draw)(keys))
+    np.testing.assert_allclose(
+        batched.actuator_gainprm[:, 0, 0], drawn[:, 0], rtol=1e-5
+    )
+    body = m.body("pole").id
+    np.testing.assert_allclose(batched.body_mass[:, body], drawn[:, 1], rtol=1e-5)
+    each = jax.tree.leaves(axes, is_leaf=lambda x: x is None)
+    assert 0 < each.count(0) < 0.2 * len(each)
+
+    def fell(model: Any) -> jax.Array:
+        d = mjx.make_data(model).replace(qpos=jnp.array([0.0, 0.3]))
+        return jax.lax.fori_loop(0, 20, lambda _, d: mjx.step(model, d), d).qpos
+
+    ends = jax.jit(jax.vmap(fell, in_axes=(axes,)))(batched)
+    assert len(np.unique(np.asarray(ends)[:, 1])) == 6
+    assert space.size == 3
+
+
+def test_what_mjx_leaves_out_is_said(given, tmp_path: Path) -> None:
+    _, _, path = given
+    m = make("cartpole").mj_model
+    text = path.read_text().replace("joint.pole.damping", "joint.pole.frictionloss")
+    (tmp_path / "other.yaml").write_text(text)
+    domain_randomizer(tmp_path / "other.yaml", m)
+    m.dof_frictionloss[:] = 0.0
+    with pytest.raises(UserError, match="leaves it out"):
+        domain_randomizer(tmp_path / "other.yaml", m)
+    m.dof_frictionloss[:] = 0.01
+
+
+@pytest.mark.parametrize("text", ["", "parameters: 3", "parameters: [{name: a}]"])
+def test_a_file_of_another_form_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "bad.yaml").write_text(text)
+    with pytest.raises(UserError, match=r"bad\.yaml"):
+        read_randomization(tmp_path / "bad.yaml")
+
+
+def test_a_machine_without_the_address_is_refused(given) -> None:
+    _, _, path = given
+    other = make("ballbalance").mj_model
+    with pytest.raises(UserError):
+        domain_randomizer(path, other)
+    assert Machine(make("cartpole").mj_model, given[0], 0.02).space.size == 3
