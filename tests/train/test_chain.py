@@ -5,15 +5,21 @@ import re
 import shutil
 from pathlib import Path
 
+import jax
+import mujoco
 import numpy as np
+import onnxruntime
 import pytest
+import yaml
 from PIL import Image
 
 from easi_jax.errors import UserError
 from easi_jax.io.video import render
+from easi_jax.rl.networks import act
 from envs import make
 from tests.commands import command, refused
-from train import easi, evaluate, pipeline, udr
+from train import easi, evaluate, export, pipeline, udr
+from train._robots import load_policies
 
 # The whole chain is compiled here; on a busy machine that takes its time.
 pytestmark = pytest.mark.timeout(1500)
@@ -203,3 +209,56 @@ def test_bad_settings_leave_the_earlier_run(chain: Path, capsys) -> None:
     line = refused(capsys, udr, "--out", chain / "udr", "--robot", "cartpole")
     assert "--resume" in line and "--overwrite" in line
     assert (chain / "udr" / "results.json").read_bytes() == before
+
+
+def test_export_writes_all_that_a_run_has(chain: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "export"
+    command(export, chain / "easi", "--out", out)
+    assert "cart_speed_limit: not in model.xml" in capsys.readouterr().out
+    assert {p.name for p in out.iterdir()} == {
+        *("policy.onnx", "policy.json", "policy.stablehlo", "policy.mlir"),
+        *("model.xml", "randomization.yaml"),
+    }
+    found = json.loads((chain / "easi" / "distribution.json").read_text())
+    names = [p["name"] for p in found["parameters"]]
+    mean = dict(zip(names, found["seeds"]["0"]["mean"], strict=True))
+    m = mujoco.MjModel.from_xml_path(str(out / "model.xml"))
+    assert m.actuator("cart").gainprm[0] == pytest.approx(mean["cart_kp"], rel=1e-4)
+    drawn = yaml.safe_load((out / "randomization.yaml").read_text())
+    entry = next(p for p in drawn["parameters"] if p["name"] == "cart_kp")
+    assert entry["mean"] == pytest.approx(mean["cart_kp"], rel=1e-4)
+
+    policy = load_policies(chain / "easi")["policies"]
+    obs = np.random.default_rng(0).normal(0, 0.2, (100, 4)).astype(np.float32)
+    want = act(jax.tree.map(lambda x: x[0], policy), obs, deterministic=True)
+    session = onnxruntime.InferenceSession(out / "policy.onnx")
+    got = session.run(["action"], {"observation": obs})[0]
+    np.testing.assert_allclose(got, want, atol=1e-5)
+
+
+def test_export_of_a_policy_alone(chain: Path, tmp_path: Path) -> None:
+    command(export, chain / "udr", "--to", "onnx", "--out", tmp_path)
+    assert {p.name for p in tmp_path.iterdir()} == {"policy.onnx", "policy.json"}
+    told = json.loads((tmp_path / "policy.json").read_text())
+    assert told["observation"] == ["x", "v", "angle", "rate"]
+    assert told["method"] == "UDR" and told["ctrl"] == ["cart"] and told["dt"] == 0.02
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["udr", "--to", "mjcf"], "no identified parameters"),
+        (["udr", "--to", "onxx"], "did you mean"),
+        (["easi", "--seed", "7"], "--seed 7"),
+        (["easi", "--method", "Oracle"], "has no policy"),
+        (["nothing"], "holds no run"),
+    ],
+)
+def test_export_says_what_is_wrong(
+    chain: Path, words: list[str], said: str, tmp_path: Path, capsys
+) -> None:
+    line = refused(
+        capsys, export, chain / words[0], *words[1:], "--out", tmp_path / "out"
+    )
+    assert said in line
+    assert not (tmp_path / "out").exists()
