@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import mujoco
 import numpy as np
 
@@ -213,7 +214,7 @@ class Twin:
         # MuJoCo has no speed limit: the model's is a clip, a motor's is its curve.
         self._clip = None
         if gap.motor is None:
-            self._clip = np.asarray(env.model().speed_limit, float)
+            self._clip = np.asarray(jax.jit(lambda: env.model().speed_limit)(), float)
         self._late = divmod(round(gap.delay / m.opt.timestep), self.parts)
         self._back = round(gap.window / m.opt.timestep)
         if self._back > self.parts:

@@ -24,6 +24,10 @@ ENVS = {"cartpole": make("cartpole"), "go2": make("go2")}
 HALF_SECOND = 25  # control steps
 
 
+def reset(env: Any, key: jax.Array) -> Any:
+    return jax.jit(lambda k: env.reset(env.model(), k))(key)
+
+
 GENTLE = {"cartpole": 0.15, "go2": 0.15}
 STRONG = {"cartpole": 0.2, "go2": 0.6}  # of 40 N m/rad: to the motors' limits
 
@@ -32,7 +36,7 @@ def begin(
     env: Any, size: dict[str, float] = GENTLE
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A start, and commands that change every 0.1 s."""
-    physics = env.reset(env.model(), jax.random.key(0)).physics
+    physics = reset(env, jax.random.key(0)).physics
     rng = np.random.default_rng(0)
     center = 0.0 if env.name == "cartpole" else env.mj_model.key_ctrl[0]
     ctrl = center + rng.uniform(-1, 1, (5, env.mj_model.nu)) * size[env.name]
@@ -54,10 +58,10 @@ def robot(request: pytest.FixtureRequest) -> Any:
     """An environment, its twin without a gap, and MJX from the same start."""
     env = ENVS[request.param]
     qpos, qvel, ctrl = begin(env)
-    step, model = jax.jit(env.machine.step), env.model()
+    step = jax.jit(lambda state, u: env.machine.step(env.model(), state, u))
     state, out = env.machine.start(jnp.asarray(qpos), jnp.asarray(qvel)), []
     for u in ctrl:
-        state = step(model, state, jnp.asarray(u, jnp.float32))
+        state = step(state, jnp.asarray(u, jnp.float32))
         out.append(np.asarray(state.qpos))
     return env, moved(env, Gap()), np.array(out)
 
@@ -192,7 +196,9 @@ def test_play_is_the_environments_own_episode(name: str) -> None:
     env.episode_length = 40
     keys = jax.random.split(jax.random.key(3), 6)
     resets = jax.vmap(jax.random.split, out_axes=1)(keys)[0]
-    ours = evaluate(env, env.model(), POLICIES[name], act, keys)
+    ours = jax.jit(lambda p, k: evaluate(env, env.model(), p, act, k))(
+        POLICIES[name], keys
+    )
     got = play(
         Twin(env, Gap(timestep=env.dt / env.machine.substeps)),
         POLICIES[name],
@@ -248,11 +254,11 @@ def test_the_same_seed_gives_the_same_starts(recorded: Any) -> None:
 def test_commands_reach_the_observation() -> None:
     env = ENVS["go2"]
     keys = jax.random.split(jax.random.key(0), 2)
-    state = commanded(env, [0.4, 1.4])(keys)
+    state = jax.jit(commanded(env, [0.4, 1.4]))(keys)
     np.testing.assert_allclose(state.obs[:, -3:], [[0.4, 0, 0], [1.4, 0, 0]], rtol=1e-6)
     walker = paper_twin.walker()
     assert walker.space.size == 7 and "ground_friction" not in walker.space.names
-    only = walker.reset(walker.model(), keys[0]).memory.command
+    only = reset(walker, keys[0]).memory.command
     np.testing.assert_allclose(only, [1.4, 0, 0], rtol=1e-6)
 
 
