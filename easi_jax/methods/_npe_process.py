@@ -6,8 +6,8 @@ Run by `easi_jax.methods.npe` as a file, so that nothing here imports jax.
 import sys
 
 import numpy as np
-import torch
-from sbi.inference import NPE
+import torch  # pyright: ignore[reportMissingImports]
+from sbi.inference import NPE  # pyright: ignore[reportMissingImports]
 
 
 def main(source: str, target: str) -> None:
