@@ -13,16 +13,15 @@ several processes or batch jobs share the work by ``--shard`` (the second of fou
 """
 
 import dataclasses
-import fcntl
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
+from benchmarks._cells import Share, run_cells
 from benchmarks.paper_cells import METHODS, Cell
 from benchmarks.paper_runtime import WAYS
-from train._command import main, say
+from train._command import main
 
 RESULTS = Path(__file__).parent / "results" / "paper.jsonl"
 
@@ -74,43 +73,20 @@ def run(config: Config) -> None:
     from benchmarks import paper_twin
     from benchmarks.paper_cells import solve
     from benchmarks.paper_runtime import timed
-    from easi_jax.errors import UserError
-    from easi_jax.io.versions import versions
 
-    every = cells(config)
-    if config.only:
-        every = [c for c in every if c.key == config.only]
-        if not every:
-            raise UserError(f'no cell "{config.only}": see --list')
-    part, parts = _shard(config.shard)
-    done = {row["key"] for row in read_rows(config.out)}
-    if config.list:
-        for c in every:
-            say(f"{'done' if c.key in done else 'open'}  {c.key}")
-        return
-    for c in every[part - 1 :: parts]:
-        if c.key in done:
-            continue
+    def result(c: Cell) -> dict[str, Any]:
         if c.method in WAYS:
-            row = timed(c)
-        elif c.target == paper_twin.TWIN:
-            row = paper_twin.solve(c, config.folder)
-        else:
-            row = solve(c, config.folder)
-        row = {"key": c.key, **dataclasses.asdict(c), **row, "versions": versions()}
-        add_row(config.out, row)
-        told = f"return {row['return']:.1f}" if "return" in row else "identified"
-        say(f"{c.key}: {told}, {row.get('seconds', row.get('identify_s', 0)):.0f} s")
+            return timed(c)
+        if c.target == paper_twin.TWIN:
+            return paper_twin.solve(c, config.folder)
+        return solve(c, config.folder)
 
+    def told(row: dict[str, Any]) -> str:
+        result = f"return {row['return']:.1f}" if "return" in row else "identified"
+        return f"{result}, {row.get('seconds', row.get('identify_s', 0)):.0f} s"
 
-def _shard(text: str) -> tuple[int, int]:
-    from easi_jax.errors import UserError
-
-    part, _, parts = text.partition("/")
-    good = part.isdigit() and parts.isdigit() and 1 <= int(part) <= int(parts)
-    if not good:
-        raise UserError(f"--shard {text}: write PART/PARTS, such as 2/4")
-    return int(part), int(parts)
+    share = Share(config.shard, config.only, config.list, config.out)
+    run_cells(cells(config), share, result, told)
 
 
 def cells(config: Config) -> list[Cell]:
@@ -246,21 +222,6 @@ EXPERIMENTS = {
     "appendix_a": _appendix_a,
     "runtime": _runtime,
 }
-
-
-def read_rows(path: Path) -> list[dict[str, Any]]:
-    """One a cell; none where the file is missing."""
-    if not path.is_file():
-        return []
-    return [json.loads(line) for line in path.read_text().splitlines()]
-
-
-def add_row(path: Path, row: dict[str, Any]) -> None:
-    """Adds a line; several processes may do so at once."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        file.write(json.dumps(row) + "\n")
 
 
 if __name__ == "__main__":

@@ -10,8 +10,9 @@ from pathlib import Path
 from statistics import mean, median, stdev
 from typing import Any
 
+from benchmarks._cells import read_rows
 from benchmarks._common import markdown_table
-from benchmarks.paper import CHANGED, MUST, SEARCHES, STARTS, read_rows
+from benchmarks.paper import CHANGED, MUST, SEARCHES, STARTS
 from benchmarks.paper_cells import METHODS
 from benchmarks.paper_runtime import WAYS
 

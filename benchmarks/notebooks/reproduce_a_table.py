@@ -19,6 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks import paper
+from benchmarks._cells import read_rows
 from benchmarks._common import markdown_table
 from benchmarks.paper_cells import METHODS, solve
 from easi_jax.io.versions import versions
@@ -70,7 +71,7 @@ print(*(cell.key for cell in cells), sep="\n")
 # jobs share the work.
 
 # %%
-done = {row["key"] for row in paper.read_rows(asked.out)}
+done = {row["key"] for row in read_rows(asked.out)}
 for cell in cells:
     if cell.key not in done:
         row = solve(cell, asked.folder)
@@ -96,7 +97,7 @@ PUBLISHED = {
     ("EASI", "cart_kp*0.5"): "182.9 ± 2.2",
 }
 keys = {cell.key for cell in cells}
-rows = [row for row in paper.read_rows(asked.out) if row["key"] in keys]
+rows = [row for row in read_rows(asked.out) if row["key"] in keys]
 targets = list(dict.fromkeys(row["target"] for row in rows))
 returns = {
     (method, target): [

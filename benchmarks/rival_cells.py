@@ -1,0 +1,216 @@
+"""Cells of the rivals' comparison: one robot, setting, method and seed each."""
+
+import dataclasses
+import time
+from typing import Any
+
+METHODS = (
+    *("EASI", "CMA-ES", "DROPO", "SimOpt"),
+    *("random search", "mujoco.sysid", "NPE"),
+)
+ROBOTS = ("cartpole", "arm6", "go2")
+SETTINGS = ("paired", "unpaired", "stochastic", "effect")
+
+_SPREAD = 1.5  # factor, at most, between a truth and the nominal values
+_LATE = 0.01  # s that commands are late where the target has an effect
+_STEPS = 32 * 25  # control steps that an individual replays, however they are cut
+_PIECE = 25  # control steps of a piece that information is counted on
+_REGION = 0.9
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """What is run once.
+
+    Attributes:
+        robot, setting, method: names in `ROBOTS`, `SETTINGS`, `METHODS`.
+        seed: of the truth, the recording and the method.
+        trajectories: recorded, of 200 control steps.
+        budget: control steps that may be simulated.
+    """
+
+    robot: str
+    setting: str
+    method: str
+    seed: int
+    trajectories: int
+    budget: int
+
+    @property
+    def key(self) -> str:
+        """One line that says it all, for files."""
+        return (
+            f"{self.method}, {self.robot}, {self.setting}, seed {self.seed}, "
+            f"{self.trajectories} trajectories, {self.budget} steps"
+        )
+
+    @property
+    def possible(self) -> bool:
+        """SimOpt needs an environment, and the controller."""
+        return self.method != "SimOpt" or (
+            self.robot == "cartpole" and self.setting != "unpaired"
+        )
+
+
+def method_of(cell: Cell) -> Any:
+    """The method; where only single transitions are known, it replays as many steps."""
+    from easi_jax.methods import (
+        Dropo,
+        Easi,
+        MujocoSysid,
+        NeuralPosterior,
+        PairedCmaEs,
+        RandomSearch,
+        SimOpt,
+    )
+
+    cut: dict[str, Any] = {}
+    if cell.setting == "unpaired":
+        cut = {"pieces": _STEPS, "horizon": 1}
+    known = {
+        "EASI": lambda: Easi(refine=True),
+        "CMA-ES": lambda: PairedCmaEs(**cut),
+        "DROPO": lambda: Dropo(),
+        "SimOpt": lambda: SimOpt(),
+        "random search": lambda: RandomSearch(**cut),
+        "mujoco.sysid": lambda: MujocoSysid(**cut),
+        "NPE": lambda: NeuralPosterior(**cut),
+    }
+    return known[cell.method]()
+
+
+def solve(cell: Cell) -> dict[str, Any]:
+    """Runs a cell.
+
+    Returns:
+        ``error``: RMS of the log ratio to the truth along the ``rank`` directions that
+        the data determine (`easi_jax.information`), None without any; ``start_error``:
+        that of the middle of where searches start; ``covered``: whether the truth is in
+        the found 90 % region of these directions; ``log_ratio`` and unit-coordinate
+        ``std`` of each parameter; ``seconds``; control steps ``simulated`` and, of the
+        real machine beyond the recording, ``measured``.
+    """
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from benchmarks.rigs import RIGS
+    from easi_jax.distribution import covariance
+    from easi_jax.methods import Budget
+
+    rig = RIGS[cell.robot]()
+    space = rig.machine.space
+    k_truth, k_record, k_noise, k_order, k_fit = jax.random.split(
+        jax.random.key(cell.seed), 5
+    )
+    away = jax.random.uniform(k_truth, (space.size,), minval=-1.0, maxval=1.0)
+    theta = jnp.asarray(space.nominal, jnp.float32) * _SPREAD**away
+    real = rig.late(_LATE) if cell.setting == "effect" else rig.machine
+    explore = 1.0 if cell.setting == "stochastic" else 0.0
+    task = rig.task(real, theta, explore)
+    demos = recorded(
+        rig, cell, real, theta, explore, task.noise, (k_record, k_noise, k_order)
+    )
+    information = fisher(task, demos, space.to_unit(theta))
+    begun = time.monotonic()
+    found = method_of(cell).fit(task, demos, Budget(cell.budget), k_fit)
+    found = jax.block_until_ready(found)
+    seconds = time.monotonic() - begun
+    mean, cov = np.asarray(found.distribution.mean), covariance(found.distribution)
+    truth = np.asarray(found.space.to_unit(theta))
+    start = score(space, information, np.full(space.size, 0.5), cov, truth)
+    return {
+        **score(found.space, information, mean, cov, truth),
+        "start_error": start["error"],
+        "log_ratio": ((mean - truth) * found.space.log_width).tolist(),
+        "std": np.sqrt(np.diag(cov)).tolist(),
+        "parameters": list(space.names),
+        "seconds": seconds,
+        "simulated": found.simulated,
+        "measured": found.measured,
+    }
+
+
+def recorded(
+    rig: Any,
+    cell: Cell,
+    real: Any,
+    theta: Any,
+    explore: float,
+    noise: Any,
+    keys: Any,
+) -> Any:
+    """What the sensors recorded, ``(B, T, 1, ...)``.
+
+    ``unpaired``: single transitions in any order, ``(B T, 1, 1, ...)``. A state, the
+    command and the next state still belong together; what came before and after, and
+    which controller it was, is not known.
+    """
+    import jax
+
+    from easi_jax.rollout import measured
+
+    def record(theta: Any, k_record: Any, k_noise: Any) -> Any:
+        clean = rig.record(real, theta, k_record, cell.trajectories, explore)
+        return measured(clean, noise, k_noise)
+
+    demos = jax.jit(record)(theta, *keys[:2])
+    if cell.setting != "unpaired":
+        return demos
+    count = demos.weight.size
+    order = jax.random.permutation(keys[2], count)
+    return jax.tree.map(lambda x: x.reshape(count, 1, *x.shape[2:])[order], demos)
+
+
+def fisher(task: Any, demos: Any, truth: Any) -> Any:
+    """Information of the recording at the true parameters, ``(n, n)``, as the model
+    without any effect has it."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from easi_jax.identify import effective_noise
+    from easi_jax.information import PairedFit
+    from easi_jax.refine import step_weights
+    from easi_jax.segments import windows
+
+    steps = min(_PIECE, demos.weight.shape[1])
+    pieces = windows(demos, steps, steps)
+
+    def information(truth: Any, pieces: Any) -> Any:
+        noise = effective_noise(task.machine, pieces, task.noise)
+        fit = PairedFit(task.machine, task.space, pieces, noise, task.mesh)
+        still = jnp.zeros((pieces.count, len(noise)))
+        return fit.normal(truth, still, step_weights(pieces, noise)).hessian
+
+    return np.asarray(jax.jit(information)(truth, pieces))
+
+
+def score(
+    space: Any, information: Any, mean: Any, cov: Any, truth: Any
+) -> dict[str, Any]:
+    """``error``, ``covered`` and ``rank``, along what the data determine.
+
+    Args:
+        mean, cov, truth: unit coordinates, ``(n,)``, ``(n, n)``, ``(n,)``.
+    """
+    import numpy as np
+    from scipy.stats import chi2
+
+    from easi_jax.information import identifiability
+
+    known = identifiability(space, information)
+    if not known.rank:
+        return {"error": None, "covered": None, "rank": 0}
+    hidden = known.null.shape[1]
+    # The rest of an orthonormal basis that begins with what is undetermined.
+    whole = np.linalg.qr(np.hstack([known.null, np.eye(space.size)]))[0]
+    seen = whole[:, hidden:].T * known.scale
+    off = seen @ (np.asarray(mean, float) - truth)
+    values, vectors = np.linalg.eigh(seen @ np.asarray(cov, float) @ seen.T)
+    far = (vectors.T @ off) ** 2 / np.maximum(values, 1e-14)
+    return {
+        "error": float(np.sqrt(np.mean(off**2))),
+        "covered": bool(far.sum() <= chi2.ppf(_REGION, known.rank)),
+        "rank": known.rank,
+    }

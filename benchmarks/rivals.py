@@ -1,0 +1,101 @@
+"""Identification at equal data and budget: EASI, its rivals and today's tools.
+
+    python -m benchmarks.rivals
+    python -m benchmarks.rivals --robots cartpole --settings paired --seeds 0 1 2
+    python -m benchmarks.rivals --shard 1/4
+    python -m benchmarks.rivals --list
+
+A cell is one robot, setting, method and seed. Each seed draws its own machine, every
+parameter within 1.5 times its nominal value either way; searches start within 3 times.
+All methods get the same recording, with sensor noise, and the same budget of simulated
+control steps (EASI's least-squares finish comes on top, and is in its seconds).
+``paired``: logged commands, deterministic ones. ``stochastic``: with exploration noise.
+``unpaired``: single transitions in any order, of an unknown controller. ``effect``:
+commands reach the target's drives 10 ms late, which no model has. Lines go to
+``results/rivals.jsonl``; a cell that has one is not run again. mujoco.sysid and NPE
+need ``pip install -e '.[peers]'``.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from benchmarks._cells import Share, run_cells
+from benchmarks.rival_cells import METHODS, ROBOTS, SETTINGS, Cell, solve
+from train._command import main
+
+RESULTS = Path(__file__).parent / "results" / "rivals.jsonl"
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Compares methods of identification at equal data."""
+
+    robots: tuple[str, ...] = ROBOTS
+    """cartpole, arm6, go2 (hung by its base)."""
+    settings: tuple[str, ...] = SETTINGS
+    """paired, unpaired, stochastic, effect."""
+    methods: tuple[str, ...] = METHODS
+    """Methods; SimOpt runs where it has an environment and the controller."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Seeds, paired over methods."""
+    trajectories: int = 40
+    """Recorded trajectories of 200 control steps."""
+    budget: int = 3_000_000
+    """Control steps that each method may simulate."""
+    shard: str = "1/1"
+    """Which part of the cells this process runs."""
+    only: str = ""
+    """One cell, by its name as --list shows it."""
+    list: bool = False
+    """Show the cells, and which are done, without running any."""
+    out: Path = RESULTS
+    """Where a line for each cell is added."""
+
+
+def run(config: Config) -> None:
+    """Runs the cells that are not there yet."""
+
+    def told(row: dict[str, Any]) -> str:
+        if row["error"] is None:
+            return f"these data determine nothing, {row['seconds']:.0f} s"
+        return (
+            f"error {row['error']:.3f} (start {row['start_error']:.3f}) along "
+            f"{row['rank']} directions, truth "
+            f"{'inside' if row['covered'] else 'outside'}, {row['seconds']:.0f} s"
+        )
+
+    share = Share(config.shard, config.only, config.list, config.out)
+    run_cells(cells(config), share, solve, told)
+
+
+def cells(config: Config) -> list[Cell]:
+    """The cells, in the order in which they are run.
+
+    Raises:
+        UserError: no such robot, setting or method.
+    """
+    from easi_jax.errors import UserError, nearest
+
+    for flag, given, known in (
+        ("robots", config.robots, ROBOTS),
+        ("settings", config.settings, SETTINGS),
+        ("methods", config.methods, METHODS),
+    ):
+        for name in given:
+            if name not in known:
+                raise UserError(
+                    f'--{flag} "{name}": {", ".join(known)}{nearest(name, known)}'
+                )
+    every = (
+        Cell(robot, setting, method, seed, config.trajectories, config.budget)
+        for seed in config.seeds
+        for robot in config.robots
+        for setting in config.settings
+        for method in config.methods
+    )
+    return [c for c in every if c.possible]
+
+
+if __name__ == "__main__":
+    main(Config, run, name="benchmarks.rivals")

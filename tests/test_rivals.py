@@ -1,0 +1,85 @@
+"""How rivals are scored, and that cells are run once."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import rivals
+from benchmarks._cells import Share, read_rows, run_cells
+from benchmarks.rival_cells import score
+from easi_jax.errors import UserError
+from easi_jax.parameters import Parameter, ParameterSpace
+
+# Two whose product alone is seen, one by itself; a unit is a factor of 9.
+SPACE = ParameterSpace(
+    tuple(
+        Parameter(n, (f"body.{n}.mass",), 1.0, (1 / 3, 3.0), (1e-3, 1e3)) for n in "abc"
+    )
+)
+SEEN = np.array([[1.0, 1.0, 0.0], [0.0, 0.0, np.sqrt(2)]]) / np.sqrt(2)
+
+
+def scored(off: list[float], std: float) -> dict:
+    """Found beside the truth by log ratios ``off``, with ``std`` (log) everywhere."""
+    width = SPACE.log_width
+    information = 1e4 * (SEEN * width).T @ (SEEN * width)
+    truth = np.full(3, 0.5)
+    cov = np.diag((std / width) ** 2)
+    return score(SPACE, information, truth + np.array(off) / width, cov, truth)
+
+
+def test_errors_count_along_what_the_data_determine() -> None:
+    got = scored([0.3, -0.3, 0.0], 0.01)
+    assert got == {"error": pytest.approx(0.0, abs=1e-9), "covered": True, "rank": 2}
+    got = scored([0.0, 0.0, 0.2], 0.01)
+    assert got["error"] == pytest.approx(0.2 / np.sqrt(2))
+    assert not got["covered"]
+    # chi2 of 2 at 90 % is 4.6: 2.1 standard deviations are inside, 2.2 are not.
+    assert scored([0.0, 0.0, 0.2], 0.2 / 2.1)["covered"]
+    assert not scored([0.0, 0.0, 0.2], 0.2 / 2.2)["covered"]
+
+
+def test_nothing_determined_is_said() -> None:
+    nothing = score(SPACE, np.zeros((3, 3)), np.ones(3), np.eye(3), np.zeros(3))
+    assert nothing == {"error": None, "covered": None, "rank": 0}
+
+
+def test_simopt_runs_where_it_can() -> None:
+    every = rivals.cells(rivals.Config(methods=("SimOpt", "EASI"), seeds=(0,)))
+    simopt = {(c.robot, c.setting) for c in every if c.method == "SimOpt"}
+    assert simopt == {("cartpole", s) for s in ("paired", "stochastic", "effect")}
+    assert len(every) == 3 * 4 + 3 and len({c.key for c in every}) == len(every)
+    with pytest.raises(UserError, match="did you mean"):
+        rivals.cells(rivals.Config(settings=("pairde",)))
+
+
+@dataclass(frozen=True)
+class One:
+    key: str
+
+
+def test_a_cell_is_run_once_and_shared(tmp_path: Path) -> None:
+    out, ran = tmp_path / "rows.jsonl", []
+
+    def go(shard: str = "1/1", only: str = "") -> None:
+        def solve(c: One) -> dict:
+            ran.append(c.key)
+            return {"value": len(ran)}
+
+        share = Share(shard, only, False, out)
+        run_cells([One(k) for k in "abcd"], share, solve, lambda row: "done")
+
+    go("2/2")
+    assert ran == ["b", "d"]
+    go(only="a")
+    go()
+    assert ran == ["b", "d", "a", "c"]
+    assert [r["key"] for r in read_rows(out)] == ran
+    assert json.loads(out.read_text().splitlines()[0])["value"] == 1
+    with pytest.raises(UserError, match="--list"):
+        go(only="e")
+    with pytest.raises(UserError, match="2/4"):
+        go("3/2")
