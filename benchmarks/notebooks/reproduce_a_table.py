@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks import paper
-from benchmarks._cells import read_rows
+from benchmarks._cells import add_row, read_rows
 from benchmarks._common import markdown_table
 from benchmarks.paper_cells import METHODS, solve
 from easi_jax.io.versions import versions
@@ -76,7 +76,7 @@ for cell in cells:
     if cell.key not in done:
         row = solve(cell, asked.folder)
         line = {"key": cell.key, **asdict(cell), **row, "versions": versions()}
-        paper.add_row(asked.out, line)
+        add_row(asked.out, line)
         print(f"{cell.key}: return {row['return']:.1f}, {row['seconds']:.0f} s")
 
 # %% [markdown]
