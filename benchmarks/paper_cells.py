@@ -122,9 +122,9 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
 
     Returns:
         ``return`` in the target (mean of `EPISODES` episodes) where there is a policy;
-        ``log_ratio`` of each parameter to the truth, ``error``, their RMS along the
-        directions that the demonstrations determine, and unit-coordinate ``std`` where
-        a distribution was found; what was ``simulated`` and ``measured``, ``seconds``.
+        ``log_ratio`` of each parameter to the truth and unit-coordinate ``std`` where a
+        distribution was found, and without a policy ``error``, the ratios' RMS along
+        the directions that the demonstrations determine; what was ``simulated`` and ``measured``, ``seconds``.
         With ``cell.curves``: ``curve`` (control steps, returns in the target) of the
         last training, ``trace`` (mean, below, above) of each parameter by generation,
         as ratios to the truth.
@@ -258,13 +258,12 @@ class _Bench:
             "measured": found.measured,
             "parameters": list(found.space.names),
             "log_ratio": off.tolist(),
-            "error": self._determined().error(off),
             "std": spread.tolist(),
         }
         if cell.curves and found.trace is not None:
             row["trace"] = _trace(found, truth)
         if not cell.policy:
-            return self.policy, row
+            return self.policy, row | {"error": self._determined().error(off)}
         learned = train(found.space, found.distribution, self.keys["final"])
         if cell.curves:
             row["curve"] = self._curve(curve[-1])

@@ -111,7 +111,8 @@ class Ant(Robot):
 
     def control(self, state: EnvState, action: jax.Array) -> jax.Array:
         """Motor commands ``(8,)`` for an action in [-1, 1]."""
-        return self.action_map(state.obs, action)
+        del state
+        return self.action_map(None, action)
 
     def observe(self, physics: Physics, last: jax.Array) -> jax.Array:
         """Observation ``(60,)`` of a physics state after the action ``last``."""

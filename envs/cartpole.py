@@ -96,7 +96,8 @@ class Cartpole:
 
     def control(self, state: EnvState, action: jax.Array) -> jax.Array:
         """The actuator's ctrl ``(1,)`` [m] for an action in [-1, 1]."""
-        return self.action_map(state.obs, action)
+        del state
+        return self.action_map(None, action)
 
     def observe(self, physics: Physics) -> jax.Array:
         """Observation ``(4,)`` of a physics state."""

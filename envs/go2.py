@@ -193,7 +193,8 @@ class Go2(Robot):
 
     def control(self, state: EnvState, action: jax.Array) -> jax.Array:
         """Joint targets ``(12,)`` [rad] for an action in [-1, 1]."""
-        return self.action_map(state.obs, action)
+        del state
+        return self.action_map(None, action)
 
     def observe(self, physics: Physics, memory: Memory) -> jax.Array:
         """Observation ``(48,)`` of a physics state."""
