@@ -124,7 +124,8 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
         ``return`` in the target (mean of `EPISODES` episodes) where there is a policy;
         ``log_ratio`` of each parameter to the truth and unit-coordinate ``std`` where a
         distribution was found, and without a policy ``error``, the ratios' RMS along
-        the directions that the demonstrations determine; what was ``simulated`` and ``measured``, ``seconds``.
+        the directions that the demonstrations determine; what was ``simulated`` and
+        ``measured``, ``seconds``.
         With ``cell.curves``: ``curve`` (control steps, returns in the target) of the
         last training, ``trace`` (mean, below, above) of each parameter by generation,
         as ratios to the truth.
