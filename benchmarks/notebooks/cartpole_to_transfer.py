@@ -252,8 +252,9 @@ for method, values in returns.items():
     print(f"{method:7} {np.median(values):6.1f}  (seeds: {np.round(values, 1)})")
 
 # %% [markdown]
-# At full size EASI's policy should come near the Oracle's and well above UDR's. The
-# same chain as two commands, with checkpoints and a report:
+# At full size EASI's policy should come near the Oracle's and well above UDR's; over
+# more seeds and targets it is measured in `benchmarks/results/README.md`. The same
+# chain as two commands, with checkpoints and a report:
 #
 #     python -m train.udr --target 'cart_kp*0.25' --out results/udr
 #     python -m train.easi --udr results/udr --target 'cart_kp*0.25' --oracle

@@ -23,6 +23,7 @@ from benchmarks._cells import add_row, read_rows
 from benchmarks._common import markdown_table
 from benchmarks.paper_cells import METHODS, solve
 from easi_jax.io.versions import versions
+from easi_jax.pipeline import target_parameters
 from envs import make
 
 # full: about a minute a cell on a laptop. tiny: to see that it runs; its policies and
@@ -147,15 +148,18 @@ if "Oracle" in ROWS:
 # that their single values mean little.
 
 # %%
-names = make("cartpole").space.names
+space = make("cartpole").space
+names = space.names
 searches = [row for row in rows if "log_ratio" in row]
 fig, axis = plt.subplots(figsize=(8, 3.4), layout="constrained")
 for target in targets:
     ratios = [row["log_ratio"] for row in searches if row["target"] == target]
-    axis.plot(np.exp(np.median(ratios, 0)), "o", alpha=0.7, label=target)
+    given = np.array(space.nominal) / target_parameters(space, (target,))
+    (dots,) = axis.plot(np.exp(np.median(ratios, 0)), "o", label=f"{target}, found")
+    axis.plot(given, "x", color=dots.get_color(), label=f"{target}, model as given")
 axis.axhline(1, color="black", ls="--", lw=1)
 axis.set_xticks(range(len(names)), names, rotation=40, ha="right")
-axis.set(xlabel="parameter", ylabel="found / truth [-]", yscale="log")
+axis.set(xlabel="parameter", ylabel="value / truth [-]", yscale="log")
 axis.legend(title="machine")
 plt.show()
 

@@ -199,7 +199,9 @@ plt.show()
 # The answer is a distribution. Its standard deviations come from the data's Fisher
 # information, and its correlations belong to it: two parameters may be uncertain one by
 # one and sure together. A policy is trained under draws from all of it. What the data
-# do not determine is flagged, and must not be believed.
+# do not determine is flagged, and must not be believed. The spread counts the noise and
+# how well pieces fit, not everything that a model can get wrong: a timestep that is
+# still coarser than the machine's moves the values by more than these small bars.
 
 # %%
 nominal = np.array([p["nominal"] for p in found["parameters"]])
