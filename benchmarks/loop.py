@@ -2,6 +2,7 @@
 
     python -m benchmarks.loop --effect friction
     python -m benchmarks.loop --effect delay
+    python -m benchmarks.loop --robot go2 --seeds 0 1 2
     python -m train.udr --robot go2 --out results/go2_udr
     python -m benchmarks.loop --robot go2 --start-from results/go2_udr --seeds 0 1 2
 
@@ -10,8 +11,9 @@ noisy logs ``train.gap`` finds what the model lacks; ``train.easi`` then searche
 trains with what was found, and without it. Oracle trains in the target itself. All
 seeds are paired, and the commands are those that a user has.
 
-On Go2 one trained policy acts in the target, and each training goes on from it, as long
-with what was found as without it.
+On Go2 no search follows: policies are trained with what was found, as long as without
+it. With ``--start-from`` one trained policy acts in the target, and each training goes
+on from it, for processors; without it each starts from nothing, for a GPU.
 """
 
 import dataclasses
@@ -40,6 +42,7 @@ HIDDEN = {
 # Standard deviations of a reading [m, rad], of a free joint's six, then of the others.
 NOISE = {"cartpole": (2e-4, 5e-4), "go2": (*[2e-4] * 3, *[5e-4] * 3, *[2e-4] * 12)}
 EPISODES = {"cartpole": 2, "go2": 6}  # of each policy, as logs
+POLICIES = {"cartpole": 5, "go2": 1}  # at most, that are logged
 STEPS = {"go2": 1_000_000}  # of each training that goes on
 
 
@@ -74,17 +77,17 @@ def run(config: Config) -> None:
         if word not in known:
             which = " or ".join(known)
             raise UserError(f"--{flag} {word}: {which}{nearest(word, known)}")
-    if (config.start_from is None) == (config.robot in STEPS):
-        raise UserError("--start-from goes with --robot go2, and is needed there")
+    if config.start_from is not None and config.robot not in STEPS:
+        raise UserError("--start-from goes with --robot go2")
     folder = config.folder / config.effect
     if config.robot != "cartpole":
         folder = config.folder / f"{config.robot}_{config.effect}"
     hidden = folder / "hidden.yaml"
     atomic_write(hidden, HIDDEN[config.robot][config.effect])
-    if config.start_from is None:
+    if config.robot not in STEPS:
         told, returns = _searched(config, folder, hidden)
     else:
-        told, returns = _gone_on(config, folder, hidden, config.start_from)
+        told, returns = _trained(config, folder, hidden)
     path = write_result(
         f"loop_{config.robot}_{config.effect}",
         command_of("benchmarks.loop", config),
@@ -158,20 +161,17 @@ def _searched(
     }
 
 
-def _gone_on(
-    config: Config, folder: Path, hidden: Path, start: Path
+def _trained(
+    config: Config, folder: Path, hidden: Path
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The same for trainings that go on from one trained policy."""
+    """The same without a search, from nothing or on from one trained policy."""
     from easi_jax.io.files import read_json
     from train import udr
 
-    found, told = _asked(config.robot, start, hidden, folder)
-    returns = {}
-    for method, name, effects, fixed in (
-        ("UDR", "without", None, False),
-        ("UDR, effects found", "with", found, False),
-        ("Oracle", "oracle", hidden, True),
-    ):
+    start = config.start_from
+    steps = None if start is None else STEPS[config.robot]
+
+    def train(method: str, name: str, effects: Path | None, fixed: bool) -> Path:
         out = folder / f"udr_{name}"
         if not (out / "results.json").exists():
             say(f"== {method}")
@@ -184,10 +184,19 @@ def _gone_on(
                     target_effects=hidden,
                     fixed=fixed,
                     start_from=start,
-                    env_steps=STEPS[config.robot],
+                    env_steps=steps,
                     overwrite=True,
                 )
             )
+        return out
+
+    runs = {"UDR": train("UDR", "without", None, False)}
+    found, told = _asked(config.robot, start or runs["UDR"], hidden, folder)
+    more = "UDR, effects found"
+    runs[more] = train(more, "with", found, False)
+    runs["Oracle"] = train("Oracle", "oracle", hidden, True)
+    returns = {}
+    for method, out in runs.items():
         (returns[method],) = read_json(out / "results.json")["returns"].values()
     return told, returns
 
@@ -263,7 +272,7 @@ def _recorded(robot: str, run_folder: Path, hidden: Path, folder: Path) -> list[
     drives = [env.mj_model.actuator(i).name for i in range(env.mj_model.nu)]
     head = ["time", *columns, *(f"ctrl.{a}" for a in drives)]
     out = []
-    for i, seed in enumerate(saved["seeds"]):
+    for i, seed in enumerate(saved["seeds"][: POLICIES[robot]]):
         policy = jax.tree.map(lambda x, i=i: x[i], saved["policies"])
         logs = jax.tree.map(np.asarray, episodes(policy, jax.random.key(seed)))
         for k in range(EPISODES[robot]):

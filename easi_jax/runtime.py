@@ -16,13 +16,15 @@ _EMITTERS = "xla_cpu_use_fusion_emitters"
 _LEVEL = "xla_backend_optimization_level"
 _WAIT = 10**7  # s
 _EXTRA = "xla_backend_extra_options"
+_NEXT = (0, 13)  # first jaxlib that these were not tried with
 # Bytes that a loop may touch and still run as one piece; beyond, compiling takes long.
 _LOOPS = "xla_cpu_small_while_loop_byte_threshold=2000000"
-_FLAGS = {
-    _EMITTERS: "false",
-    _EXTRA: _LOOPS,
-    "xla_cpu_collective_call_warn_stuck_timeout_seconds": _WAIT,
-    "xla_cpu_collective_call_terminate_timeout_seconds": _WAIT,
+# An unknown flag ends the process: each only up to the jaxlib that is known to have it.
+_FLAGS: dict[str, tuple[object, tuple[int, int]]] = {
+    _EMITTERS: ("false", (0, 11)),
+    _EXTRA: (_LOOPS, _NEXT),
+    "xla_cpu_collective_call_warn_stuck_timeout_seconds": (_WAIT, _NEXT),
+    "xla_cpu_collective_call_terminate_timeout_seconds": (_WAIT, _NEXT),
 }
 _state: dict[str, object] = {}
 
@@ -102,23 +104,23 @@ def prepare() -> dict[str, object]:
 
 
 def _ready_flags(version: tuple[int, ...]) -> None:
-    if not _knows_flags(version):
-        return
     flags = os.environ.get("XLA_FLAGS", "")
-    for name, value in _FLAGS.items():
-        if name not in flags:
+    for name, (value, _) in _FLAGS.items():
+        if name not in flags and _known(name, version):
             flags = f"{flags} --{name}={value}".strip()
-    os.environ["XLA_FLAGS"] = flags
+    if flags:
+        os.environ["XLA_FLAGS"] = flags
 
 
 def fast_loops() -> dict[str, Any]:
     """``compiler_options`` of ``jax.jit`` for programs that simulate for long.
 
-    They take longer to compile and, on CPU, simulate about twice as fast.
+    They take longer to compile and, on CPU, simulate about twice as fast; from jaxlib
+    0.11 on there are no others.
     """
     import jax
 
-    return {_EMITTERS: True} if _knows_flags(jax.__version_info__) else {}
+    return {_EMITTERS: True} if _known(_EMITTERS, jax.__version_info__) else {}
 
 
 def quick_compile() -> dict[str, Any]:
@@ -133,9 +135,8 @@ def quick_compile() -> dict[str, Any]:
     return {_LEVEL: 1} if jax.default_backend() == "cpu" else {}
 
 
-def _knows_flags(version: tuple[int, ...]) -> bool:
-    # An unknown flag ends the process: only where it is known to exist.
-    return (0, 10) <= version < (0, 11)
+def _known(flag: str, version: tuple[int, ...]) -> bool:
+    return (0, 10) <= version < _FLAGS[flag][1]
 
 
 def _ready_cache() -> None:

@@ -21,6 +21,8 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend import core as jex_core
 
+from easi_jax.small_linalg import scan_sizes
+
 MAX_ENTRIES = 60_000  # computed by all operations together: beyond, code gets too long
 _REMEMBERED = 32  # programs
 _UNROLLED = 8  # steps of an inner scan that are written out
@@ -287,7 +289,7 @@ class _Replay:
             return self.run(branch.jaxpr, [_split(c) for c in branch.consts], xs[1:])
         if p["length"] > _UNROLLED:
             return NotImplemented
-        nc, nk, length = p["num_consts"], p["num_carry"], p["length"]
+        (nc, nk), length = scan_sizes(p), p["length"]
         consts, carry, rest = xs[:nc], xs[nc : nc + nk], xs[nc + nk :]
         body, steps = p["jaxpr"], range(length)
         kept: list[Any] = [None] * length
@@ -662,7 +664,7 @@ def _compute(name: str, p: dict[str, Any], dtype: Any, e: tuple[Any, ...]) -> An
         elif name == "div" and dtype.kind == "f":
             out = e[0] / e[1]
         elif name == "div" and e[1]:
-            out = np.fix(np.float64(e[0]) / np.float64(e[1]))
+            out = np.trunc(np.float64(e[0]) / np.float64(e[1]))
         else:
             return None
     return np.asarray(out).astype(dtype)[()]

@@ -98,8 +98,16 @@ def _while(p: dict[str, Any], vals: list[Any]) -> list[Any]:
     )
 
 
+def scan_sizes(p: dict[str, Any]) -> tuple[int, int]:
+    """Numbers of constants and of carried values of a ``scan``."""
+    if "ft_in" in p:  # from jax 0.11 on
+        consts, carry, _ = p["ft_in"].unpack()
+        return len(consts), len(carry)
+    return p["num_consts"], p["num_carry"]
+
+
 def _scan(p: dict[str, Any], vals: list[Any]) -> list[Any]:
-    nc, nk = p["num_consts"], p["num_carry"]
+    nc, nk = scan_sizes(p)
     consts, init, xs = vals[:nc], vals[nc : nc + nk], vals[nc + nk :]
     body = _closed(p["jaxpr"])
 

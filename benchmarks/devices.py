@@ -1,0 +1,149 @@
+"""Whether a CPU and a GPU, or several devices, compute the same.
+
+    JAX_PLATFORMS=cpu python -m benchmarks.devices --save cpu.npz
+    python -m benchmarks.devices --against cpu.npz
+
+Every robot is simulated from the same resets under the same commands, for random
+models; and the Cartpole's search runs with its least-squares finish on the same logs.
+``benchmarks/results/devices.json`` holds the differences: of positions by control step,
+and of the search's result in its own standard deviations.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from train._command import main, say, show_table
+
+ROBOTS = ("cartpole", "ant", "ballbalance", "go2")
+STEPS = (1, 5, 20)  # control steps after which positions are compared
+SHARES = (50, 99)  # percentiles
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Computes, and saves or compares."""
+
+    save: Path | None = None
+    """Where the figures of this device are kept."""
+    against: Path | None = None
+    """Figures of another device."""
+    population: int = 64
+    """Models of each robot."""
+    generations: int = 30
+    """Generations of the search."""
+
+
+def run(config: Config) -> None:
+    """Computes the figures, then saves them or compares them."""
+    import jax
+    import numpy as np
+
+    from benchmarks._common import command_of, write_result
+    from easi_jax.errors import UserError
+
+    if (config.save is None) == (config.against is None):
+        raise UserError("give either --save FILE or --against FILE")
+    figures = {name: moved(name, config.population) for name in ROBOTS}
+    figures |= searched(config)
+    if config.against is None:
+        figures["device"] = np.array(jax.devices()[0].device_kind)
+        np.savez(str(config.save), **figures)
+        say(f"written: {config.save}")
+        return
+    with np.load(config.against, allow_pickle=False) as found:
+        other = dict(found)
+    rows = {}
+    for name in ROBOTS:
+        off = np.abs(figures[name] - other[name]).max(-1)
+        rows[name] = [
+            {f"{p} %": float(np.percentile(off[:, s - 1], p)) for p in SHARES}
+            for s in STEPS
+        ]
+    std = np.sqrt(np.diag(figures["cov"]))
+    apart = np.abs(figures["mean"] - other["mean"]) / std
+    refined = np.abs(figures["refined"] - other["refined"])
+    path = write_result(
+        "devices",
+        command_of("benchmarks.devices", dataclasses.replace(config, against=None)),
+        dataclasses.replace(config, against=None),
+        other_device=str(other["device"]),
+        control_steps=STEPS,
+        positions=rows,
+        search_apart_std=apart.tolist(),
+        refined_apart_log=refined.tolist(),
+    )
+    show_table(
+        f"differences of positions [m, rad], {other['device']} beside this",
+        ("robot", *(f"after {s}, {p} %" for s in STEPS for p in SHARES)),
+        [
+            (n, *(f"{x:.1e}" for step in r for x in step.values()))
+            for n, r in rows.items()
+        ],
+    )
+    say(f"search: at most {apart.max():.2g} of its standard deviations apart")
+    say(f"after the finish: log ratios at most {refined.max():.2g} apart")
+    say(f"written: {path}")
+
+
+def moved(name: str, population: int) -> Any:
+    """Positions of random models under random commands, ``(P, max(STEPS), nq)``."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from easi_jax.rollout import policy_rollout
+    from envs import make
+
+    env = make(name)
+    low, high = (jnp.asarray(x) for x in env.space.initial)
+
+    def one(key: jax.Array) -> jax.Array:
+        k_model, k_run = jax.random.split(key)
+        theta = jax.random.uniform(k_model, low.shape, minval=low, maxval=high)
+
+        def wander(_: jax.Array, k: jax.Array) -> jax.Array:
+            return jnp.clip(0.3 * jax.random.normal(k, (env.action_size,)), -1.0, 1.0)
+
+        seg = policy_rollout(env, env.model(theta), wander, k_run, max(STEPS) + 1)
+        return seg.qpos[1:]
+
+    keys = jax.random.split(jax.random.key(0), population)
+    return np.asarray(jax.jit(jax.vmap(one))(keys))
+
+
+def searched(config: Config) -> dict[str, Any]:
+    """A search's mean and covariance, and its refined mean, unit coordinates."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from benchmarks.recovery import controller
+    from easi_jax.identify import estimate
+    from easi_jax.rollout import collect
+    from easi_jax.search import Search, SearchData
+    from easi_jax.search_config import preset
+    from easi_jax.segments import windows
+    from envs import make
+
+    env = make("cartpole")
+    machine = env.machine.rebuilt(space=env.space.scaled(0.3, 0.9))
+    search = Search(machine, preset("default", generations=config.generations))
+    still = jnp.zeros(2 * env.mj_model.nv)
+
+    @jax.jit
+    def find(key: jax.Array) -> tuple[jax.Array, ...]:
+        demos = collect(env, env.model(), controller, key, 50, env.episode_length)
+        data = SearchData(windows(demos, 1, 1), still, ())
+        state, _ = search.run(search.init(key, data), data, config.generations)
+        mean, cov = state.result_mean, state.result_cov
+        pieces = windows(demos, 25, 26)
+        fit = estimate(machine, search.space, mean, cov, pieces, still, True)
+        return mean, cov, fit.distribution.mean
+
+    mean, cov, refined = (np.asarray(x) for x in find(jax.random.key(0)))
+    return {"mean": mean, "cov": cov, "refined": refined * search.space.log_width}
+
+
+if __name__ == "__main__":
+    main(Config, run, name="benchmarks.devices")

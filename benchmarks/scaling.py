@@ -1,0 +1,153 @@
+"""How the cost of a search and of training grows, one quantity at a time.
+
+    python -m benchmarks.scaling
+    python -m benchmarks.scaling --robot go2 --generations 2 --seeds 1 2 4
+
+Seconds of a generation by population, horizon and number of parameters, and of training
+by seeds that one program holds; compiled before, the least of three timings. Each is a
+line of ``benchmarks/results/scaling.jsonl``, with versions and device.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from benchmarks._common import RESULTS
+from train._command import main, say
+
+FEWEST = 4  # parameters
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Times a robot's search and training over sizes."""
+
+    robot: str = "cartpole"
+    """Built-in robot."""
+    option: tuple[str, ...] = ()
+    """Options of the robot, NAME=VALUE."""
+    populations: tuple[int, ...] = (300, 1024, 4096, 16384)
+    """Individuals."""
+    horizons: tuple[int, ...] = (1, 4, 16, 64)
+    """Control steps of a replayed piece."""
+    seeds: tuple[int, ...] = (1, 4, 16, 32)
+    """Seeds that are trained in one program."""
+    generations: int = 5
+    """Generations timed."""
+    iterations: int = 20
+    """Iterations of training timed."""
+    devices: int | None = None
+    """Devices to spread over; all where not given."""
+    out: Path = RESULTS / "scaling.jsonl"
+    """Where a line for each size is added."""
+
+
+def run(config: Config) -> None:
+    """Times every size, the smallest first."""
+    import jax
+
+    from benchmarks._cells import add_row
+    from easi_jax.io.versions import versions
+    from easi_jax.mesh import make_mesh
+    from envs import open_env
+
+    env, mesh = open_env(config.robot, None, config.option), make_mesh(config.devices)
+    where = {
+        "robot": config.robot,
+        "option": list(config.option),
+        "devices": mesh.size,
+        "device": jax.devices()[0].device_kind,
+    }
+
+    def told(what: str, size: int, **figures: float) -> None:
+        row = {**where, "what": what, "size": size, **figures}
+        add_row(config.out, {**row, "versions": versions()})
+        words = ", ".join(f"{k} {v:.4g}" for k, v in figures.items())
+        say(f"{config.robot}, {what} {size}: {words}")
+
+    names = env.space.names
+    for n in sorted({FEWEST, len(names) // 2, len(names)}):
+        figures = _generation(config, env, mesh, names=names[:n])
+        told("parameters", n, **figures)
+    for p in config.populations:
+        told("population", p, **_generation(config, env, mesh, population=p))
+    for h in config.horizons:
+        told("horizon", h, **_generation(config, env, mesh, horizon=h))
+    for s in config.seeds:
+        told("seeds", s, **_training(config, env, mesh, s))
+
+
+def least(fun: Callable[[], Any]) -> float:
+    """Seconds, the least of three, after one that is not counted."""
+    import jax
+
+    seconds = []
+    for _ in range(4):
+        begin = time.monotonic()
+        jax.block_until_ready(fun())
+        seconds.append(time.monotonic() - begin)
+    return min(seconds[1:])
+
+
+def _generation(
+    config: Config, env: Any, mesh: Any, names: Any = None, **search: int
+) -> dict[str, float]:
+    import jax
+    import jax.numpy as jnp
+
+    from easi_jax.rollout import collect
+    from easi_jax.runtime import fast_loops
+    from easi_jax.search import Search, SearchData
+    from easi_jax.search_config import preset
+    from easi_jax.segments import windows
+
+    chosen = preset("default", generations=config.generations, **search)
+    space = env.space if names is None else env.space.select(names)
+    made = Search(env.machine.rebuilt(space=space), chosen, mesh=mesh)
+    n = env.action_size
+
+    def wander(_: jax.Array, key: jax.Array) -> jax.Array:
+        return jnp.clip(0.3 * jax.random.normal(key, (n,)), -1.0, 1.0)
+
+    def data(key: jax.Array) -> SearchData:
+        demos = collect(env, env.model(), wander, key, 20, env.episode_length)
+        pieces = windows(demos, chosen.horizon, max(1, chosen.horizon // 2))
+        return SearchData(pieces, jnp.zeros(2 * env.mj_model.nv), ())
+
+    logged = jax.jit(data)(jax.random.key(0))
+    state = made.init(jax.random.key(1), logged)
+    run = jax.jit(
+        lambda s, d: made.run(s, d, config.generations), compiler_options=fast_loops()
+    )
+    seconds = least(lambda: run(state, logged)) / config.generations
+    steps = chosen.population * chosen.segments * chosen.horizon
+    return {"seconds": seconds, "control_steps_per_s": steps / seconds}
+
+
+def _training(config: Config, env: Any, mesh: Any, seeds: int) -> dict[str, float]:
+    import jax
+    import jax.numpy as jnp
+
+    from easi_jax.pipeline import Pipeline, PipelineConfig, seed_keys, stage_keys
+    from easi_jax.runtime import fast_loops
+    from train._robots import training_config
+
+    training = training_config(env, None)
+    pipe = Pipeline(env, PipelineConfig(training=training), mesh=mesh)
+    dist = pipe.spread(pipe.udr(), seeds)
+    target = jnp.asarray(env.space.nominal, jnp.float32)
+    keys = stage_keys(seed_keys(list(range(seeds))))["udr"]
+    state = jax.jit(pipe.train_init)(keys, dist)
+    n = config.iterations
+    run = jax.jit(
+        lambda s, d: pipe.train_chunk(s, d, target, n), compiler_options=fast_loops()
+    )
+    seconds = least(lambda: run(state, dist)) / n
+    steps = seeds * training.steps_per_iteration
+    return {"seconds": seconds, "control_steps_per_s": steps / seconds}
+
+
+if __name__ == "__main__":
+    main(Config, run, name="benchmarks.scaling")
