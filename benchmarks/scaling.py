@@ -144,7 +144,8 @@ def _training(config: Config, env: Any, mesh: Any, seeds: int) -> dict[str, floa
     run = jax.jit(
         lambda s, d: pipe.train_chunk(s, d, target, n), compiler_options=fast_loops()
     )
-    seconds = least(lambda: run(state, dist)) / n
+    trained, _ = run(state, dist)  # a replay buffer is filled first
+    seconds = least(lambda: run(trained, dist)) / n
     steps = seeds * training.steps_per_iteration
     return {"seconds": seconds, "control_steps_per_s": steps / seconds}
 
