@@ -260,6 +260,8 @@ def _text(value: object) -> str:
 def _interrupted(out: Path | str | None, resumable: bool) -> str:
     if out is None:
         return "interrupted"
+    if Path(out).suffix == ".jsonl":
+        return f"interrupted; {out} keeps the lines of all that was done"
     if not resumable:
         return f"interrupted; nothing was written to {out}, start the command again"
     kept = any(Path(out).glob("checkpoints/**/step_*"))

@@ -119,19 +119,23 @@ def test_interrupt_says_what_is_kept(tmp_path, capsys, kept, said, number):
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_interrupt_of_what_cannot_be_resumed(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("", "nothing was written"), ("rows.jsonl", "keeps the lines of all that")],
+)
+def test_interrupt_of_what_cannot_be_resumed(tmp_path, capsys, name, said):
     @dataclasses.dataclass(frozen=True)
     class Short:
         """Takes seconds."""
 
-        out: Path = tmp_path
-        """Folder."""
+        out: Path = tmp_path / name
+        """Folder, or a file that lines are added to."""
 
     with pytest.raises(SystemExit) as exit_:
         main(Short, lambda _: os.kill(os.getpid(), signal.SIGINT), name="t", args=())
     assert exit_.value.code == 130
     err = capsys.readouterr().err
-    assert "nothing was written" in err and "resume" not in err
+    assert said in err and "resume" not in err
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
