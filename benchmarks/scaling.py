@@ -5,7 +5,8 @@
 
 Seconds of a generation by population, horizon and number of parameters, and of training
 by seeds that one program holds; compiled before, the least of three timings. Each is a
-line of ``benchmarks/results/scaling.jsonl``, with versions and device.
+line of ``benchmarks/results/scaling.jsonl``, with versions and device, and is not timed
+again there.
 """
 
 import dataclasses
@@ -45,10 +46,10 @@ class Config:
 
 
 def run(config: Config) -> None:
-    """Times every size, the smallest first."""
+    """Times every size that has no line yet, the smallest first."""
     import jax
 
-    from benchmarks._cells import add_row
+    from benchmarks._cells import add_row, read_rows
     from easi_jax.io.versions import versions
     from easi_jax.mesh import make_mesh
     from envs import open_env
@@ -61,22 +62,32 @@ def run(config: Config) -> None:
         "device": jax.devices()[0].device_kind,
     }
 
-    def told(what: str, size: int, **figures: float) -> None:
+    done = [
+        (r["what"], r["size"])
+        for r in read_rows(config.out)
+        if {k: r[k] for k in where} == where
+    ]
+    names = env.space.names
+    few = sorted({min(FEWEST, len(names)), len(names) // 2, len(names)})
+    sizes = {
+        "parameters": few,
+        "population": config.populations,
+        "horizon": config.horizons,
+        "seeds": config.seeds,
+    }
+    for what, size in ((w, s) for w, each in sizes.items() for s in each):
+        if (what, size) in done:
+            continue
+        if what == "seeds":
+            figures = _training(config, env, mesh, size)
+        elif what == "parameters":
+            figures = _generation(config, env, mesh, names=names[:size])
+        else:
+            figures = _generation(config, env, mesh, **{what: size})
         row = {**where, "what": what, "size": size, **figures}
         add_row(config.out, {**row, "versions": versions()})
         words = ", ".join(f"{k} {v:.4g}" for k, v in figures.items())
         say(f"{config.robot}, {what} {size}: {words}")
-
-    names = env.space.names
-    for n in sorted({FEWEST, len(names) // 2, len(names)}):
-        figures = _generation(config, env, mesh, names=names[:n])
-        told("parameters", n, **figures)
-    for p in config.populations:
-        told("population", p, **_generation(config, env, mesh, population=p))
-    for h in config.horizons:
-        told("horizon", h, **_generation(config, env, mesh, horizon=h))
-    for s in config.seeds:
-        told("seeds", s, **_training(config, env, mesh, s))
 
 
 def least(fun: Callable[[], Any]) -> float:

@@ -11,7 +11,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from benchmarks import coverage_summary, gap_summary, paper_tables
+from benchmarks import coverage_summary, gap_summary, paper_tables, scaling_summary
 from benchmarks._common import RESULTS, markdown_table
 from benchmarks.physics import GOALS
 from benchmarks.recovery import CASES
@@ -49,6 +49,7 @@ def run(config: Config) -> None:
         ),
         *(gap_summary.generated, gap_summary.real, gap_summary.times, gap_summary.loop),
         paper_tables.sections,
+        scaling_summary.growth,
     ):
         parts += section(config.results)
     for drawn in (gap_summary.figures, paper_tables.figures):

@@ -1,0 +1,65 @@
+"""What grows is timed once, and shown for every device."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks import scaling, scaling_summary
+
+SMALL = scaling.Config(
+    populations=(8, 16), horizons=(1,), seeds=(1,), generations=1, iterations=1
+)
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> list:
+    """Sizes that are timed, in place of timing them."""
+    asked: list = []
+
+    def generation(*_, names=None, **search) -> dict[str, float]:
+        asked.append(search or len(names or ()))
+        return {"seconds": 0.5, "control_steps_per_s": 2000.0}
+
+    def training(*args) -> dict[str, float]:
+        asked.append(args[-1])
+        return {"seconds": 0.25, "control_steps_per_s": 400.0}
+
+    monkeypatch.setattr(scaling, "_generation", generation)
+    monkeypatch.setattr(scaling, "_training", training)
+    return asked
+
+
+def test_a_stopped_run_goes_on(tmp_path: Path, counted: list) -> None:
+    import dataclasses
+
+    config = dataclasses.replace(SMALL, out=tmp_path / "scaling.jsonl")
+    scaling.run(config)
+    assert counted == [4, 5, 11, {"population": 8}, {"population": 16}] + [
+        {"horizon": 1},
+        1,
+    ]
+    lines = config.out.read_text().splitlines()
+    config.out.write_text("\n".join(lines[:4]) + "\n")
+    del counted[:]
+    scaling.run(config)
+    assert counted == [{"population": 16}, {"horizon": 1}, 1]
+    (text,) = [t for t in scaling_summary.growth(tmp_path) if "| 8 |" in t]
+    assert "0.5 (2,000)" in text and text.count("cartpole, ") == 1
+
+
+def test_what_was_not_run_is_said(tmp_path: Path) -> None:
+    assert "Not run" in scaling_summary.growth(tmp_path)[1]
+
+
+@pytest.mark.slow
+def test_more_individuals_take_longer(tmp_path: Path) -> None:
+    import dataclasses
+
+    config = dataclasses.replace(
+        SMALL, populations=(64, 4096), out=tmp_path / "scaling.jsonl"
+    )
+    scaling.run(config)
+    rows = [json.loads(line) for line in config.out.read_text().splitlines()]
+    small, large = (r["seconds"] for r in rows if r["what"] == "population")
+    assert large > 2 * small
