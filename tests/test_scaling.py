@@ -1,5 +1,6 @@
 """What grows is timed once, and shown for every device."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -31,19 +32,15 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list:
 
 
 def test_a_stopped_run_goes_on(tmp_path: Path, counted: list) -> None:
-    import dataclasses
-
     config = dataclasses.replace(SMALL, out=tmp_path / "scaling.jsonl")
+    rest = [{"horizon": 1}, 1]
     scaling.run(config)
-    assert counted == [4, 5, 11, {"population": 8}, {"population": 16}] + [
-        {"horizon": 1},
-        1,
-    ]
+    assert counted == [4, 5, 11, *({"population": p} for p in (8, 16)), *rest]
     lines = config.out.read_text().splitlines()
     config.out.write_text("\n".join(lines[:4]) + "\n")
     del counted[:]
     scaling.run(config)
-    assert counted == [{"population": 16}, {"horizon": 1}, 1]
+    assert counted == [{"population": 16}, *rest]
     (text,) = [t for t in scaling_summary.growth(tmp_path) if "| 8 |" in t]
     assert "0.5 (2,000)" in text and text.count("cartpole, ") == 1
 
@@ -54,8 +51,6 @@ def test_what_was_not_run_is_said(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_more_individuals_take_longer(tmp_path: Path) -> None:
-    import dataclasses
-
     config = dataclasses.replace(
         SMALL, populations=(64, 4096), out=tmp_path / "scaling.jsonl"
     )
