@@ -145,7 +145,7 @@ class _Assignment:
                 f'"{joint}" ({listed(drives)}); say by actuators: in --mapping which '
                 f"one {stream.source}.{name} is"
             )
-        known = [*self.actuators, *self.joints]
+        known = {*self.actuators, *self.joints} - {joint}
         raise UserError(
             f'{self.recording.path}: the model has no actuator for "{joint}" of '
             f"{stream.source}{nearest(joint, known)} (actuators: in --mapping names "
@@ -157,7 +157,7 @@ class _Assignment:
         return [
             name
             for i, name in enumerate(self.actuators)
-            if self.model.actuator_trntype[i] in of_joint
+            if mujoco.mjtTrn(int(self.model.actuator_trntype[i])) in of_joint
             and self.joints[int(self.model.actuator_trnid[i, 0])] == joint
         ]
 

@@ -4,6 +4,7 @@ Messages are decoded by the standard definitions of their types; definitions tha
 recording carries are not used.
 """
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -86,7 +87,7 @@ class _Bag:
             bag.open()
         except Exception as error:  # whatever its parsers meet in a damaged file
             raise self._broken(error) from None
-        with bag:
+        with contextlib.closing(bag):
             self.topics = {name: t.msgtype or "" for name, t in bag.topics.items()}
             states, commands = self._chosen()
             found = [s for topic in states for s in self._state(bag, topic)]
