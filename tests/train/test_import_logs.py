@@ -314,6 +314,7 @@ def test_a_malicious_pickle_does_not_run(tmp_path: Path, refuse: Any) -> None:
         (b"\x80\x02cbuiltins\neval\n.", "asks for builtins.eval"),
         (b"\x80\x02ctorch._utils\n_rebuild_parameter\n.", "_rebuild_parameter"),
         (b"\x80\x04\x8c\x02os\x8c\x06system\x93.", "asks for os.system"),
+        (b"\x80\x02c\x1b[31m\nred\n.", r"asks for \x1b[31m.red"),
         (b"\x80\x02(ios\nsystem\n.", "uses INST"),
         (b"\x80\x02}}b.", "uses BUILD"),
         (b"\x80\x02ccollections\nOrderedDict\n)\x81.", "uses NEWOBJ"),

@@ -61,8 +61,8 @@ def read_lerobot(path: Path, selection: Selection) -> Iterator[Recording]:
         if key not in wanted
         and key.startswith(("observation.", "action."))
         and isinstance(feature, dict)
-        and feature.get("dtype") in _NUMBERS
-        and len(feature.get("shape") or [1]) == 1
+        and str(feature.get("dtype")) in _NUMBERS
+        and len(_shape(feature)) == 1
     ]
     roles: dict[str, Role] = dict.fromkeys(states, "qpos")
     roles |= dict.fromkeys(commands, "ctrl")
@@ -163,6 +163,11 @@ def _time(where: str, columns: dict[str, np.ndarray], info: dict[str, Any]) -> A
     if "frame_index" in columns and isinstance(rate, int | float) and rate > 0:
         return columns["frame_index"][:, 0] / rate
     raise UserError(f"{where} has neither timestamp nor frame_index with fps")
+
+
+def _shape(feature: dict[str, Any]) -> list[Any]:
+    shape = feature.get("shape")
+    return shape if isinstance(shape, list) else [1]
 
 
 def _names(feature: Any, width: int) -> list[str] | None:

@@ -75,10 +75,12 @@ def _file(path: Path) -> tuple[Path, str]:
 
 
 def _episodes(file: Path, root: Any, chosen: tuple[int, ...]) -> list[int]:
+    try:
+        groups = [str(key).partition(_EPISODE) for key in root]
+    except (OSError, RuntimeError, KeyError, ValueError):
+        raise UserError(f"{file}: cannot be read; damaged?") from None
     numbers = sorted(
-        int(key.removeprefix(_EPISODE))
-        for key in root
-        if key.startswith(_EPISODE) and key.removeprefix(_EPISODE).isdecimal()
+        int(number) for before, _, number in groups if not before and number.isdecimal()
     )
     if not numbers:
         raise UserError(f"{file}: no group {_EPISODE}0; not a Minari dataset")
@@ -94,6 +96,8 @@ def _leaves(group: Any, prefix: str) -> Iterator[tuple[str, np.ndarray]]:
     """Numeric arrays by their path, such as ``observations.pose``."""
     for key, item in group.items():
         name = f"{prefix}{key}"
+        if item is None:
+            raise KeyError(name)  # h5py's word for a link that leads nowhere
         if hasattr(item, "items"):
             yield from _leaves(item, f"{name}.")
         elif item.dtype.kind in "biuf" and item.ndim in (1, 2):

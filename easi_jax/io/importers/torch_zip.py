@@ -186,8 +186,10 @@ class _Program:
 
     def _global(self, module: str, name: str) -> _Global:
         if (module, name) not in _GLOBALS:
+            # Escaped, as a terminal would obey what control characters say.
+            asked = f"{module}.{name}"[:80].encode("unicode_escape").decode()
             raise _RefusedError(
-                f"refused: its pickle asks for {module}.{name}; only plain tensors in "
+                f"refused: its pickle asks for {asked}; only plain tensors in "
                 "a dictionary are read, nothing is executed"
             )
         return _Global(module, name)
