@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -465,6 +466,30 @@ def test_topics(tmp_path: Path, refuse: Any) -> None:
     line = refuse(ros.write(tmp_path / "none"))
     assert "no topic for --state" in line and "/chatter [std_msgs/msg/String]" in line
     assert "no episodes" in refuse(path, "--episodes", 0)
+
+
+def test_the_field_of_a_command(tmp_path: Path, call: Any, refuse: Any) -> None:
+    ros = Ros()
+    for i, at in enumerate(TIME):
+        ros.joints(at, NAMES, QPOS[i])
+        ros.joints(at, ["drive"], [9.0], effort=[CTRL[i]], topic="/to")
+    chosen = ("--state", "/joint_states", "--command", "/to", "--command-field")
+    path = ros.write(tmp_path / "walk")
+    check(call(path, *chosen, "effort")["walk"])
+    line = refuse(path, *chosen, "velocity", "--overwrite")
+    assert "message 1 of /to has 1 names and 0 values" in line
+
+
+@pytest.mark.parametrize("package", ["rosbags", "h5py"])
+def test_a_package_that_is_not_installed(
+    tmp_path: Path, refuse: Any, monkeypatch: pytest.MonkeyPatch, package: str
+) -> None:
+    paths = {"rosbags": bag().write(tmp_path / "a"), "h5py": minari(tmp_path / "b")}
+    # the module that is imported from, which earlier tests have loaded
+    module = {"rosbags": "rosbags.rosbag2", "h5py": "h5py"}[package]
+    monkeypatch.setitem(sys.modules, module, None)
+    line = refuse(paths[package], "--step", STEP)
+    assert f"needs the package {package}" in line and "easi-jax[import]" in line
 
 
 def test_joints_that_the_model_lacks(tmp_path: Path, refuse: Any) -> None:
