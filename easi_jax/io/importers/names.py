@@ -1,0 +1,207 @@
+"""Which channel of a recording becomes which column of the log."""
+
+from dataclasses import dataclass
+
+import mujoco
+
+from easi_jax.errors import UserError, nearest
+from easi_jax.io.importers.mapping import ImportMapping
+from easi_jax.io.importers.streams import Recording, Stream, listed
+from easi_jax.io.log_columns import LogColumns, log_columns
+
+_KINDS = {
+    mujoco.mjtJoint.mjJNT_FREE: "free",
+    mujoco.mjtJoint.mjJNT_BALL: "ball",
+}
+
+
+@dataclass(frozen=True)
+class Use:
+    """Entry ``index`` of ``stream`` is ``column`` of the log."""
+
+    column: str
+    stream: Stream
+    index: int
+
+
+def assign(
+    recording: Recording, mapping: ImportMapping, model: mujoco.MjModel
+) -> tuple[list[Use], list[str]]:
+    """Finds every channel's column.
+
+    A channel that ``columns`` of the mapping names goes there. Positions and
+    velocities go by their joint's name; commands by that of the actuator, or of the
+    joint that one actuator alone drives.
+
+    Returns:
+        Uses in the order of the log's columns, and the channels that have none.
+
+    Raises:
+        UserError: a name that the model or the recording does not have, two channels
+            for one column, or a column that the model needs and nothing gives.
+    """
+    return _Assignment(recording, mapping, model).result()
+
+
+class _Assignment:
+    def __init__(
+        self, recording: Recording, mapping: ImportMapping, model: mujoco.MjModel
+    ):
+        self.recording = recording
+        self.mapping = mapping
+        self.model = model
+        self.columns: LogColumns = log_columns(model)
+        self.joints = [model.joint(i).name for i in range(model.njnt)]
+        self.actuators = [model.actuator(i).name for i in range(model.nu)]
+
+    def result(self) -> tuple[list[Use], list[str]]:
+        self._check_mapping()
+        uses: dict[str, Use] = {}
+        unused: list[str] = []
+        for stream in self.recording.streams:
+            for index, channel in enumerate(stream.channels):
+                if channel in self.mapping.columns:
+                    column = self.mapping.columns[channel]
+                elif not stream.role:
+                    unused.append(channel)
+                    continue
+                else:
+                    column = self._column(stream, stream.names[index])
+                if column is None:
+                    continue
+                if column in uses:
+                    raise self._twice(column, uses[column], channel)
+                uses[column] = Use(column, stream, index)
+        for column in uses:
+            if column not in self.columns.known or column in ("time", "run"):
+                raise UserError(
+                    f"{self.mapping.source}: the model has nothing for column "
+                    f'"{column}"'
+                    f"{nearest(column, self.columns.known[2:])}"
+                )
+        for column in (*self.columns.qpos, *self.columns.ctrl):
+            if column not in uses:
+                raise self._missing(column, unused)
+        ordered = [uses[c] for c in self.columns.known if c in uses]
+        return ordered, unused
+
+    def _column(self, stream: Stream, name: str) -> str | None:
+        if stream.role == "ctrl":
+            return self._actuator(stream, name)
+        joint = self._joint(stream, name)
+        return None if joint is None else f"{stream.role}.{joint}"
+
+    def _joint(self, stream: Stream, name: str) -> str | None:
+        if name in self.mapping.joints:
+            joint = self.mapping.joints[name]
+            if joint is not None and joint not in self.joints:
+                raise UserError(
+                    f'{self.mapping.source}: the model has no joint "{joint}"'
+                    f"{nearest(joint, self.joints)}"
+                )
+        elif stream.named:
+            joint = name
+        else:
+            raise self._nameless(stream, "joints", self.joints)
+        if joint is None:
+            return None
+        if joint not in self.joints:
+            raise UserError(
+                f'{self.recording.path}: the model has no joint "{joint}" of '
+                f"{stream.source}{nearest(joint, self.joints)} (joints: in --mapping "
+                "gives it the model's name, or leaves it out)"
+            )
+        kind = mujoco.mjtJoint(int(self.model.joint(joint).type[0]))
+        if kind in _KINDS:
+            raise UserError(
+                f'{self.recording.path}: joint "{joint}" is a {_KINDS[kind]} joint, '
+                f"which {stream.source}.{name} cannot hold; map its parts by columns: "
+                "in --mapping"
+            )
+        return joint
+
+    def _actuator(self, stream: Stream, name: str) -> str | None:
+        if name in self.mapping.actuators:
+            actuator = self.mapping.actuators[name]
+            if actuator is not None and actuator not in self.actuators:
+                raise UserError(
+                    f'{self.mapping.source}: the model has no actuator "{actuator}"'
+                    f"{nearest(actuator, self.actuators)}"
+                )
+            return None if actuator is None else f"ctrl.{actuator}"
+        if stream.named and name in self.actuators:
+            return f"ctrl.{name}"
+        if not stream.named and name not in self.mapping.joints:
+            raise self._nameless(stream, "actuators", self.actuators)
+        joint = self.mapping.joints.get(name, name)
+        if joint is None:
+            return None
+        drives = self._drives(joint)
+        if len(drives) == 1:
+            return f"ctrl.{drives[0]}"
+        if drives:
+            raise UserError(
+                f"{self.recording.path}: {len(drives)} actuators drive joint "
+                f'"{joint}" ({listed(drives)}); say by actuators: in --mapping which '
+                f"one {stream.source}.{name} is"
+            )
+        known = {*self.actuators, *self.joints} - {joint}
+        raise UserError(
+            f'{self.recording.path}: the model has no actuator for "{joint}" of '
+            f"{stream.source}{nearest(joint, known)} (actuators: in --mapping names "
+            "it, or leaves it out)"
+        )
+
+    def _drives(self, joint: str) -> list[str]:
+        of_joint = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        return [
+            name
+            for i, name in enumerate(self.actuators)
+            if mujoco.mjtTrn(int(self.model.actuator_trntype[i])) in of_joint
+            and self.joints[int(self.model.actuator_trnid[i, 0])] == joint
+        ]
+
+    def _check_mapping(self) -> None:
+        channels = [c for s in self.recording.streams for c in s.channels]
+        names = [n for s in self.recording.streams for n in s.names if s.role]
+        for key, known in (
+            ("joints", names),
+            ("actuators", names),
+            ("columns", channels),
+        ):
+            for theirs in getattr(self.mapping, key):
+                if theirs not in known:
+                    raise UserError(
+                        f'{self.mapping.source}: {key} name "{theirs}", which '
+                        f"{self.recording.path} does not have"
+                        f"{nearest(theirs, known) or f' (it has {listed(known)})'}"
+                    )
+
+    def _nameless(self, stream: Stream, key: str, known: list[str]) -> UserError:
+        return UserError(
+            f"{self.recording.path}: {stream.source} has {len(stream.names)} entries "
+            f'without names; say whose they are, in order, by "{key}: [...]" in '
+            f"--mapping (the model has {listed(known)})"
+        )
+
+    def _twice(self, column: str, first: Use, channel: str) -> UserError:
+        before = first.stream.channels[first.index]
+        if before == channel:
+            return UserError(
+                f"{self.recording.path}: {channel} is in messages that list different "
+                "joints, so its rows cannot be put together"
+            )
+        return UserError(
+            f'{self.recording.path}: "{before}" and "{channel}" both become {column}; '
+            "leave one out in --mapping"
+        )
+
+    def _missing(self, column: str, unused: list[str]) -> UserError:
+        role, _, name = column.partition(".")
+        entries = [n for s in self.recording.streams for n in s.names if s.role == role]
+        hint = nearest(name, [e for e in entries if e in self.mapping.joints])
+        others = f" (not used: {listed(unused)})" if unused and not hint else ""
+        return UserError(
+            f'{self.recording.path}: nothing gives "{column}", which the model needs'
+            f"{hint}{others}"
+        )
