@@ -3,6 +3,7 @@
 from pathlib import Path
 from statistics import median
 
+from benchmarks._cells import read_rows
 from benchmarks._common import markdown_table
 from benchmarks.gap_real import MACHINES
 from benchmarks.gap_score import (
@@ -20,6 +21,8 @@ from benchmarks.gap_score import (
     shares,
     wilson,
 )
+from benchmarks.gap_times import EFFECTS
+from benchmarks.gap_times import GOALS as TIME_GOALS
 from benchmarks.loop import HIDDEN
 
 
@@ -139,26 +142,26 @@ def loop(folder: Path) -> list[str]:
 
 def times(folder: Path) -> list[str]:
     """Seconds of the whole command."""
-    from easi_jax.io.files import read_json
-
-    path = folder / "gap_times.json"
-    if not path.is_file():
-        return ["## Time of train.gap", "Not run: `python -m benchmarks.gap_times`."]
-    r = read_json(path)
-    lines = [
-        (
-            c["mechanism"],
-            ", ".join(c["truth"]),
-            ", ".join(c["named"]) or "none",
-            f"{c['seconds']:.0f}",
-            f"{c['goal_s']}, {'met' if c['seconds'] <= c['goal_s'] else '**missed**'}",
-        )
-        for c in r["cases"]
-    ]
+    out, rows = ["## Time of train.gap"], read_rows(folder / "gap_times.jsonl")
+    if not rows:
+        return [*out, "Not run: `python -m benchmarks.gap_times`."]
+    done = {(r["mechanism"], r["effect"]): r for r in rows}
+    lines: list[tuple[object, ...]] = []
+    for mechanism, goal in TIME_GOALS.items():
+        for effect in EFFECTS:
+            c = done.get((mechanism, effect))
+            if c is None:
+                lines.append((mechanism, effect, "not run"))
+                continue
+            met = "met" if c["seconds"] <= goal else "**missed**"
+            named = ", ".join(c["named"]) or "none"
+            told = (f"{c['seconds']:.0f}", f"{goal}, {met}")
+            lines.append((mechanism, ", ".join(c["truth"]), named, *told))
+    cores = ", ".join(sorted({str(r["cores"]) for r in rows}))
     return [
-        "## Time of train.gap",
+        *out,
         f"`python -m benchmarks.gap_times`: from a first start, nothing cached, on "
-        f"{r['cores']} cores.",
+        f"{cores} cores.",
         markdown_table(("machine", "hidden", "named", "s", "goal [s]"), lines),
     ]
 

@@ -3,7 +3,8 @@
     python -m benchmarks.gap_times
 
 A generated case each (``tests/gap_cases``), nothing cached; about half an hour on an
-otherwise idle machine. Results go to ``benchmarks/results/gap_times.json``.
+otherwise idle machine. Each is a line of ``benchmarks/results/gap_times.jsonl`` and is
+not run again there.
 """
 
 import dataclasses
@@ -11,13 +12,29 @@ import json
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
-from benchmarks._common import first_start
-from train._command import main, say, show_table
+from benchmarks._cells import Share, run_cells
+from benchmarks._common import RESULTS, first_start
+from train._command import main
 
 GOALS = {"pendulum": 90, "cartpole": 180, "leg": 300, "arm6": 600}  # s, on two cores
 EFFECTS = ("coulomb_friction", "actuator_lag")
 _LIMIT = 3600  # s
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """A machine and what it hides."""
+
+    mechanism: str
+    effect: str
+    seed: int
+
+    @property
+    def key(self) -> str:
+        """All of it, for files."""
+        return f"{self.mechanism}, {self.effect}, seed {self.seed}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,50 +43,44 @@ class Config:
 
     seed: int = 30_000
     """Of the cases."""
+    shard: str = "1/1"
+    """Which part of the cases this process runs."""
+    only: str = ""
+    """One case, by its name as --list shows it."""
+    list: bool = False
+    """Show the cases, and which are done, without running any."""
+    out: Path = RESULTS / "gap_times.jsonl"
+    """Where a line for each case is added."""
 
 
 def run(config: Config) -> None:
     """Runs the command in processes and compilation caches of their own."""
-    from benchmarks._common import command_of, write_result
+    cells = [Cell(m, e, config.seed) for m in GOALS for e in EFFECTS]
+    share = Share(config.shard, config.only, config.list, config.out)
+    run_cells(cells, share, solve, lambda row: f"{row['seconds']:.0f} s")
+
+
+def solve(cell: Cell) -> dict[str, Any]:
+    """Draws a case, and times what is said of it."""
+    from easi_jax.errors import UserError
     from tests.gap_cases import CaseError, draw_case
 
-    rows = []
-    for mechanism, goal in GOALS.items():
-        for effect in EFFECTS:
-            with tempfile.TemporaryDirectory() as folder:
-                case = Path(folder) / "case"
-                try:
-                    draw_case(
-                        config.seed, "single", case, effect=effect, mechanism=mechanism
-                    )
-                except CaseError as error:
-                    say(f"{mechanism}, {effect}: no case ({error})")
-                    continue
-                seconds, told = timed(case, Path(folder))
-                answer = json.loads((case / "answer.json").read_text())
-            rows.append(
-                {
-                    "mechanism": mechanism,
-                    "truth": [f"{e['effect']}@{e['at']}" for e in answer["effects"]],
-                    "named": [f"{e['effect']}@{e['at']}" for e in told["effects"]],
-                    "seconds": seconds,
-                    "goal_s": goal,
-                }
-            )
-            say(f"{mechanism}, {effect}: {seconds:.0f} s")
-    path = write_result(
-        "gap_times",
-        command_of("benchmarks.gap_times", config),
-        config,
-        cores=len(os.sched_getaffinity(0)),
-        cases=rows,
-    )
-    show_table(
-        "train.gap from a first start",
-        ("machine", "hidden", "seconds", "goal"),
-        [(r["mechanism"], r["truth"][0], r["seconds"], r["goal_s"]) for r in rows],
-    )
-    say(f"written: {path}")
+    with tempfile.TemporaryDirectory() as folder:
+        case = Path(folder) / "case"
+        drawn = {"effect": cell.effect, "mechanism": cell.mechanism}
+        try:
+            draw_case(cell.seed, "single", case, **drawn)
+        except CaseError as error:
+            raise UserError(f"{cell.key}: {error}; give another --seed") from error
+        seconds, told = timed(case, Path(folder))
+        answer = json.loads((case / "answer.json").read_text())
+    return {
+        "truth": [f"{e['effect']}@{e['at']}" for e in answer["effects"]],
+        "named": [f"{e['effect']}@{e['at']}" for e in told["effects"]],
+        "seconds": seconds,
+        "goal_s": GOALS[cell.mechanism],
+        "cores": len(os.sched_getaffinity(0)),
+    }
 
 
 def timed(case: Path, folder: Path) -> tuple[float, dict]:
