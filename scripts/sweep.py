@@ -78,11 +78,10 @@ def run(config: Config) -> None:
         return
     failed = []
     for i, job in enumerate(jobs, 1):
-        error = job.exception()
-        if error is not None:
+        if job.exception() is not None:
             failed.append(i)
-            reason = str(error).strip().splitlines()[-1]
-            say(f"part {i} failed: {reason} (see {job.paths.stderr})")
+            said = (job.stderr() or job.state).strip().splitlines()[-1]
+            say(f"part {i} failed: {said} (see {job.paths.stderr})")
     if failed:
         raise UserError(
             f"{len(failed)} of {len(jobs)} jobs failed; the same command runs what is "

@@ -105,11 +105,9 @@ def test_dockerfile_runs_a_command() -> None:
     assert re.fullmatch(r"python:3\.\d+-slim", image)
 
 
-@pytest.mark.parametrize(
-    "path", sorted((ROOT / "scripts").glob("*.py")), ids=lambda p: p.stem
-)
-def test_commands_in_docstrings_parse(path: Path) -> None:
-    found = list(commands(path.read_text()))
+@pytest.mark.parametrize("name", ["notebooks", "sweep"])
+def test_commands_in_docstrings_parse(name: str) -> None:
+    found = list(commands((ROOT / "scripts" / f"{name}.py").read_text()))
     assert found
     for words in found:
         parsed(words)

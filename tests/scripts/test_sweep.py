@@ -70,19 +70,19 @@ def test_done_cells_are_skipped_and_failures_told(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "part 2/2" in done.stdout and "5 cells are done" in done.stdout
     assert (tmp_path / "paper.jsonl").read_text() == text  # nothing ran again
-    # No space for a UDR training: the jobs fail, and it is said where to look.
+    # No place for a UDR training: the jobs fail, and it is said why and where to look.
     (tmp_path / "paper.jsonl").unlink()
     (tmp_path / "udr").write_text("a file in the way")
     done = call(tmp_path, *CELLS, "--jobs", 2)
     assert done.returncode == 2
-    assert "part 1 failed" in done.stdout and "logs" in done.stdout
+    assert "part 1 failed: FileExistsError" in done.stdout and "logs" in done.stdout
     assert done.stderr.startswith("error: 2 of 2 jobs failed")
 
 
 @pytest.mark.slow
 @without_submitit
 def test_two_jobs_run_real_cells(tmp_path: Path) -> None:
-    steps = ("--env-steps", 1500)
+    steps = ("--env-steps", 2500)
     done = call(tmp_path, *CELLS, *steps, "--jobs", 2)
     assert done.returncode == 0, done.stdout + done.stderr
     lines = (tmp_path / "paper.jsonl").read_text().splitlines()
