@@ -46,7 +46,7 @@ def started(script: Path, folder: Path, *arguments: str) -> list[str]:
 
 def test_there_is_one_for_each_kind_of_job() -> None:
     names = {p.stem for p in BATCH}
-    assert names == {"one_gpu", "one_node", "cells"}
+    assert names == {"one_gpu", "one_node", "several_nodes", "cells"}
 
 
 @pytest.mark.parametrize("script", BATCH, ids=lambda p: p.stem)
