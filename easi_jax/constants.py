@@ -14,6 +14,8 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import smooth, support
 
+from easi_jax.mesh import own_device
+
 _ELIMINATE_UP_TO = 24
 
 
@@ -70,7 +72,7 @@ def set_const(m: mjx.Model) -> mjx.Model:
     m = m.replace(body_subtreemass=subtree @ mass)
     if m.nv == 0:
         return m
-    d = mjx.make_data(m).replace(qpos=m.qpos0)
+    d = mjx.make_data(m, own_device()).replace(qpos=m.qpos0)
     d = smooth.com_pos(m, smooth.kinematics(m, d))
     d = smooth.tendon(m, d)
     d = smooth.transmission(m, smooth.tendon_armature(m, smooth.crb(m, d)))

@@ -6,7 +6,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from easi_jax import distributed
 
 AXIS = "device"
 
@@ -15,6 +17,11 @@ def make_mesh(devices: int | None = None) -> Mesh:
     """A one-dimensional mesh over the first ``devices`` devices (default: all)."""
     found = jax.devices()
     return Mesh(np.array(found[: devices or len(found)]), (AXIS,))
+
+
+def own_device() -> Any:
+    """This process's first device; mjx takes the first of all, another host's."""
+    return jax.local_devices()[0]
 
 
 def sharded_map(
@@ -30,6 +37,7 @@ def sharded_map(
     ``shared`` goes whole to every device. The axis is padded by repetition where it
     does not divide, so that no device count is a special case; each slice has a
     multiple of ``multiple`` rows. A device whose slice is nothing but padding idles.
+    With several processes the result is gathered on all: each can read only its own.
     """
     n = jax.tree.leaves(sharded)[0].shape[0]
     pad = -n % (mesh.size * multiple)
@@ -57,4 +65,6 @@ def sharded_map(
         check_vma=False,
     )
     out = mapped(jax.tree.map(padded, sharded), *shared)
+    if distributed.count() > 1:
+        out = jax.lax.with_sharding_constraint(out, NamedSharding(mesh, whole))
     return jax.tree.map(lambda x: x[:n], out) if pad else out

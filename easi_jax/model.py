@@ -17,6 +17,7 @@ from easi_jax.constants import set_const
 from easi_jax.drives import TorqueSpeed
 from easi_jax.effects import Effects
 from easi_jax.errors import UserError
+from easi_jax.mesh import own_device
 from easi_jax.quantities import length_of, long_axis, unit_inertia
 
 Sense = Callable[[mjx.Model, mjx.Data], jax.Array]
@@ -106,7 +107,7 @@ def put_model(
     writers = resolve(mj_model, every)
     opened = open_gates(mj_model, [a for p in every for a in p])
     try:
-        put = mjx.put_model(opened, impl="jax")
+        put = mjx.put_model(opened, own_device(), impl="jax")
     except NotImplementedError as error:
         reason = " ".join(str(error).split())
         raise UserError(f"MJX cannot simulate this model: {reason}") from error

@@ -15,6 +15,7 @@ from easi_jax import effects, solver
 from easi_jax.backlash import first_rotor
 from easi_jax.effects import Effects
 from easi_jax.equality import with_velocity_products
+from easi_jax.mesh import own_device
 from easi_jax.quantities import scalar_places
 from easi_jax.scalarize import scalarized
 from easi_jax.small_linalg import unroll_small
@@ -64,7 +65,7 @@ def at_rest(model: Any, qpos: jax.Array, qvel: jax.Array) -> Physics:
 
 def data_at(model: Any, state: Physics, ctrl: jax.Array) -> mjx.Data:
     """The `mjx.Data` of a state, before `forward`."""
-    return mjx.make_data(model.mjx).replace(
+    return mjx.make_data(model.mjx, own_device()).replace(
         qpos=state.qpos,
         qvel=state.qvel,
         act=state.act,

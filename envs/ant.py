@@ -20,6 +20,7 @@ from mujoco.mjx._src import support
 from easi_jax.action_map import ActionMap
 from easi_jax.env import EnvState, advance, start
 from easi_jax.machine import Machine
+from easi_jax.mesh import own_device
 from easi_jax.model import Model
 from easi_jax.physics import Physics
 from envs.frames import matrix, roll_yaw
@@ -180,10 +181,10 @@ class FootLoads:
     def of(cls, m: mujoco.MjModel) -> "FootLoads":
         """Finds the contacts of the feet; the floor comes first in every pair."""
         with jax.ensure_compile_time_eval():
-            put = mjx.put_model(m, impl="jax")
+            put = mjx.put_model(m, own_device(), impl="jax")
 
             def found() -> jax.Array:
-                data: Any = mjx.collision(put, mjx.make_data(put))
+                data: Any = mjx.collision(put, mjx.make_data(put, own_device()))
                 return data._impl.contact.geom
 
             pairs = np.asarray(jax.jit(found)())  # the compiler drops all else

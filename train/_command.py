@@ -20,6 +20,12 @@ LOG_SECONDS = 10.0
 _NUMBER = re.compile(r"[-+]?\d|nan|-?inf|$")
 USER_ERROR = 2
 INTERRUPTED = 130
+_PARTED = (
+    "error: another process of this run has ended, so this one ends too; start all "
+    "again with --resume, and they go on from the last checkpoint"
+)
+# What gloo, NCCL and jax's coordination service say of a lost process.
+_GONE = ("Gloo", "gloo", "NCCL", "Connection", "UNAVAILABLE", "DEADLINE", "ABORTED")
 
 
 class Progress(Protocol):
@@ -58,13 +64,18 @@ def main(
 
     config = tyro.cli(config_class, prog=f"python -m {name}", args=args)
     try:
+        from easi_jax import distributed
         from easi_jax.errors import UserError
 
         try:
             with _interrupt.remembered():
+                if getattr(config, "distributed", False):
+                    distributed.start()
                 run(config)
+                distributed.stop()
         except UserError as error:
-            _stop(f"error: {' '.join(str(error).split())}", USER_ERROR, args is None)
+            said = f"error: {' '.join(str(error).split())}" if _heard() else ""
+            _stop(said, USER_ERROR, args is None)
     except BrokenPipeError:
         # The reader of our output has gone, as in `... | head`.
         sys.stderr.close()
@@ -72,7 +83,10 @@ def main(
     except BaseException as error:
         # An event loop or a callback turns the interrupt into an error of its own.
         told = isinstance(error, KeyboardInterrupt) or _interrupt.asked()
+        if not told and _parted(error):
+            _stop(_PARTED, 1, args is None)
         if not told or isinstance(error, SystemExit):
+            _leave_others(error)
             raise
         out = getattr(config, "out", None)
         _stop(_interrupted(out, hasattr(config, "resume")), INTERRUPTED, args is None)
@@ -85,6 +99,8 @@ def show_table(
     from rich.table import Table
     from rich.text import Text
 
+    if not _heard():
+        return
     table = Table()
     cells = [[_text(cell) for cell in row] for row in rows]
     for index, column in enumerate(columns):
@@ -99,6 +115,8 @@ def show_table(
 
 def say(message: str) -> None:
     """Prints one line of result, as it is."""
+    if not _heard():
+        return
     _console(sys.stdout).print(message, markup=False, highlight=False, soft_wrap=True)
 
 
@@ -115,7 +133,9 @@ def progress(
         patience: nothing is shown of what takes no longer [s].
     """
     meter = Meter(total, done)
-    if sys.stderr.isatty():
+    if not _heard():
+        yield _Silent()
+    elif sys.stderr.isatty():
         with _bar(name, meter, patience) as shown:
             yield shown
     else:
@@ -177,6 +197,11 @@ def duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+class _Silent:
+    def advance(self, n: int = 1, **fields: float | int | str) -> None:
+        _interrupt.check()
 
 
 class _Log:
@@ -273,8 +298,41 @@ def _interrupted(out: Path | str | None, resumable: bool) -> str:
     return f"interrupted before the first checkpoint; nothing to resume in {out}"
 
 
+def _heard() -> bool:
+    """Whether this process speaks: of several in one run, the first does."""
+    from easi_jax import distributed
+
+    return distributed.leader()
+
+
+def _parted(error: BaseException) -> bool:
+    """Whether a program failed because another process of this run is gone."""
+    from easi_jax import distributed
+
+    if distributed.count() == 1:
+        return False
+    import jax
+
+    return isinstance(error, jax.errors.JaxRuntimeError) and any(
+        word in str(error) for word in _GONE
+    )
+
+
+def _leave_others(error: BaseException) -> None:
+    """Ends a process of several at once: at its end Python would wait for them, and
+    they for it."""
+    from easi_jax import distributed
+
+    if distributed.count() > 1 and not isinstance(error, SystemExit):
+        import traceback
+
+        traceback.print_exception(error)
+        os._exit(1)
+
+
 def _stop(message: str, status: int, leave: bool) -> NoReturn:
-    print(message, file=sys.stderr)
+    if message:
+        print(message, file=sys.stderr)
     if not leave:
         raise SystemExit(status)
     # Not by the interpreter's end: it waits for what still compiles, and XLA's threads

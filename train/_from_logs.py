@@ -124,7 +124,7 @@ def _ready_finish(
     import jax.numpy as jnp
     import numpy as np
 
-    from easi_jax import replay
+    from easi_jax import distributed, replay
     from easi_jax.identify import effective_noise, estimate
     from easi_jax.information import shift_start
     from easi_jax.log_data import misfit_of, outlier_weights, segments_from_runs
@@ -174,7 +174,7 @@ def _ready_finish(
         misfit, weighed, center = hidden, pieces, mean
         for k in range(_PASSES):
             given = (center, cov, weighed, misfit, 0 if k else _ROBUST, k > 0)
-            found, error = compiled(*placed(given))
+            found, error = distributed.local(compiled(*placed(given)))
             misfit = jnp.maximum(misfit_of(error, assumed, weighed.weight), hidden)
             weight = outlier_weights(error, assumed, misfit, _OUTLIER)
             weighed = replace(pieces, weight=pieces.weight * weight)

@@ -215,6 +215,8 @@ def _saved(folder: Any, name: str, make: Any, checkpoints: Any, refined: bool) -
     """A result that is costly to make again, kept as a checkpoint."""
     import jax
 
+    from easi_jax import distributed
+
     place = folder.checkpoints / name
     found = checkpoints.restore(
         place, jax.eval_shape(make), config_hash=folder.config_hash
@@ -224,7 +226,7 @@ def _saved(folder: Any, name: str, make: Any, checkpoints: Any, refined: bool) -
     say("least squares on the paired data ..." if refined else "Fisher information ...")
     result = make()
     checkpoints.save(place, 1, result, config_hash=folder.config_hash)
-    return result
+    return distributed.local(result)
 
 
 def held_out_errors(

@@ -42,6 +42,7 @@ def run_stage(
     """
     import jax
 
+    from easi_jax import distributed
     from easi_jax.io import checkpoints
 
     folder = run.checkpoints / name
@@ -75,7 +76,7 @@ def run_stage(
             last = lines[-1][1] if lines else {}
             shown = {k: v for k, v in last.items() if "/" not in k}
             meter.advance(n, **shown)
-    return state
+    return distributed.local(state)
 
 
 def placed(tree: Any) -> Any:
@@ -88,6 +89,7 @@ def placed(tree: Any) -> Any:
     import jax.numpy as jnp
     from jax.sharding import NamedSharding, PartitionSpec
 
+    from easi_jax import distributed
     from easi_jax.mesh import make_mesh
 
     def strong(x: Any) -> Any:
@@ -95,14 +97,24 @@ def placed(tree: Any) -> Any:
         return x.astype(x.dtype) if jnp.issubdtype(x.dtype, jnp.number) else x
 
     everywhere = NamedSharding(make_mesh(), PartitionSpec())
-    return jax.device_put(jax.tree.map(strong, tree), everywhere)
+    tree = jax.tree.map(strong, tree)
+    if distributed.count() > 1:
+        return distributed.everywhere(tree, everywhere)
+    return jax.device_put(tree, everywhere)
 
 
 def started(work: Callable[[], T]) -> Callable[[], T]:
     """Begins ``work`` beside what follows; the function waits for its result.
 
-    For compiling, which leaves other cores and the interpreter mostly free.
+    For compiling, which leaves other cores and the interpreter mostly free. Several
+    processes of one run must begin their programs in one order, so there it is done
+    at once.
     """
+    from easi_jax import distributed
+
+    if distributed.count() > 1:
+        done = work()
+        return lambda: done
     pool = ThreadPoolExecutor(1)
     result = pool.submit(work).result
     pool.shutdown(wait=False)

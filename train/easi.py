@@ -86,6 +86,9 @@ class Config:
     """Go on with the run in the folder."""
     overwrite: bool = False
     """Delete the run in the folder first."""
+    distributed: bool = False
+    """One of several processes (srun, mpirun, Kubernetes) whose devices share the
+    work."""
 
 
 def run(config: Config) -> None:

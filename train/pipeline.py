@@ -65,6 +65,9 @@ class Config:
     """Episodes of the final evaluation."""
     overwrite: bool = False
     """Delete the run in the folder first."""
+    distributed: bool = False
+    """One of several processes (srun, mpirun, Kubernetes) whose devices share the
+    work."""
 
 
 def run(config: Config) -> None:
@@ -84,6 +87,7 @@ def run(config: Config) -> None:
     import jax.numpy as jnp
     import numpy as np
 
+    from easi_jax import distributed
     from easi_jax.errors import UserError
     from easi_jax.io.runs import RunFolder
     from easi_jax.pipeline import (
@@ -138,6 +142,7 @@ def run(config: Config) -> None:
         say(f"compiled in {compiled - begin:.0f} s; running ...")
         out = jax.block_until_ready(program(keys, target))
         seconds = time.monotonic() - compiled
+        out = distributed.local(out)
         info = jax.device_get(out["search"])
         for step, row in search_rows(config.seeds, env.space.names, pipe.space.to_si)(
             0, info

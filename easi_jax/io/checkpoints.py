@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from easi_jax import distributed
 from easi_jax.errors import UserError
 from easi_jax.io.files import os_reason, read_json, to_json
 
@@ -49,6 +50,8 @@ class _UnusableError(Exception):
 def save(folder: Path, step: int, state: Any, *, config_hash: str) -> Path:
     """Writes ``state`` as the checkpoint of ``step``; keeps the newest ``KEEP``.
 
+    Of several processes of one run, the leader alone writes.
+
     Args:
         folder: where the checkpoints of one stage live; made if missing.
         step: counts up; an older checkpoint of the same step is replaced.
@@ -58,14 +61,17 @@ def save(folder: Path, step: int, state: Any, *, config_hash: str) -> Path:
     Raises:
         UserError: it cannot be written; the earlier ones are as they were.
     """
-    names, leaves = _named_leaves(jax.device_get(_raw_keys(state)))
+    final = folder / f"step_{step:012d}"
+    raw = _raw_keys(state)
+    if not distributed.leader():
+        return final
+    names, leaves = _named_leaves(jax.device_get(raw))
     types = _leaf_types(state)
     kinds = jax.tree.leaves(jax.eval_shape(lambda: _raw_keys(state)))
     arrays = {
         n: np.asarray(x, k.dtype) for n, x, k in zip(names, leaves, kinds, strict=True)
     }
     temp = folder / f".writing-{os.getpid()}"
-    final = folder / f"step_{step:012d}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _remove_leftovers(folder)
@@ -111,6 +117,8 @@ def restore(
 ) -> Restored | None:
     """Reads the newest good checkpoint; None where there is none at all.
 
+    Of several processes of one run, the leader alone reads, and tells the others.
+
     Args:
         folder: as given to ``save``.
         target: the state's structure, such as ``jax.eval_shape(lambda: state)``.
@@ -121,15 +129,28 @@ def restore(
         UserError: there are checkpoints, and each is cut short, damaged, of another
             format, another configuration or other shapes.
     """
+    found = distributed.from_leader(lambda: _newest(folder, target, config_hash))
+    if found is None:
+        return None
+    values, step, notes = found
+    names, _ = _named_leaves(jax.eval_shape(_raw_keys, target))
+    wanted, structure = jax.tree.flatten(target)
+    placed = [_place(values[n], w) for n, w in zip(names, wanted, strict=True)]
+    return Restored(jax.tree.unflatten(structure, placed), step, notes)
+
+
+def _newest(
+    folder: Path, target: Any, config_hash: str | None
+) -> tuple[dict[str, np.ndarray], int, tuple[str, ...]] | None:
     notes = []
     for step in reversed(steps(folder)):
         path = folder / f"step_{step:012d}"
         try:
-            state = _read(path, target, config_hash)
+            values = _read(path, target, config_hash)
         except _UnusableError as error:
             notes.append(f"checkpoint {path} is unusable: {error}")
         else:
-            return Restored(state, step, tuple(notes))
+            return values, step, tuple(notes)
     if not notes:
         return None
     raise UserError(
@@ -138,7 +159,8 @@ def restore(
     )
 
 
-def _read(path: Path, target: T, config_hash: str | None) -> T:
+def _read(path: Path, target: Any, config_hash: str | None) -> dict[str, np.ndarray]:
+    """Arrays by the names of `_named_leaves`, keys as their integers."""
     try:
         meta = read_json(path / "meta.json")
         form, config = meta["format"], meta["config"]
@@ -154,25 +176,28 @@ def _read(path: Path, target: T, config_hash: str | None) -> T:
     names, leaves = _named_leaves(jax.eval_shape(_raw_keys, target))
     values = {n: np.empty(x.shape, x.dtype) for n, x in zip(names, leaves, strict=True)}
     stored = {n: x for n, x in values.items() if x.size}
-    values |= _orbax_restore(path / "state", stored)
-    wanted, structure = jax.tree.flatten(target)
-    return jax.tree.unflatten(
-        structure,
-        [_place(values[n], w) for n, w in zip(names, wanted, strict=True)],
+    return values | _orbax_restore(path / "state", stored)
+
+
+def _checkpointer() -> Any:
+    """orbax waits for the other processes unless told that the leader is alone."""
+    import orbax.checkpoint as ocp
+
+    if distributed.count() == 1:
+        return ocp.StandardCheckpointer()
+    alone = ocp.options.MultiprocessingOptions(
+        primary_host=0, active_processes={0}, barrier_sync_key_prefix="leader"
     )
+    return ocp.StandardCheckpointer(multiprocessing_options=alone)
 
 
 def _orbax_save(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    import orbax.checkpoint as ocp
-
-    with _quiet(), ocp.StandardCheckpointer() as checkpointer:
+    with _quiet(), _checkpointer() as checkpointer:
         checkpointer.save(path.absolute(), arrays)
 
 
 def _orbax_restore(path: Path, target: dict[str, np.ndarray]) -> dict[str, Any]:
-    import orbax.checkpoint as ocp
-
-    with _quiet(), ocp.StandardCheckpointer() as checkpointer:
+    with _quiet(), _checkpointer() as checkpointer:
         return checkpointer.restore(path.absolute(), target)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from easi_jax import distributed
 from easi_jax.errors import UserError
 
 _NON_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
@@ -25,9 +26,13 @@ def os_reason(error: OSError) -> str:
 def atomic_write(path: Path, data: str | bytes) -> None:
     """Writes ``path`` so that it holds the old content or the new, never a part.
 
+    Of several processes of one run, the leader alone writes.
+
     Raises:
         UserError: the file cannot be written; what was there before is kept.
     """
+    if not distributed.leader():
+        return
     raw = data.encode() if isinstance(data, str) else data
     temp = None
     try:

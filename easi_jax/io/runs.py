@@ -10,6 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from easi_jax import distributed
 from easi_jax.errors import UserError
 from easi_jax.io.files import (
     atomic_write,
@@ -23,7 +24,7 @@ from easi_jax.io.versions import versions
 
 FORMAT = 1
 # Where and how a run is started; these do not change what it computes.
-VOLATILE = ("out", "resume", "overwrite")
+VOLATILE = ("out", "resume", "overwrite", "distributed")
 
 _CONFIG = "config.json"
 _LOCK = ".lock"
@@ -31,6 +32,9 @@ _LOCK = ".lock"
 
 class RunFolder:
     """One run's files, locked against a second process; use ``open`` and ``with``.
+
+    Of several processes of one run (`easi_jax.distributed`) the leader alone touches
+    the folder; the others know of it what the leader tells them.
 
     Attributes:
         path: the folder.
@@ -82,6 +86,24 @@ class RunFolder:
             raise UserError("--resume and --overwrite exclude each other: choose one")
         folder = Path(path)
         plain = {k: v for k, v in _as_mapping(config).items() if k not in VOLATILE}
+        opened: list[Self] = []
+
+        def begin() -> bool:
+            opened.append(cls._begun(folder, plain, command, resume, overwrite))
+            return opened[0].resumed
+
+        resumed = distributed.from_leader(begin)
+        return opened[0] if opened else cls(folder, plain, -1, resumed)
+
+    @classmethod
+    def _begun(
+        cls,
+        folder: Path,
+        plain: dict[str, Any],
+        command: str,
+        resume: bool,
+        overwrite: bool,
+    ) -> Self:
         _refuse_foreign(folder)
         lock = _acquire(folder)
         try:
@@ -119,11 +141,13 @@ class RunFolder:
 
     def log(self, stage: str, step: int, values: Mapping[str, Any]) -> None:
         """Records scalars of one step of a stage (see ``MetricsLog``)."""
-        self._log().write(stage, step, values)
+        if distributed.leader():
+            self._log().write(stage, step, values)
 
     def rewind(self, stage: str, step: int) -> None:
         """Forgets metrics of ``stage`` after ``step``, where a checkpoint resumed."""
-        self._log().rewind(stage, step)
+        if distributed.leader():
+            self._log().rewind(stage, step)
 
     def close(self) -> None:
         """Closes the metrics and lets go of the folder; may be called twice."""
