@@ -62,7 +62,7 @@ def read_excite_problem(config: Any) -> ExciteProblem:
     _check_numbers(config, LEAD)
     check_names(config.effects)
     _check_out(config)
-    model = read_model(config.model)
+    model = read_model(config.model, config.allow_assets)
     m = model.mj_model
     if not m.nu:
         raise UserError(f"{config.model}: the model has no actuator to excite")

@@ -39,6 +39,9 @@ class Config:
     model: Path | None = None
     """MJCF that the robot's model came from, for mjcf; a built-in robot's own, and that
     of a search in logs, where not given."""
+    allow_assets: tuple[Path, ...] = ()
+    """Files, or folders with all below them, that the model may read besides those in
+    its own folder (meshes, textures, includes)."""
 
 
 def run(config: Config) -> None:
@@ -204,9 +207,10 @@ def _model_of(config: Config, settings: dict[str, Any]) -> tuple[Path, Any, Any]
 
     if settings.get("model"):  # of measured logs
         path = Path(config.model or settings["model"])
-        return path, load_model(path), None
+        return path, load_model(path, config.allow_assets), None
     env = env_of(config.run_folder, settings, config.env)
     if config.model is not None:
+        load_model(config.model, config.allow_assets)
         return config.model, env.mj_model, env.dt
     if env.name not in REGISTRY:
         raise UserError(

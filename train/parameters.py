@@ -21,6 +21,9 @@ class Config:
 
     model: Path
     """MuJoCo model (MJCF) of the machine."""
+    allow_assets: tuple[Path, ...] = ()
+    """Files, or folders with all below them, that the model may read besides those in
+    its own folder (meshes, textures, includes)."""
     out: Path = Path("parameters.yaml")
     """Parameter file to write."""
     data: tuple[Path, ...] = ()
@@ -44,7 +47,7 @@ def run(config: Config) -> None:
             f"{config.out} is there already: name another file with --out, or replace "
             "it with --overwrite"
         )
-    m = load_model(config.model)
+    m = load_model(config.model, config.allow_assets)
     proposals = propose(m)
     verdicts: dict[str, str] = {}
     notes: list[str] = []

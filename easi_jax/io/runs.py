@@ -23,7 +23,7 @@ from easi_jax.io.versions import versions
 
 FORMAT = 1
 # Where and how a run is started; these do not change what it computes.
-VOLATILE = ("out", "resume", "overwrite")
+VOLATILE = ("out", "resume", "overwrite", "allow_assets")
 
 _CONFIG = "config.json"
 _LOCK = ".lock"
