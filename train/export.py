@@ -52,12 +52,13 @@ def run(config: Config) -> None:
         if form not in _FORMS:
             known = ", ".join(_FORMS)
             raise UserError(f'--to "{form}": {known}{nearest(form, _FORMS)}')
-    from easi_jax.io.files import atomic_write, read_json
+    from easi_jax.io.files import atomic_write
+    from easi_jax.io.run_files import read_checked
     from easi_jax.io.runs import read_config
 
     settings, results = read_config(config.run_folder), {}
     if (config.run_folder / "results.json").exists():
-        results = read_json(config.run_folder / "results.json")
+        results = read_checked(config.run_folder / "results.json", {}, "a run's result")
     policies = "methods" in results
     identified = (config.run_folder / "distribution.json").exists()
     has = {"onnx": policies, "stablehlo": policies}
@@ -117,9 +118,9 @@ def _parameter_files(
 ) -> dict[str, str | bytes]:
     from easi_jax.errors import UserError
     from easi_jax.export.randomization import to_yaml
-    from easi_jax.io.files import read_json
+    from easi_jax.io.run_files import read_distribution
 
-    found = read_json(config.run_folder / "distribution.json")
+    found = read_distribution(config.run_folder / "distribution.json")
     first = str(found.get("best_seed", next(iter(found["seeds"]))))
     seed = first if config.seed is None else str(config.seed)
     if seed not in found["seeds"]:
