@@ -30,7 +30,14 @@ _YAML = (
     b"!!python/object/apply:os.system ['touch CANARY']",
     b"!!python/object/new:os.system [touch CANARY]",
     b"!!python/name:os.system",
-    *(b"!!int ''", b"!!bool x", b"!!timestamp x", b"!!float x", b"!!set {a}", b"!!map x"),
+    *(
+        b"!!int ''",
+        b"!!bool x",
+        b"!!timestamp x",
+        b"!!float x",
+        b"!!set {a}",
+        b"!!map x",
+    ),
     *(b"!!binary x", b"!!omap 3", b"!!pairs 3", b"!local 3", b"<<: 3", b"=", b"0x_"),
     *(b"[" * 5000, b"{a: " * 5000, b"- " * 5000, b"&a [*a]", b"&a {b: *a}", b"*none"),
     b"{? [a] : b}",
@@ -125,7 +132,9 @@ def _word(rng: random.Random, raw: bytes) -> bytes:
 
 def _insert(rng: random.Random, raw: bytes) -> bytes:
     at = rng.randint(0, len(raw))
-    what = rng.choice((*_TEXTS, *_HUGE, *_YAML, *_JSON, b"\n" + bomb() + b"\nx: *b19\n"))
+    what = rng.choice(
+        (*_TEXTS, *_HUGE, *_YAML, *_JSON, b"\n" + bomb() + b"\nx: *b19\n")
+    )
     return raw[:at] + what + raw[at:]
 
 
@@ -145,7 +154,9 @@ def _columns(rng: random.Random, raw: bytes) -> bytes:
     i, way = rng.randrange(max(map(len, rows))), rng.randrange(4)
     for row in rows:
         if i < len(row):
-            row[i : i + 1] = ([b""], [row[i]] * 2, [], [row[i].replace(b".", b",")])[way]
+            row[i : i + 1] = ([b""], [row[i]] * 2, [], [row[i].replace(b".", b",")])[
+                way
+            ]
     return b"\n".join(b",".join(row) for row in rows)
 
 
@@ -222,7 +233,7 @@ def _npz(rng: random.Random, raw: bytes) -> bytes:
         text = rng.choice(_HEADERS).encode().ljust(117) + b"\n"
         entry = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + entry[128:]
     elif way == 2:
-        name = rng.choice(("../../evil.npy", "/evil.npy", "x", "run.npy", "\x00.npy"))
+        name = rng.choice(("../../evil.npy", "/evil.npy", "x", "run.npy", "\x01.npy"))
     elif way == 3:
         shape = rng.choice(((3, 4), (), (0,), (1,), (100_000,)))
         kind = rng.choice((np.float16, np.complex128, np.bool_, "U7", "S3", "M8[s]"))

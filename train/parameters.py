@@ -56,7 +56,6 @@ def run(config: Config) -> None:
         verdicts, notes = _verdicts(proposals, _information(config, m, proposals))
         names = ", ".join(p.name for p in config.data)
         head.append(f"What {names} can determine at best is said beside each name.")
-    config.out.parent.mkdir(parents=True, exist_ok=True)
     atomic_write(config.out, as_text(proposals, head, verdicts))
     read_parameter_file(config.out, m)
     rows = [

@@ -112,8 +112,17 @@ def to_json(value: Any, indent: int | None = 2) -> str:
 
 
 def number(value: Any) -> float:
-    """A number read from JSON, the strings for non-finite ones included."""
-    return _NON_FINITE[value] if value in _NON_FINITE else float(value)
+    """A number read from JSON, the strings for non-finite ones included.
+
+    Raises:
+        TypeError, ValueError: it is none.
+    """
+    if isinstance(value, str) and value in _NON_FINITE:
+        return _NON_FINITE[value]
+    try:
+        return float(value)
+    except OverflowError:  # a whole number of hundreds of digits
+        raise ValueError("too large a number") from None
 
 
 def read_json(path: Path) -> Any:

@@ -3,6 +3,7 @@
 import itertools
 import os
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -39,11 +40,19 @@ def read_mjcf(path: Path, allowed: Sequence[Path] = ()) -> mujoco.MjModel:
             not accept it.
     """
     check_assets(path, allowed)
+    said: list[str] = []
+    # Without a handler MuJoCo writes warnings to a file in the working folder.
+    mujoco.set_mju_user_warning(said.append)
     try:
-        return mujoco.MjModel.from_xml_path(str(path))
+        model = mujoco.MjModel.from_xml_path(str(path))
     except (ValueError, RecursionError, MemoryError, mujoco.FatalError) as error:
-        reason = " ".join(str(error).split())
+        reason = " ".join(f"{error} {' '.join(said)}".split())
         raise UserError(f"{path}: MuJoCo cannot read this model: {reason}") from None
+    finally:
+        mujoco.set_mju_user_warning(None)
+    for text in said:
+        warnings.warn(f"{path}: {text}", stacklevel=2)
+    return model
 
 
 def check_assets(path: Path, allowed: Sequence[Path] = ()) -> None:
@@ -67,6 +76,8 @@ def check_assets(path: Path, allowed: Sequence[Path] = ()) -> None:
             if key in _FOLDERS:
                 below.add(value)
             elif key.startswith("file"):
+                if element in _NESTED and not value:
+                    raise UserError(f"{path}: the {element} without a file name")
                 named.add((element in _NESTED, value))
         if len(folders) * len(below) * len(named) > _MOST:
             raise UserError(f"{path}: names too many files and folders")

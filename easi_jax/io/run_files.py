@@ -114,5 +114,5 @@ def checked(content: Any, form: Any, where: str, at: str = "") -> Any:
         raise wrong
     try:
         return number(content) if form is float else content
-    except (ValueError, OverflowError):
+    except ValueError:
         raise wrong from None
