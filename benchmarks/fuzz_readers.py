@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.fuzz_mutations import Case, Evil, Files, bomb
 
-ROOT = Path(__file__).parents[1]
+ARM = Path(__file__).parents[1] / "examples" / "lift_arm"
 SECRET = "secret_of_another_folder"
 
 CART = """<mujoco model="cart"><option timestep="0.01"/><worldbody>
@@ -109,11 +109,10 @@ def _table(extension: str, columns: dict[str, Any] | None = None) -> bytes:
 def _logs(extension: str) -> Callable[[], list[Files]]:
     def good() -> list[Files]:
         few = {k: v for k, v in _columns().items() if k not in ("run", "qvel.slider")}
-        made = [_table(extension), _table(extension, few)]
-        if extension == ".csv":
-            measured = (ROOT / "examples/lift_arm/moves.csv").read_bytes()
-            made.append(b"\n".join(measured.split(b"\n")[:60]))
-        return [{f"log{extension}": raw} for raw in made]
+        return [
+            {f"log{extension}": raw}
+            for raw in (_table(extension), _table(extension, few))
+        ]
 
     return good
 
@@ -125,6 +124,35 @@ def _read_log(extension: str) -> Callable[[Path], object]:
         return read_logs(folder / f"log{extension}", _cart())
 
     return read
+
+
+def _arm_logs() -> list[Files]:
+    """The example's log, its first second and all."""
+    lines = (ARM / "moves.csv").read_bytes().splitlines(keepends=True)
+    return [{"log.csv": b"".join(part)} for part in (lines[:60], lines)]
+
+
+@functools.cache
+def _arm() -> Any:
+    from easi_jax.io.model_file import read_mjcf
+
+    return read_mjcf(ARM / "model.xml")
+
+
+def _read_arm_log(folder: Path) -> object:
+    from easi_jax.io.logs import read_logs
+
+    return read_logs(folder / "log.csv", _arm())
+
+
+def _arm_parameters() -> list[Files]:
+    return [{"p.yaml": (ARM / "parameters.yaml").read_bytes()}]
+
+
+def _read_arm_parameters(folder: Path) -> object:
+    from easi_jax.io.parameter_file import read_parameter_file
+
+    return read_parameter_file(folder / "p.yaml", _arm())
 
 
 def _evil_npz(canary: Path, outside: Path) -> list[Case]:
@@ -303,7 +331,7 @@ def _read_mapping(folder: Path) -> object:
 _PARAMETERS = """parameters:
   - {name: mass, address: body.cart.mass, nominal: 0.3, initial: [0.1, 0.9]}
   - name: damping
-    address: [joint.slider.damping, "joint.*.damping"]
+    address: [joint.slider.damping, "joint.sl*.damping"]
     bounds: [1e-3, .inf]
     scale: linear
     unit: N s/m
@@ -695,12 +723,14 @@ _WORDS = {
 }
 
 READERS = (
-    Reader("CSV logs", 0.16, _logs(".csv"), _read_log(".csv"), _drawn_csv),
+    Reader("CSV logs", 0.13, _logs(".csv"), _read_log(".csv"), _drawn_csv),
+    Reader("CSV log of the example", 0.06, _arm_logs, _read_arm_log),
+    Reader("parameter file of the example", 0.03, _arm_parameters, _read_arm_parameters),
     Reader(
-        "NPZ logs", 0.12, _logs(".npz"), _read_log(".npz"), special=_evil_npz
+        "NPZ logs", 0.11, _logs(".npz"), _read_log(".npz"), special=_evil_npz
     ),
     Reader(
-        "Parquet logs", 0.12, _logs(".parquet"), _read_log(".parquet"),
+        "Parquet logs", 0.11, _logs(".parquet"), _read_log(".parquet"),
         special=_evil_parquet,
     ),
     Reader(
@@ -709,12 +739,12 @@ READERS = (
         _evil_yaml("map.yaml", _mappings),
     ),
     Reader(
-        "parameter files", 0.1, lambda: [{"p.yaml": _PARAMETERS.encode()}],
+        "parameter files", 0.07, lambda: [{"p.yaml": _PARAMETERS.encode()}],
         _read_parameters, _drawn_yaml("p.yaml", _WORDS["p.yaml"], {}),
         _evil_yaml("p.yaml", lambda: [{}]),
     ),
     Reader(
-        "effects files", 0.1, lambda: [{"effects.yaml": _EFFECTS.encode()}],
+        "effects files", 0.09, lambda: [{"effects.yaml": _EFFECTS.encode()}],
         _read_effects, _drawn_yaml("effects.yaml", _WORDS["effects.yaml"], {}),
         _evil_yaml("effects.yaml", lambda: [{}]),
     ),

@@ -19,7 +19,9 @@ _MOST = 100_000  # places that a model may name
 _SKIPPED = (("<!--", "-->"), ("<![CDATA[", "]]>"), ("<?", "?>"), ("<!", ">"))
 _TAG = re.compile(r"<((?:[^\"'>]++|\"[^\"]*+\"|'[^']*+')*+)>")
 _NAME = re.compile(r"[^\s/\"'=]+")
-_ATTRIBUTE = re.compile(r"([^\s\"'=/]++)\s*+=\s*+(?:\"([^\"]*+)\"|'([^']*+)')")
+_ATTRIBUTE = re.compile(
+    r"(?<![^\s\"'/])([^\s\"'=/]++)\s*+=\s*+(?:\"([^\"]*+)\"|'([^']*+)')"
+)
 _REFERENCE = re.compile(r"&(?:#x([0-9a-fA-F]{1,6})|#([0-9]{1,7})|(\w{2,4}));")
 _ENTITIES = {"lt": "<", "gt": ">", "amp": "&", "quot": '"', "apos": "'"}
 
@@ -62,13 +64,15 @@ def check_assets(path: Path, allowed: Sequence[Path] = ()) -> None:
     that names it, and to each folder of a ``compiler`` element.
 
     Raises:
-        UserError: such a file, a folder or a device in place of a file, or no XML.
+        UserError: such a file, a folder or a device in place of a file, a file that
+            includes itself, or no XML.
     """
     if not path.is_file():
         raise UserError(f"{path}: no such model file")
     roots = [path.parent.resolve(), *(place.resolve() for place in allowed)]
-    folders, below, named = {path.parent}, {""}, set[tuple[bool, str]]()
-    todo, seen, tried = [path], {path.resolve()}, set[tuple[bool, Path]]()
+    folders, below, named = {path.parent}, {""}, set[tuple[Path | None, str]]()
+    todo, seen, tried = [path], {path.resolve()}, set[tuple[Path | None, Path]]()
+    leads: dict[Path, set[Path]] = {}
     while todo:
         document = todo.pop()
         folders.add(document.parent)
@@ -77,20 +81,34 @@ def check_assets(path: Path, allowed: Sequence[Path] = ()) -> None:
                 below.add(value)
             elif key.startswith("file"):
                 if element in _NESTED and not value:
-                    raise UserError(f"{path}: the {element} without a file name")
-                named.add((element in _NESTED, value))
+                    raise UserError(f'{path}: "{element}" without a file name')
+                named.add((document.resolve() if element in _NESTED else None, value))
         if len(folders) * len(below) * len(named) > _MOST:
             raise UserError(f"{path}: names too many files and folders")
-        for folder, part, (nested, value) in itertools.product(folders, below, named):
+        for folder, part, (parent, value) in itertools.product(folders, below, named):
             for text in _ways(value):
                 place = folder / part / text
-                if (nested, place) in tried or not os.path.lexists(place):
+                if (parent, place) in tried or not os.path.lexists(place):
                     continue
-                tried.add((nested, place))
+                tried.add((parent, place))
                 real = _confined(path, value, place, roots)
-                if nested and real not in seen:
+                if parent is None:
+                    continue
+                leads.setdefault(parent, set()).add(real)
+                if real not in seen:
                     seen.add(real)
                     todo.append(place)
+    _refuse_circles(path, leads)
+
+
+def _refuse_circles(path: Path, leads: dict[Path, set[Path]]) -> None:
+    """Refuses a file that leads back to itself, which ends MuJoCo's process."""
+    left = {file: set(named) for file, named in leads.items()}
+    while left:
+        ends = {file for file, named in left.items() if not named & left.keys()}
+        if not ends:
+            raise UserError(f"{path}: {min(left).name} includes itself")
+        left = {file: named for file, named in left.items() if file not in ends}
 
 
 def _ways(value: str) -> set[str]:

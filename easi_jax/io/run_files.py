@@ -67,6 +67,10 @@ def read_distribution(path: Path) -> dict[str, Any]:
             raise UserError(f'{path}: seed "{seed}" is no whole number')
     if not n or not seeds:
         raise UserError(f"{path}: no parameter or no seed")
+    if found.get("best_seed") is None:
+        found.pop("best_seed", None)
+    elif str(found["best_seed"]) not in seeds:
+        raise UserError(f"{path}: best_seed is none of its seeds")
     return found
 
 

@@ -33,6 +33,9 @@ def robot(tmp_path: Path) -> Path:
     (folder / "link.xml").symlink_to("../elsewhere/part.xml")
     (folder / "linked").symlink_to("../elsewhere")
     (folder / "nowhere.xml").symlink_to("none.xml")
+    attach = '<mujocoinclude><asset><model name="n" file="{}"/></asset></mujocoinclude>'
+    (folder / "turn.xml").write_text(attach.format("sub/back.xml"))
+    (folder / "sub/back.xml").write_text(attach.format("../turn.xml"))
     os.mkfifo(folder / "pipe.xml")
     return folder
 
@@ -84,12 +87,18 @@ def test_files_of_its_own_folder_are_read(robot: Path, inside: str) -> None:
         ('<compiler assetdir="ROOT/elsewhere"/>' + MESH.format("t.stl"), "outside"),
         (TEXTURE.format("/etc/passwd"), "/etc/passwd lies outside"),
         (f'<asset><model name="x" file="link.xml"/></asset>{BODY}', "lies outside"),
+        ('<asset><model name="n" file="model.xml"/></asset>', "includes itself"),
+        (INCLUDE.format("model.xml"), "model.xml includes itself"),
+        (INCLUDE.format("turn.xml"), "includes itself"),
+        (INCLUDE.format(""), "without a file name"),
+        ("<" + "a" * 300_000 + "/>", "MuJoCo cannot read this model"),
         ("<!-- never closed", "not an XML text"),
         ('<a b="', "not an XML text"),
         ("\0", "not an XML text"),
         ("<worldbody><nothing/></worldbody>", "MuJoCo cannot read this model"),
     ],
 )
+@pytest.mark.timeout(60)
 def test_other_files_are_not(robot: Path, inside: str, said: str) -> None:
     path = model(robot, inside.replace("ROOT", str(robot.parent)))
     with pytest.raises(UserError) as error:
@@ -116,3 +125,14 @@ def test_a_model_that_names_too_much_is_refused_at_once(robot: Path) -> None:
     many = "".join(f'<a file="{i}"/><b meshdir="{i}"/>' for i in range(400))
     with pytest.raises(UserError, match="too many files"):
         read_mjcf(model(robot, many + BODY))
+
+
+def test_mujocos_warnings_leave_no_file(
+    robot: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (robot / "noend").write_bytes(tetrahedron())
+    monkeypatch.chdir(robot.parent)
+    before = sorted(robot.parent.iterdir())
+    with pytest.raises(UserError, match="MuJoCo cannot read this model"):
+        read_mjcf(model(robot, MESH.format("noend")))
+    assert sorted(robot.parent.iterdir()) == before

@@ -50,6 +50,7 @@ def test_a_distribution_with_open_bounds_is_exported(tmp_path: Path) -> None:
         (("seeds", "0", "mean"), [1.0], "seed 0 has not 2 parameters"),
         (("seeds", "0", "unit_covariance", 0), [1.0], "seed 0 has not 2"),
         (("seeds", "²"), DISTRIBUTION_CONTENT["seeds"]["0"], "no whole number"),
+        (("best_seed",), 7, "none of its seeds"),
         (("best_seed",), "x", "best_seed is not a whole number"),
     ],
 )
