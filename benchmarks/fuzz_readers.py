@@ -725,7 +725,9 @@ _WORDS = {
 READERS = (
     Reader("CSV logs", 0.13, _logs(".csv"), _read_log(".csv"), _drawn_csv),
     Reader("CSV log of the example", 0.06, _arm_logs, _read_arm_log),
-    Reader("parameter file of the example", 0.03, _arm_parameters, _read_arm_parameters),
+    Reader(
+        "parameter file of the example", 0.03, _arm_parameters, _read_arm_parameters
+    ),
     Reader(
         "NPZ logs", 0.11, _logs(".npz"), _read_log(".npz"), special=_evil_npz
     ),

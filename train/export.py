@@ -202,13 +202,15 @@ def _model_of(config: Config, settings: dict[str, Any]) -> tuple[Path, Any, Any]
     from importlib import resources
 
     from easi_jax.errors import UserError
+    from easi_jax.io.run_files import MADE_WITH, checked
     from envs import REGISTRY
     from train._log_problem import load_model
     from train._robots import env_of
 
     if settings.get("model"):  # of measured logs
-        path = Path(config.model or settings["model"])
+        path = Path(config.model or str(settings["model"]))
         return path, load_model(path, config.allow_assets), None
+    settings = checked(settings, MADE_WITH, f"{config.run_folder} holds no run")
     env = env_of(config.run_folder, settings, config.env)
     if config.model is not None:
         load_model(config.model, config.allow_assets)

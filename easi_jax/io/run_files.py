@@ -9,12 +9,11 @@ from easi_jax.io.files import number, read_json
 # Forms: a type; [form] for a list; {key: form} for a mapping, where a key that ends in
 # "?" may be missing or null, and the key "*" stands for all others.
 CONFIG = {"format": int, "command": str, "config": {}}
+MADE_WITH = {"robot": str, "env?": str, "option?": [str]}
 TRAINED = {
-    "robot": str,
+    **MADE_WITH,
     "env_steps": int,
     "seeds": [int],
-    "env?": str,
-    "option?": [str],
     "algorithm?": str,
     "effects?": {},
     "target_effects?": {},

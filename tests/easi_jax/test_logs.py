@@ -841,7 +841,6 @@ def test_a_pipe_or_a_device_is_not_waited_for(tmp_path, cart, extension):
         "{'descr': '<f8', 'fortran_order': False, 'shape': (999999999999,)}",
         "{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999999999999999,)}",
         "{'descr': '<f8', 'fortran_order': False, 'shape': (-1,)}",
-        "{'descr': [], 'fortran_order': False, 'shape': (40,)}",
         "{'descr': ((((",
         "[[[[[[[[",
         "{{}: 1}",
