@@ -203,7 +203,8 @@ def _read_npz(path: Path) -> dict[str, list[str] | np.ndarray | str]:
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise broken
             _refuse_duplicates(path, archive.files)
-            _refuse_bomb(path, sum(x.file_size for x in archive.zip.infolist()))
+            with zipfile.ZipFile(path) as unread:
+                _refuse_bomb(path, sum(x.file_size for x in unread.infolist()))
             return {name: _npz_column(archive, name) for name in archive.files}
     except (UserError, OSError):
         raise

@@ -4,6 +4,9 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from yaml.composer import ComposerError
+from yaml.constructor import ConstructorError
+from yaml.scanner import ScannerError
 
 from easi_jax.errors import UserError
 from easi_jax.io.files import os_reason, regular_file
@@ -15,28 +18,24 @@ _DEEPEST = 100
 class _Loader(yaml.SafeLoader):
     def fetch_tag(self) -> None:
         # the standard ones too: their constructors raise anything on a wrong value
-        raise yaml.scanner.ScannerError(
-            None, None, "tags (!...) are not allowed", self.get_mark()
-        )
+        raise ScannerError(None, None, "tags (!...) are not allowed", self.get_mark())
 
     def fetch_more_tokens(self) -> None:
         # before the scanner, whose time goes with the square of the depth
         if self.flow_level + len(self.indents) > _DEEPEST:
-            raise yaml.scanner.ScannerError(
-                None, None, "nested too deeply", self.get_mark()
-            )
+            raise ScannerError(None, None, "nested too deeply", self.get_mark())
         super().fetch_more_tokens()
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
-                raise yaml.constructor.ConstructorError(
+                raise ConstructorError(
                     None, None, "a key is no plain value", key.start_mark
                 )
             text = str(key.value)
             if text in seen:
-                raise yaml.constructor.ConstructorError(
+                raise ConstructorError(
                     None, None, f'key "{text}" is there twice', key.start_mark
                 )
             seen.add(text)
@@ -92,7 +91,5 @@ def _count(node: yaml.Node, known: dict[int, int]) -> int:
                 count += _count(child, known)
         known[id(node)] = count
     if count > _MOST:
-        raise yaml.composer.ComposerError(
-            None, None, "its aliases repeat too much", node.start_mark
-        )
+        raise ComposerError(None, None, "its aliases repeat too much", node.start_mark)
     return count
