@@ -46,6 +46,7 @@ def run(config: Config) -> None:
             coverage_summary.section,
             _transfer,
             _real,
+            _fuzz,
         ),
         *(gap_summary.generated, gap_summary.real, gap_summary.times, gap_summary.loop),
         paper_tables.sections,
@@ -294,6 +295,28 @@ def _own_robot(folder: Path) -> list[str]:
         f"(goal {r['goal_s']} s, {_met(r['seconds'] < r['goal_s'])}). "
         f"{len(errors)} parameters within {100 * max(errors):.1f} % of the truth; "
         f"held-out error {after} rad, {before} rad in the model as given.",
+    ]
+
+
+def _fuzz(folder: Path) -> list[str]:
+    """Hostile and broken files: how many, and what the readers did."""
+    r = _read(folder, "fuzz")
+    if r is None:
+        return ["## Hostile and broken files", "Not run: `python -m benchmarks.fuzz`."]
+    columns = ("cases", "refused", "accepted", "failed")
+    rows = [
+        (x["reader"], *(x[c] for c in columns), f"{1000 * x['slowest_s']:.0f}")
+        for x in r["readers"]
+    ]
+    total = r["total"]
+    return [
+        "## Hostile and broken files",
+        f"`{r['command']}`: {total['cases']} files changed, drawn or written to do "
+        f"harm, in {r['seconds']:.0f} s of one core. Each is accepted or refused in "
+        "one line; anything else (another exception, a hang, something unpickled or "
+        "started, a file read or written elsewhere) is a failure: "
+        f"{total['failed']} of them ({_met(total['failed'] == 0)}).",
+        markdown_table(("reader", *columns, "slowest [ms]"), rows),
     ]
 
 

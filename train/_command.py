@@ -19,6 +19,7 @@ _Config = TypeVar("_Config")
 LOG_SECONDS = 10.0
 _NUMBER = re.compile(r"[-+]?\d|nan|-?inf|$")
 USER_ERROR = 2
+_LONGEST = 2000  # characters of a message
 INTERRUPTED = 130
 _PARTED = (
     "error: another process of this run has ended, so this one ends too; start all "
@@ -74,7 +75,7 @@ def main(
                 run(config)
                 distributed.stop()
         except UserError as error:
-            said = f"error: {' '.join(str(error).split())}" if _heard() else ""
+            said = f"error: {_line(str(error))}" if _heard() else ""
             _stop(said, USER_ERROR, args is None)
     except BrokenPipeError:
         # The reader of our output has gone, as in `... | head`.
@@ -280,6 +281,14 @@ def _text(value: object) -> str:
     if hasattr(value, "item"):
         value = value.item()  # type: ignore[attr-defined]
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _line(text: str) -> str:
+    """One line that a terminal shows as it is, whatever a file put into it."""
+    plain = " ".join(text.split())
+    if len(plain) > _LONGEST:
+        plain = f"{plain[: _LONGEST // 2]} ... {plain[-_LONGEST // 2 :]}"
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in plain)
 
 
 def _interrupted(out: Path | str | None, resumable: bool) -> str:

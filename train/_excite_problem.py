@@ -8,7 +8,6 @@ from typing import Any
 _NOISE = 1e-3  # rad, m
 _TRAVEL = {2: 0.5, 3: math.pi}  # m for slides, rad for hinges
 _RATE = 100.0  # Hz
-_TOLD = {"effect", "at", "indistinguishable"}  # of each effect in a gap.json
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +61,7 @@ def read_excite_problem(config: Any) -> ExciteProblem:
     _check_numbers(config, LEAD)
     check_names(config.effects)
     _check_out(config)
-    model = read_model(config.model)
+    model = read_model(config.model, config.allow_assets)
     m = model.mj_model
     if not m.nu:
         raise UserError(f"{config.model}: the model has no actuator to excite")
@@ -220,16 +219,12 @@ def _from_gap(config: Any, m: Any, notes: list[str]) -> tuple[list[Any], Any]:
     from easi_jax.errors import UserError
     from easi_jax.gap.table import object_id
     from easi_jax.io.effects_file import read_effects
-    from easi_jax.io.files import read_json
+    from easi_jax.io.run_files import GAP, read_checked
 
     path = config.gap / "gap.json" if config.gap.is_dir() else config.gap
-    told = read_json(path)
-    if not isinstance(told, dict) or not isinstance(told.get("effects"), list):
-        raise UserError(f"{path}: not a gap.json of train.gap")
+    told = read_checked(path, GAP, "a gap.json of train.gap")
     pairs = []
     for effect in told["effects"]:
-        if not isinstance(effect, dict) or not _TOLD.issubset(effect):
-            raise UserError(f"{path}: not a gap.json of train.gap")
         key = f"{effect['effect']}@{effect['at']}"
         pairs += [(key, other) for other in effect["indistinguishable"]]
     if not pairs:
@@ -246,6 +241,8 @@ def _from_gap(config: Any, m: Any, notes: list[str]) -> tuple[list[Any], Any]:
         values = {}
         for column, value in e.columns.items():
             field, _, part = column.partition(".")
+            if part and not (part.isascii() and part.isdecimal() and len(part) < 4):
+                raise UserError(f'{beside}: "{column}" does not end in a number')
             values[(field, (*index, int(part)) if part else index)] = value
         strengths[f"{e.effect}@{e.at}"] = values
     return list(dict.fromkeys(pairs)), strengths

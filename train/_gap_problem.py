@@ -68,7 +68,7 @@ def read_gap_problem(config: Any) -> GapProblem:
 
     if not (math.isfinite(config.horizon) and config.horizon > 0):
         raise UserError(f"--horizon is {config.horizon:g}: give seconds above 0")
-    model = read_model(config.model)
+    model = read_model(config.model, config.allow_assets)
     mj_model = model.mj_model
     space = (
         own_space(mj_model)
@@ -101,8 +101,8 @@ def beyond_mjcf(space: Any) -> dict[str, float]:
     }
 
 
-def read_model(text: str) -> GivenModel:
-    """A built-in robot by its name, or an MJCF file.
+def read_model(text: str, allowed: tuple[Path, ...] = ()) -> GivenModel:
+    """A built-in robot by its name, or an MJCF file; see `load_model`.
 
     Raises:
         UserError: no such model.
@@ -114,7 +114,7 @@ def read_model(text: str) -> GivenModel:
         env = make(text)
         return GivenModel(text, None, env.mj_model, env)
     path = Path(text)
-    mj_model = load_model(path)
+    mj_model = load_model(path, allowed)
     # The first of the model's names is its own.
     name = mj_model.names.split(b"\0", 1)[0].decode()
     return GivenModel(name or path.stem, path, mj_model, None)

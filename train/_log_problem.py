@@ -198,30 +198,24 @@ def _model_and_space(config: Any) -> tuple[str, Any, Any]:
             "--model needs --parameters P.yaml (or --effects E.yaml): say what may "
             "vary in the model (see docs/your_own_robot.md)"
         )
-    mj_model = load_model(config.model)
+    mj_model = load_model(config.model, config.allow_assets)
     if config.parameters is None:
         return config.model.stem, mj_model, ParameterSpace(())
     space = read_parameter_file(config.parameters, mj_model)
     return config.model.stem, mj_model, space
 
 
-def load_model(path: Path) -> Any:
-    """The MuJoCo model in ``path``.
+def load_model(path: Path, allowed: tuple[Path, ...] = ()) -> Any:
+    """The MuJoCo model in ``path``; ``allowed`` are places outside of its folder that
+    it may read.
 
     Raises:
-        UserError: the file cannot be read, or MuJoCo does not accept it.
+        UserError: as `read_mjcf`; or nothing in it moves.
     """
-    import mujoco
-
     from easi_jax.errors import UserError
+    from easi_jax.io.model_file import read_mjcf
 
-    if not path.is_file():
-        raise UserError(f"{path}: no such model file")
-    try:
-        model = mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"{path}: MuJoCo cannot read this model: {reason}") from None
+    model = read_mjcf(path, allowed)
     if model.nv == 0:
         raise UserError(f"{path}: the model has no joint, so nothing can be identified")
     return model

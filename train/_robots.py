@@ -156,18 +156,13 @@ def load_policies(
 
     from easi_jax.errors import UserError, nearest
     from easi_jax.io import checkpoints
-    from easi_jax.io.files import read_json
     from easi_jax.io.runs import read_config
     from easi_jax.pipeline import Pipeline, PipelineConfig
 
     read_config(folder)
     if not (folder / "results.json").exists():
         raise UserError(f"{folder} holds an unfinished run: finish it with --resume")
-    result = read_json(folder / "results.json")
-    if "methods" not in result:
-        raise UserError(
-            f"{folder} holds no policies: it identified a machine from logs"
-        )
+    result = read_policies(folder / "results.json")
     own = "EASI" if "EASI" in result["methods"] else result["methods"][0]
     chosen = method or own
     if chosen not in result["methods"]:
@@ -201,6 +196,28 @@ def load_policies(
     }
 
 
+def read_policies(path: Path) -> dict[str, Any]:
+    """``results.json`` of a run that has policies.
+
+    Raises:
+        UserError: of another run, or edited into another form.
+    """
+    from easi_jax.errors import UserError
+    from easi_jax.io.files import read_json
+    from easi_jax.io.run_files import POLICIES, checked
+
+    told = read_json(path)
+    if isinstance(told, dict) and "methods" not in told:
+        raise UserError(
+            f"{path.parent} holds no policies: it identified a machine from logs"
+        )
+    told = checked(told, POLICIES, f"{path} is not the result of a training")
+    if not told["methods"]:
+        raise UserError(f"{path}: no method")
+    check_seeds(tuple(told["seeds"]))
+    return told
+
+
 def load_udr(folder: Path, env_file: Path | None = None) -> dict[str, Any]:
     """What ``train.udr`` left: seeds, settings, policies, training states.
 
@@ -213,12 +230,14 @@ def load_udr(folder: Path, env_file: Path | None = None) -> dict[str, Any]:
 
     from easi_jax.errors import UserError
     from easi_jax.io import checkpoints
+    from easi_jax.io.run_files import TRAINED, checked
     from easi_jax.io.runs import config_hash, read_config
     from easi_jax.pipeline import Pipeline, PipelineConfig, seed_keys
 
     config = read_config(folder)
     if "robot" not in config or "env_steps" not in config or "udr" in config:
         raise UserError(f"{folder} holds no run of train.udr; give one with --udr")
+    config = checked(config, TRAINED, f"{folder} holds no run of train.udr")
     if not (folder / "results.json").exists():
         raise UserError(
             f"{folder} holds an unfinished run of train.udr: finish it with --resume"

@@ -41,6 +41,9 @@ class Config:
     """Logs kept out of the search, to test the result on."""
     model: Path | None = None
     """MuJoCo model (MJCF) of the machine that the logs are of."""
+    allow_assets: tuple[Path, ...] = ()
+    """Files, or folders with all below them, that the model may read besides those in
+    its own folder (meshes, textures, includes)."""
     parameters: Path | None = None
     """Parameter file (YAML): what may vary in the model, and in which range."""
     mapping: Path | None = None

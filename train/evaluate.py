@@ -89,7 +89,6 @@ def run(config: Config) -> None:
             },
             **saved["given"].results(),
         }
-        config.out.parent.mkdir(parents=True, exist_ok=True)
         atomic_write(config.out, to_json(result))
         say(f"written: {config.out}")
     if config.render is not None:

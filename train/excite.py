@@ -31,6 +31,9 @@ class Config:
 
     model: str = ""
     """MuJoCo model (MJCF), or the name of a built-in robot."""
+    allow_assets: tuple[Path, ...] = ()
+    """Files, or folders with all below them, that the model may read besides those in
+    its own folder (meshes, textures, includes)."""
     out: Path = Path("results/excite")
     """Folder for commands.csv and excite.json; or a file NAME.csv, with NAME.json
     beside it."""

@@ -39,6 +39,9 @@ class Config:
     model: Path | None = None
     """MJCF that the robot's model came from, for mjcf; a built-in robot's own, and that
     of a search in logs, where not given."""
+    allow_assets: tuple[Path, ...] = ()
+    """Files, or folders with all below them, that the model may read besides those in
+    its own folder (meshes, textures, includes)."""
 
 
 def run(config: Config) -> None:
@@ -49,12 +52,13 @@ def run(config: Config) -> None:
         if form not in _FORMS:
             known = ", ".join(_FORMS)
             raise UserError(f'--to "{form}": {known}{nearest(form, _FORMS)}')
-    from easi_jax.io.files import atomic_write, read_json
+    from easi_jax.io.files import atomic_write
+    from easi_jax.io.run_files import read_checked
     from easi_jax.io.runs import read_config
 
     settings, results = read_config(config.run_folder), {}
     if (config.run_folder / "results.json").exists():
-        results = read_json(config.run_folder / "results.json")
+        results = read_checked(config.run_folder / "results.json", {}, "a run's result")
     policies = "methods" in results
     identified = (config.run_folder / "distribution.json").exists()
     has = {"onnx": policies, "stablehlo": policies}
@@ -114,9 +118,9 @@ def _parameter_files(
 ) -> dict[str, str | bytes]:
     from easi_jax.errors import UserError
     from easi_jax.export.randomization import to_yaml
-    from easi_jax.io.files import read_json
+    from easi_jax.io.run_files import read_distribution
 
-    found = read_json(config.run_folder / "distribution.json")
+    found = read_distribution(config.run_folder / "distribution.json")
     first = str(found.get("best_seed", next(iter(found["seeds"]))))
     seed = first if config.seed is None else str(config.seed)
     if seed not in found["seeds"]:
@@ -198,15 +202,18 @@ def _model_of(config: Config, settings: dict[str, Any]) -> tuple[Path, Any, Any]
     from importlib import resources
 
     from easi_jax.errors import UserError
+    from easi_jax.io.run_files import MADE_WITH, checked
     from envs import REGISTRY
     from train._log_problem import load_model
     from train._robots import env_of
 
     if settings.get("model"):  # of measured logs
-        path = Path(config.model or settings["model"])
-        return path, load_model(path), None
+        path = Path(config.model or str(settings["model"]))
+        return path, load_model(path, config.allow_assets), None
+    settings = checked(settings, MADE_WITH, f"{config.run_folder} holds no run")
     env = env_of(config.run_folder, settings, config.env)
     if config.model is not None:
+        load_model(config.model, config.allow_assets)
         return config.model, env.mj_model, env.dt
     if env.name not in REGISTRY:
         raise UserError(

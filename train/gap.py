@@ -25,6 +25,9 @@ class Config:
 
     model: str = ""
     """MuJoCo model (MJCF), or the name of a built-in robot."""
+    allow_assets: tuple[Path, ...] = ()
+    """Files, or folders with all below them, that the model may read besides those in
+    its own folder (meshes, textures, includes)."""
     data: tuple[Path, ...] = ()
     """Measured logs (CSV, NPZ or Parquet)."""
     out: Path = Path("results/gap")

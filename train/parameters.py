@@ -21,6 +21,9 @@ class Config:
 
     model: Path
     """MuJoCo model (MJCF) of the machine."""
+    allow_assets: tuple[Path, ...] = ()
+    """Files, or folders with all below them, that the model may read besides those in
+    its own folder (meshes, textures, includes)."""
     out: Path = Path("parameters.yaml")
     """Parameter file to write."""
     data: tuple[Path, ...] = ()
@@ -44,7 +47,7 @@ def run(config: Config) -> None:
             f"{config.out} is there already: name another file with --out, or replace "
             "it with --overwrite"
         )
-    m = load_model(config.model)
+    m = load_model(config.model, config.allow_assets)
     proposals = propose(m)
     verdicts: dict[str, str] = {}
     notes: list[str] = []
@@ -53,7 +56,6 @@ def run(config: Config) -> None:
         verdicts, notes = _verdicts(proposals, _information(config, m, proposals))
         names = ", ".join(p.name for p in config.data)
         head.append(f"What {names} can determine at best is said beside each name.")
-    config.out.parent.mkdir(parents=True, exist_ok=True)
     atomic_write(config.out, as_text(proposals, head, verdicts))
     read_parameter_file(config.out, m)
     rows = [

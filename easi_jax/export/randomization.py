@@ -129,7 +129,7 @@ def read_randomization(path: Path | str) -> Randomization:
             root=vectors * np.sqrt(np.maximum(values, 0.0)),
             bounds=np.array([p["bounds"] for p in entries], float).T,
         )
-    except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
+    except (LookupError, TypeError, ArithmeticError, ValueError) as error:
         raise UserError(
             f"{path} is no randomization file of train.export ({error!r})"
         ) from None

@@ -71,7 +71,7 @@ def save(folder: Path, step: int, state: Any, *, config_hash: str) -> Path:
     arrays = {
         n: np.asarray(x, k.dtype) for n, x, k in zip(names, leaves, kinds, strict=True)
     }
-    temp = folder / f".writing-{os.getpid()}"
+    temp, last = (folder / f".{w}-{os.getpid()}" for w in ("writing", "old"))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _remove_leftovers(folder)
@@ -88,16 +88,19 @@ def save(folder: Path, step: int, state: Any, *, config_hash: str) -> Path:
         (temp / "meta.json").write_text(to_json(meta), encoding="utf-8")
         _sync(temp)
         if final.exists():
-            final.rename(folder / f".old-{os.getpid()}")
+            final.rename(last)
         temp.rename(final)
         _sync_folder(folder)
     except (OSError, ValueError, RuntimeError) as error:
+        if last.exists() and not final.exists():
+            with contextlib.suppress(OSError):
+                last.rename(final)
         shutil.rmtree(temp, ignore_errors=True)
         kept = steps(folder)
-        last = f"the one of step {kept[-1]} is kept" if kept else "none is kept yet"
+        good = f"the one of step {kept[-1]} is kept" if kept else "none is kept yet"
         reason = os_reason(error) if isinstance(error, OSError) else _reason(error)
         raise UserError(
-            f"cannot write checkpoint {final}: {reason}; {last}: free the disk, then "
+            f"cannot write checkpoint {final}: {reason}; {good}: free the disk, then "
             "go on with --resume"
         ) from error
     _remove_leftovers(folder)
@@ -109,7 +112,7 @@ def save(folder: Path, step: int, state: Any, *, config_hash: str) -> Path:
 def steps(folder: Path) -> list[int]:
     """Steps that have a checkpoint, ascending; empty where there is none."""
     found = folder.glob("step_*") if folder.is_dir() else []
-    return sorted(int(p.name[5:]) for p in found if p.name[5:].isdigit())
+    return sorted({int(n) for p in found if re.fullmatch("[0-9]+", n := p.name[5:])})
 
 
 def restore(
@@ -171,12 +174,17 @@ def _read(path: Path, target: Any, config_hash: str | None) -> dict[str, np.ndar
         _check_leaves(meta["leaves"], _leaf_types(target))
         if _digests(path / "state") != meta["files"]:
             raise _UnusableError("cut short or damaged")
-    except (UserError, KeyError, TypeError, AttributeError, OSError) as error:
+    except (UserError, LookupError, TypeError, AttributeError, OSError) as error:
         raise _UnusableError("cut short or damaged") from error
     names, leaves = _named_leaves(jax.eval_shape(_raw_keys, target))
     values = {n: np.empty(x.shape, x.dtype) for n, x in zip(names, leaves, strict=True)}
     stored = {n: x for n, x in values.items() if x.size}
-    return values | _orbax_restore(path / "state", stored)
+    values |= _orbax_restore(path / "state", stored)
+    for name, value in stored.items():
+        found = values[name]
+        if (found.shape, found.dtype) != (value.shape, value.dtype):
+            raise _UnusableError("not what its description says")
+    return values
 
 
 def _checkpointer() -> Any:
@@ -198,7 +206,11 @@ def _orbax_save(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 def _orbax_restore(path: Path, target: dict[str, np.ndarray]) -> dict[str, Any]:
     with _quiet(), _checkpointer() as checkpointer:
-        return checkpointer.restore(path.absolute(), target)
+        try:
+            return checkpointer.restore(path.absolute(), target)
+        # The digests fit, so the files were edited, and orbax may raise anything.
+        except Exception as error:
+            raise _UnusableError(f"damaged ({_reason(error)})") from error
 
 
 def _is_key(leaf: Any) -> bool:
@@ -255,9 +267,16 @@ def _check_leaves(found: list[list[Any]], wanted: list[list[Any]]) -> None:
 
 
 def _digests(folder: Path) -> dict[str, str]:
-    """SHA-256 of each file: orbax's own format lets damage pass."""
+    """SHA-256 of each file: orbax's own format lets damage pass.
+
+    Raises:
+        _UnusableError: something that orbax does not write, such as a link.
+        OSError: a file cannot be read.
+    """
     digests = {}
-    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+    for path in sorted(p for p in folder.rglob("*") if not p.is_dir()):
+        if path.is_symlink() or not path.is_file():
+            raise _UnusableError(f"{path.name} is no file")
         with path.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
         digests[path.relative_to(folder).as_posix()] = digest

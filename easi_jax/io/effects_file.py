@@ -144,6 +144,10 @@ def _entry(path: str, i: int, item: Any) -> EffectEntry:
 def _number(path: str, where: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise UserError(f'{path}, {where}: "{value}" is not a number')
-    if not math.isfinite(value):
+    try:
+        number = float(value)
+    except OverflowError:  # a whole number of hundreds of digits
+        number = math.inf
+    if not math.isfinite(number):
         raise UserError(f"{path}, {where}: {value} is not finite")
-    return float(value)
+    return number

@@ -51,6 +51,7 @@ _STYLE: Any = {
     "xtick.color": FAINT,
     "ytick.color": FAINT,
     "text.color": INK,
+    "text.parse_math": False,  # a $ in a name is a $
     "legend.frameon": False,
     "legend.fontsize": 9.0,
     "lines.solid_capstyle": "round",
@@ -150,9 +151,8 @@ def dash(index: int) -> Any:
 
 
 def with_unit(name: str, unit: str) -> str:
-    """``name [unit]``, safe from matplotlib's mathematics."""
-    label = f"{name} [{unit}]" if unit else name
-    return label.replace("$", r"\$")
+    """``name [unit]``."""
+    return f"{name} [{unit}]" if unit else name
 
 
 def svg(figure: Figure) -> str:

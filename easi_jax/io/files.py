@@ -2,9 +2,11 @@
 
 import dataclasses
 import enum
+import errno
 import json
 import math
 import os
+import stat
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,6 +25,20 @@ def os_reason(error: OSError) -> str:
     return error.strerror or type(error).__name__
 
 
+def regular_file(path: Path) -> None:
+    """Refuses what opening could wait for without end: a pipe, a device.
+
+    Raises:
+        UserError: it is there and no file.
+        OSError: as `os.stat`; ``IsADirectoryError`` for a folder.
+    """
+    mode = path.stat().st_mode
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(mode):
+        raise UserError(f"{path} is a pipe or a device, not a file")
+
+
 def atomic_write(path: Path, data: str | bytes) -> None:
     """Writes ``path`` so that it holds the old content or the new, never a part.
 
@@ -33,7 +49,8 @@ def atomic_write(path: Path, data: str | bytes) -> None:
     """
     if not distributed.leader():
         return
-    raw = data.encode() if isinstance(data, str) else data
+    # Half of a surrogate pair, as a file's name may hold, is no UTF-8.
+    raw = data.encode("utf-8", "backslashreplace") if isinstance(data, str) else data
     temp = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -100,8 +117,17 @@ def to_json(value: Any, indent: int | None = 2) -> str:
 
 
 def number(value: Any) -> float:
-    """A number read from JSON, the strings for non-finite ones included."""
-    return _NON_FINITE[value] if value in _NON_FINITE else float(value)
+    """A number read from JSON, the strings for non-finite ones included.
+
+    Raises:
+        TypeError, ValueError: it is none.
+    """
+    if isinstance(value, str) and value in _NON_FINITE:
+        return _NON_FINITE[value]
+    try:
+        return float(value)
+    except OverflowError:  # a whole number of hundreds of digits
+        raise ValueError("too large a number") from None
 
 
 def read_json(path: Path) -> Any:
@@ -111,8 +137,11 @@ def read_json(path: Path) -> Any:
         UserError: it is missing, unreadable or no JSON.
     """
     try:
+        regular_file(path)
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise UserError(f"cannot read {path}: {os_reason(error)}") from error
     except ValueError as error:
         raise UserError(f"{path} is not valid JSON: {error}") from error
+    except RecursionError as error:
+        raise UserError(f"{path} is not valid JSON: nested too deeply") from error

@@ -73,7 +73,7 @@ def gap_steps(
     axis.plot([low, high], [y[-1], y[-1]], color=INK, lw=2)
     axis.axvline(floor, **DASHED)
     axis.text(floor, len(labels) - 0.45, " noise floor", color=INK, va="bottom")
-    axis.set_yticks(y, [text.replace("$", r"\$") for text in labels])
+    axis.set_yticks(y, labels)
     axis.set_xlabel("gap on held-out data (share of the motion)")
     axis.set_ylim(-0.6, len(labels) - 0.1)
     axis.grid(visible=False, axis="y")

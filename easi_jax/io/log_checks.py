@@ -7,6 +7,7 @@ import numpy as np
 
 from easi_jax.errors import UserError
 from easi_jax.io.log_columns import LogColumns
+from easi_jax.io.log_rows import recordings
 from easi_jax.recording import physics_steps
 
 _HUGE = 1e8
@@ -130,8 +131,7 @@ def normalized(
 def _wraps(values: np.ndarray, label: np.ndarray) -> np.ndarray:
     """Whole turns by which each row has jumped since its recording began."""
     turns = np.zeros(len(values))
-    for name in set(label.tolist()):
-        rows = np.flatnonzero(label == name)
+    for _, rows in recordings(label):
         step = np.diff(values[rows])
         jump = np.sign(step) * (np.abs(np.abs(step) - 2 * np.pi) < np.pi / 2)
         turns[rows[1:]] = np.cumsum(jump)

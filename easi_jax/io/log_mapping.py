@@ -115,7 +115,7 @@ def _numbers(
         try:
             # YAML 1.1 takes 1e-3 for text
             number = float(value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             number = math.nan
         if not math.isfinite(number):
             raise UserError(f'{path}: {key} of "{name}" is {value!r}, not a number')

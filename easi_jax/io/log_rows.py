@@ -31,6 +31,15 @@ class Rows(NamedTuple):
         )
 
 
+def recordings(label: np.ndarray) -> list[tuple[str, np.ndarray]]:
+    """Labels ``(T,)`` in the order of their first rows, and the rows of each."""
+    names, first, index = np.unique(label, return_index=True, return_inverse=True)
+    rows = np.split(
+        np.argsort(index, kind="stable"), np.cumsum(np.bincount(index))[:-1]
+    )
+    return [(str(names[i]), rows[i]) for i in np.argsort(first)]
+
+
 def is_even(time: np.ndarray, dt: float) -> bool:
     """Whether ``time`` (s, ``(T,)``) ticks evenly by ``dt`` (s)."""
     count = len(time)

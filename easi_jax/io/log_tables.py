@@ -4,7 +4,6 @@ import csv
 import io
 import os
 import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,9 +14,10 @@ import pyarrow
 import pyarrow.parquet
 
 from easi_jax.errors import UserError
-from easi_jax.io.files import atomic_write, os_reason
+from easi_jax.io.files import atomic_write, os_reason, regular_file
 
 EXTENSIONS = (".csv", ".npz", ".parquet")
+_LARGEST = 4_000_000_000  # bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +101,7 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     if extension not in EXTENSIONS:
         raise UserError(f"{path}: a log ends in {', '.join(EXTENSIONS)}")
     try:
+        regular_file(path)
         if path.stat().st_size == 0:
             raise UserError(f"{path} is empty")
         if extension == ".csv":
@@ -202,10 +203,13 @@ def _read_npz(path: Path) -> dict[str, list[str] | np.ndarray | str]:
             if not isinstance(archive, np.lib.npyio.NpzFile):
                 raise broken
             _refuse_duplicates(path, archive.files)
+            with zipfile.ZipFile(path) as unread:
+                _refuse_bomb(path, sum(x.file_size for x in unread.infolist()))
             return {name: _npz_column(archive, name) for name in archive.files}
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError):
-        raise broken from None
-    except (RuntimeError, MemoryError):  # encrypted; a size that cannot be true
+    except (UserError, OSError):
+        raise
+    # zipfile, its codecs and numpy's header raise whatever the bytes lead them to.
+    except Exception:
         raise broken from None
 
 
@@ -230,17 +234,19 @@ def _read_parquet(path: Path) -> dict[str, list[str] | np.ndarray | str]:
     try:
         with pyarrow.parquet.ParquetFile(path) as file:
             _refuse_duplicates(path, file.schema_arrow.names)
+            cells = file.metadata.num_rows * file.metadata.num_columns
+            _refuse_bomb(path, 8 * cells)
             table = file.read()
+        return {
+            name: _parquet_column(column)
+            for name, column in zip(table.column_names, table.columns, strict=True)
+        }
     except OSError as error:
         if error.errno:
             raise
         raise broken from None
     except (pyarrow.ArrowException, ValueError, MemoryError):
         raise broken from None
-    return {
-        name: _parquet_column(column)
-        for name, column in zip(table.column_names, table.columns, strict=True)
-    }
 
 
 def _parquet_column(column: pyarrow.ChunkedArray) -> np.ndarray | str:
@@ -273,6 +279,15 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _refuse_bomb(path: Path, size: int) -> None:
+    """Refuses compressed files that would fill the memory; ``size`` in bytes."""
+    if size > _LARGEST:
+        raise UserError(
+            f"{path}: {size / 1e9:.3g} GB when unpacked, more than a log has "
+            f"({_LARGEST / 1e9:.3g} GB); split it"
+        )
 
 
 def _refuse_duplicates(path: Path, names: list[str]) -> None:

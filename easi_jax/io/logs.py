@@ -15,7 +15,7 @@ from easi_jax.errors import UserError
 from easi_jax.io import log_checks
 from easi_jax.io.log_columns import LogColumns, check_columns, log_columns
 from easi_jax.io.log_mapping import LogMapping, read_mapping
-from easi_jax.io.log_rows import EVEN, Rows, is_even, resampled
+from easi_jax.io.log_rows import EVEN, Rows, is_even, recordings, resampled
 from easi_jax.io.log_tables import Table, read_table, write_table
 from easi_jax.recording import Log, Run
 from easi_jax.windows import fitted_velocity
@@ -134,13 +134,11 @@ class _Reader:
         self.path = path
         self.name = name
         self.configuration = Configuration.of(model)
-        self.notes: list[str] = []
+        self.notes: dict[str, None] = {}  # in order, each once
         self.uneven: list[tuple[float, str]] = []
 
     def note(self, text: str) -> None:
-        line = f"{self.path}: {text}"
-        if line not in self.notes:
-            self.notes.append(line)
+        self.notes[f"{self.path}: {text}"] = None
 
     def read(self) -> list[Run]:
         table = self.mapping.rename(read_table(self.path))
@@ -172,8 +170,7 @@ class _Reader:
         ):
             self.note(text)
         runs: list[Run] = []
-        for label in dict.fromkeys(raw.label.tolist()):
-            rows = np.flatnonzero(raw.label == label)
+        for label, rows in recordings(raw.label):
             name = f"{self.name}/{label}" if label else self.name
             runs += self._recording(name, raw, rows, good[rows])
         if not runs:

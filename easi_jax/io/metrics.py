@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from easi_jax.errors import UserError
-from easi_jax.io.files import atomic_write, number, os_reason, to_json
+from easi_jax.io.files import atomic_write, number, os_reason, regular_file, to_json
 
 
 class MetricsLog:
@@ -51,9 +51,15 @@ class MetricsLog:
                 f"cannot write {self._path}: {os_reason(error)}; free the disk, then "
                 "go on with --resume"
             ) from error
-        board = self._board(stage)
-        for name, item in scalars.items():
-            board.add_scalar(name, item, int(step), walltime=time.time())
+        try:
+            board = self._board(stage)
+            for name, item in scalars.items():
+                board.add_scalar(name, item, int(step), walltime=time.time())
+        except OSError as error:
+            raise UserError(
+                f"cannot write {self._boards}: {os_reason(error)}; free the disk, then "
+                "go on with --resume"
+            ) from error
 
     def rewind(self, stage: str, step: int) -> None:
         """Forgets what ``stage`` recorded after ``step``: a resumed run redoes it."""
@@ -64,8 +70,10 @@ class MetricsLog:
         ]
         text = "".join(to_json(line, indent=None) for line in kept)
         self._file.close()
-        atomic_write(self._path, text)
-        self._file = self._path.open("ab", buffering=0)
+        try:
+            atomic_write(self._path, text)
+        finally:
+            self._file = self._path.open("ab", buffering=0)
         if stage in self._writers:
             self._writers.pop(stage).close()
         self._purge[stage] = step + 1
@@ -96,7 +104,10 @@ def read_metrics(path: Path, stage: str | None = None) -> list[dict[str, Any]]:
         UserError: the file cannot be read or holds something else.
     """
     try:
-        raw = path.read_bytes() if path.exists() else b""
+        if not path.exists():
+            return []
+        regular_file(path)
+        raw = path.read_bytes()
     except OSError as error:
         raise UserError(f"cannot read {path}: {os_reason(error)}") from error
     lines = []
@@ -107,9 +118,13 @@ def read_metrics(path: Path, stage: str | None = None) -> list[dict[str, Any]]:
                 name: item if name in ("stage", "step") else number(item)
                 for name, item in line.items()
             }
+            if not (isinstance(values["step"], int) and "stage" in values):
+                raise ValueError("no step or no stage")
             if stage is None or values["stage"] == stage:
                 lines.append(values)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (
+            *(ValueError, KeyError, TypeError, AttributeError, RecursionError),
+        ) as error:
             raise UserError(
                 f"{path}, line {index}: not a metrics line; remove it or start the "
                 "run anew with --overwrite"
@@ -122,6 +137,7 @@ def _drop_partial_line(path: Path) -> None:
     if not path.exists():
         return
     try:
+        regular_file(path)
         with path.open("rb+") as file:
             content = file.read()
             file.truncate(content.rfind(b"\n") + 1)

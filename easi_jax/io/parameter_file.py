@@ -142,7 +142,7 @@ def _number(where: str, key: str, value: Any) -> float:
     try:
         # YAML 1.1 takes 1e-3 for text
         number = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if math.isnan(number):
         raise UserError(f"{where}: {key} is {value!r}, not a number")

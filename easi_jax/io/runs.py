@@ -20,11 +20,12 @@ from easi_jax.io.files import (
     to_plain,
 )
 from easi_jax.io.metrics import MetricsLog
+from easi_jax.io.run_files import CONFIG, checked
 from easi_jax.io.versions import versions
 
 FORMAT = 1
 # Where and how a run is started; these do not change what it computes.
-VOLATILE = ("out", "resume", "overwrite", "distributed")
+VOLATILE = ("out", "resume", "overwrite", "distributed", "allow_assets")
 
 _CONFIG = "config.json"
 _LOCK = ".lock"
@@ -201,13 +202,14 @@ def _as_mapping(config: Any) -> dict[str, Any]:
 
 
 def _read_head(folder: Path) -> dict[str, Any]:
-    head = read_json(folder / _CONFIG)
+    path = folder / _CONFIG
+    head = read_json(path)
     if not isinstance(head, dict) or head.get("format") != FORMAT:
         raise UserError(
-            f"{folder / _CONFIG} is of another format than this version writes "
+            f"{path} is of another format than this version writes "
             f"({FORMAT}): --overwrite deletes the run, or choose another --out"
         )
-    return head
+    return checked(head, CONFIG, f"{path} is not a run's configuration")
 
 
 def _check_same(folder: Path, command: str, config: dict[str, Any]) -> None:

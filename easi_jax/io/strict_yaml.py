@@ -1,21 +1,41 @@
-"""Plain data from YAML, strictly: no tags, no key twice."""
+"""Plain data from YAML, strictly: no tags, no key twice, no aliases that explode."""
 
 from pathlib import Path
 from typing import Any
 
 import yaml
+from yaml.composer import ComposerError
+from yaml.constructor import ConstructorError
+from yaml.scanner import ScannerError
 
 from easi_jax.errors import UserError
-from easi_jax.io.files import os_reason
+from easi_jax.io.files import os_reason, regular_file
+
+_MOST = 1_000_000  # values in a file, what aliases repeat counted each time
+_DEEPEST = 100
 
 
 class _Loader(yaml.SafeLoader):
+    def fetch_tag(self) -> None:
+        # the standard ones too: their constructors raise anything on a wrong value
+        raise ScannerError(None, None, "tags (!...) are not allowed", self.get_mark())
+
+    def fetch_more_tokens(self) -> None:
+        # before the scanner, whose time goes with the square of the depth
+        if self.flow_level + len(self.indents) > _DEEPEST:
+            raise ScannerError(None, None, "nested too deeply", self.get_mark())
+        super().fetch_more_tokens()
+
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
         for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise ConstructorError(
+                    None, None, "a key is no plain value", key.start_mark
+                )
             text = str(key.value)
             if text in seen:
-                raise yaml.constructor.ConstructorError(
+                raise ConstructorError(
                     None, None, f'key "{text}" is there twice', key.start_mark
                 )
             seen.add(text)
@@ -26,12 +46,21 @@ def read_yaml(path: Path) -> Any:
     """The content of a YAML file.
 
     Raises:
-        UserError: it cannot be read, is not UTF-8 or not YAML, or has a key twice;
-            names file and line.
+        UserError: it cannot be read, is not UTF-8 or not YAML, has a tag or a key
+            twice, or its aliases repeat too much; names file and line.
     """
     try:
+        regular_file(path)
         # _Loader derives from SafeLoader: plain data only
-        return yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
+        loader = _Loader(path.read_text(encoding="utf-8"))
+        try:
+            node = loader.get_single_node()
+            if node is None:
+                return None
+            _count(node, {})
+            return loader.construct_document(node)
+        finally:
+            loader.dispose()
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({os_reason(error)})") from None
     except UnicodeDecodeError:
@@ -43,3 +72,24 @@ def read_yaml(path: Path) -> Any:
         raise UserError(
             f"{path}: not valid YAML{where}{f' ({problem})' if problem else ''}"
         ) from None
+
+
+def _count(node: yaml.Node, known: dict[int, int]) -> int:
+    """Values below ``node`` as it would be written without aliases.
+
+    Raises:
+        ComposerError: more than can be meant, or an alias inside of its own anchor.
+    """
+    if id(node) in known:
+        count = known[id(node)]
+    else:
+        known[id(node)] = _MOST + 1  # while it is counted
+        parts = node.value if isinstance(node, yaml.CollectionNode) else ()
+        count = 1
+        for part in parts:
+            for child in part if isinstance(part, tuple) else (part,):
+                count += _count(child, known)
+        known[id(node)] = count
+    if count > _MOST:
+        raise ComposerError(None, None, "its aliases repeat too much", node.start_mark)
+    return count

@@ -1,6 +1,7 @@
 """Motion as pictures: frames by MuJoCo's renderer, GIF, MP4, a strip for reports."""
 
 import base64
+import contextlib
 import io
 import os
 import shutil
@@ -14,6 +15,7 @@ import numpy as np
 from PIL import Image
 
 from easi_jax.errors import UserError
+from easi_jax.io.files import os_reason
 
 FRAMES = 6  # of a strip
 _ROW = 3
@@ -81,11 +83,27 @@ def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
     """Writes ``frames (T, H, W, 3)`` as ``.gif``, or as ``.mp4`` with ffmpeg.
 
     Raises:
-        UserError: see `check_video`; ffmpeg failed.
+        UserError: see `check_video`; ffmpeg failed, or the file cannot be written;
+            what was there before is kept.
     """
     check_video(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.part{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _encode(path, part, frames, fps)
+        part.replace(path)
+    except OSError as error:
+        raise UserError(
+            f"cannot write {path}: {os_reason(error)}; free the disk or name another "
+            "file"
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def _encode(path: Path, part: Path, frames: np.ndarray, fps: float) -> None:
+    """Writes ``part``; ``path`` is named in messages."""
     if path.suffix == ".gif":
         images = [Image.fromarray(f) for f in frames]
         images[0].save(
@@ -117,13 +135,10 @@ def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
                 timeout=_LIMIT,
             )
         except subprocess.TimeoutExpired:
-            part.unlink(missing_ok=True)
             raise UserError(f"{path}: ffmpeg took more than {_LIMIT} s") from None
         if done.returncode:
-            part.unlink(missing_ok=True)
-            last = done.stderr.decode(errors="replace").strip().splitlines()[-1]
-            raise UserError(f"{path}: ffmpeg failed: {last}")
-    part.replace(path)
+            said = done.stderr.decode(errors="replace").strip().splitlines()
+            raise UserError(f"{path}: ffmpeg failed: {said[-1] if said else ''}")
 
 
 def strip(frames: np.ndarray, count: int = FRAMES) -> str:

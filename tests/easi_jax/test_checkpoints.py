@@ -1,5 +1,8 @@
+import errno
 import json
+import os
 import resource
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import evosax.algorithms
@@ -9,6 +12,7 @@ import numpy as np
 import optax
 import pytest
 
+from benchmarks.fuzz_readers import reseal
 from easi_jax.errors import UserError
 from easi_jax.io import checkpoints
 
@@ -126,6 +130,34 @@ def _other_format(path):
     (path / "meta.json").write_text(json.dumps({**meta, "format": 99}))
 
 
+def _no_mapping(path):
+    (path / "meta.json").write_text("[]")
+
+
+def _odd_leaves(path):
+    meta = json.loads((path / "meta.json").read_text())
+    (path / "meta.json").write_text(json.dumps({**meta, "leaves": [[]]}))
+
+
+def _edited_with_digests(path):
+    """As by somebody who edits the files and their digests."""
+    _cut(path)
+    reseal(path)
+
+
+def _link(path):
+    file = _largest(path)
+    other = path.parent / "elsewhere"
+    other.write_bytes(file.read_bytes())
+    file.unlink()
+    file.symlink_to(other)
+
+
+def _pipe(path):
+    (path / "meta.json").unlink()
+    os.mkfifo(path / "meta.json")
+
+
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
@@ -135,6 +167,11 @@ def _other_format(path):
         (_lose_meta, "cut short or damaged"),
         (_cut_meta, "cut short or damaged"),
         (_other_format, "format 99, this version reads 1"),
+        (_no_mapping, "cut short or damaged"),
+        (_odd_leaves, "cut short or damaged"),
+        (_edited_with_digests, "damaged ("),
+        (_link, "is no file"),
+        (_pipe, "cut short or damaged"),
     ],
 )
 def test_damaged_checkpoint_falls_back_then_refuses(
@@ -146,7 +183,9 @@ def test_damaged_checkpoint_falls_back_then_refuses(
     found = checkpoints.restore(tmp_path, target)
     assert found is not None
     assert found.step == 1
-    assert found.notes == (f"checkpoint {second} is unusable: {said}",)
+    (note,) = found.notes
+    assert note.startswith(f"checkpoint {second} is unusable: ")
+    assert said in note
     _assert_same(found.state, states[1])
     damage(first)
     with pytest.raises(UserError) as error:
@@ -207,6 +246,47 @@ def test_full_disk_keeps_the_last_good_one(tmp_path, states, target):
     found = checkpoints.restore(tmp_path, target)
     assert found is not None
     _assert_same(found.state, states[1])
+
+
+@pytest.mark.parametrize("failing", ["rename", "mkdir", "fsync"])
+@pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EROFS])
+def test_failure_at_any_point_keeps_the_same_step(
+    tmp_path, states, target, monkeypatch, failing, reason
+):
+    """Also where the step that is written again has been moved aside already."""
+    checkpoints.save(tmp_path, 1, states[1], config_hash="a")
+    owner = os if failing == "fsync" else Path
+    plain = getattr(owner, failing)
+
+    def fails(first, *args, **kwargs):
+        if failing != "rename" or ".writing" in str(first):
+            raise OSError(reason, os.strerror(reason))
+        return plain(first, *args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, failing, fails)
+        with pytest.raises(UserError) as error:
+            checkpoints.save(tmp_path, 1, states[2], config_hash="a")
+    assert os.strerror(reason) in str(error.value)
+    assert "the one of step 1 is kept" in str(error.value)
+    assert [p.name for p in tmp_path.iterdir()] == ["step_000000000001"]
+    found = checkpoints.restore(tmp_path, target)
+    assert found is not None
+    _assert_same(found.state, states[1])
+
+
+def test_a_file_where_the_folder_should_be(tmp_path, states):
+    (tmp_path / "checkpoints").write_text("")
+    with pytest.raises(UserError, match=r"cannot write checkpoint .*none is kept yet"):
+        checkpoints.save(tmp_path / "checkpoints", 1, states[0], config_hash="a")
+
+
+def test_names_that_only_look_like_steps(tmp_path, states):
+    for name in ("step_²", "step_x", "step_"):
+        (tmp_path / name).mkdir()
+    assert checkpoints.steps(tmp_path) == []
+    checkpoints.save(tmp_path, 3, states[0], config_hash="a")
+    assert checkpoints.steps(tmp_path) == [3]
 
 
 def test_leftovers_of_a_killed_process_are_cleaned(tmp_path, states):

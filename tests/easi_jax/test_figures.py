@@ -5,8 +5,10 @@ import matplotlib
 import numpy as np
 import pytest
 
-from easi_jax.io import figures
+from benchmarks.fuzz_readers import harmless
+from easi_jax.io import figures, gap_figures
 from easi_jax.io.figure_style import _log_ticks
+from easi_jax.io.report import Picture, inline_svg
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -95,3 +97,36 @@ def test_log_ticks_lie_inside_and_are_few():
         ticks = _log_ticks(low, high)
         assert 2 <= len(ticks) <= 5
         assert all(low <= tick <= high for tick in ticks)
+
+
+EVIL = [
+    "<script>alert(1)</script>",
+    '"><img src=x onerror=alert(1)>',
+    "]]></text><script>alert(1)</script>",
+    "$\\frac{$",
+]
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda n: _parameters(names=n[:2], units=n[2:]),
+        lambda n: figures.returns_by_step({x: (np.arange(3), np.ones(3)) for x in n}),
+        lambda n: figures.returns_by_method({x: np.ones(2) for x in n}),
+        lambda n: figures.prediction_errors({x: np.ones(4) for x in n}, n, n),
+        lambda n: gap_figures.gap_steps(n, np.ones(4), 0.5, 1.5, 0.1),
+        lambda n: gap_figures.residual_maps(
+            n, n, np.ones((4, 4)), np.ones((4, 4)), np.ones(4)
+        ),
+        lambda n: gap_figures.traces(
+            np.arange(3.0), *[np.zeros((1, 3, 4)) for _ in range(3)], n, n
+        ),
+    ],
+)
+def test_names_are_text_and_nothing_else(draw):
+    svg = draw(EVIL)
+    shown = " ".join(_texts(svg))
+    assert all(name in shown for name in EVIL)
+    tags = {node.tag.removeprefix(SVG) for node in ET.fromstring(svg).iter()}
+    assert not tags & {"script", "img", "a", "foreignObject"}
+    harmless(inline_svg(Picture("t", svg, EVIL[1]), 0))

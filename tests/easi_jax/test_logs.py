@@ -1,6 +1,7 @@
 """Reading and writing of logs, and every way in which a log can be wrong."""
 
 import io
+import os
 import zipfile
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 
 from easi_jax.configuration import Configuration
 from easi_jax.errors import UserError
+from easi_jax.io import log_tables
 from easi_jax.io.logs import read_logs, write_log
 from easi_jax.recording import Run
 
@@ -821,3 +823,68 @@ def test_real_logs(folder, rates, runs):
         assert len(run) > 500
         for values in (run.qpos, run.qvel, run.ctrl):
             assert np.isfinite(values).all()
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_a_pipe_or_a_device_is_not_waited_for(tmp_path, cart, extension):
+    path = tmp_path / f"log.{extension}"
+    os.mkfifo(path)
+    assert "a pipe or a device" in failure(path, cart)
+    path.unlink()
+    path.symlink_to("/dev/zero")
+    assert "a pipe or a device" in failure(path, cart)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (999999999999,)}",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999999999999999,)}",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (-1,)}",
+        "{'descr': ((((",
+        "[[[[[[[[",
+        "{{}: 1}",
+        "'a' 'b",
+    ],
+)
+def test_npz_headers_that_numpy_trips_over(tmp_path, cart, header):
+    path = save(tmp_path / "a.npz", cart_columns())
+    text = header.encode().ljust(117) + b"\n"
+    with zipfile.ZipFile(path, "a") as archive:
+        raw = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
+        archive.writestr("other.npy", raw)
+    assert "not an NPZ file, damaged or cut short" in failure(path, cart)
+
+
+@pytest.mark.parametrize("extension", ["npz", "parquet"])
+def test_files_that_unpack_to_more_than_a_log(tmp_path, cart, extension, monkeypatch):
+    path = save(tmp_path / f"a.{extension}", cart_columns())
+    monkeypatch.setattr(log_tables, "_LARGEST", 1000)
+    assert "when unpacked, more than a log has" in failure(path, cart)
+
+
+@pytest.mark.parametrize("column", ["time", "run"])
+def test_parquet_text_that_is_no_utf8(tmp_path, cart, column):
+    columns = {k: pyarrow.array(v) for k, v in cart_columns(3).items()}
+    columns[column] = pyarrow.array([b"\xff", b"1", b"2"]).view(pyarrow.string())
+    path = tmp_path / "a.parquet"
+    pyarrow.parquet.write_table(pyarrow.table(columns), path)
+    assert "not a Parquet file, damaged or cut short" in failure(path, cart)
+
+
+@pytest.mark.timeout(120)
+def test_a_run_column_that_counts_rows_is_refused_soon(tmp_path, flyer):
+    """Time went with the square of the number of recordings."""
+    rows = 30_000
+    names = [f"qpos.base.{i}" for i in range(7)] + [f"qpos.wrist.{i}" for i in range(4)]
+    columns = {name: np.full(rows, 0.5) for name in [*names, "qpos.wheel"]}
+    columns |= {"time": 0.01 * np.arange(rows), "run": np.arange(rows)}
+    path = save(tmp_path / "a.npz", columns)
+    assert "no two successive rows" in failure(path, flyer)
+
+
+def test_mapping_numbers_beyond_float(tmp_path, cart):
+    path = save(tmp_path / "a.csv", cart_columns())
+    mapping = tmp_path / "m.yaml"
+    mapping.write_text("scale: {time: 0x" + "f" * 400 + "}")
+    assert "not a number" in failure(path, cart, mapping=mapping)

@@ -84,6 +84,10 @@ def test_round_trip(tmp_path: Path) -> None:
         ("parameters: [{name: a, address: M, nominal: many}]", "'many', not a number"),
         ("parameters: [{name: a, address: M, nominal: yes}]", "True, not a number"),
         ("parameters: [{name: a, address: M, nominal: .inf}]", "finite"),
+        (
+            f"parameters: [{{name: a, address: M, nominal: 0x{'f' * 400}}}]",
+            "not a number",
+        ),
         ("parameters: [{name: a, address: M, initial: 3}]", "write [low, high]"),
         ("parameters: [{name: a, address: M, initial: [1, 2, 3]}]", "[low, high]"),
         ("parameters: [{name: a, address: M, initial: [2, 1]}]", "reversed"),

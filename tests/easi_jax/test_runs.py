@@ -1,4 +1,5 @@
 import dataclasses
+import errno
 import json
 import os
 import subprocess
@@ -10,8 +11,10 @@ import pytest
 
 from easi_jax.errors import UserError
 from easi_jax.io.files import atomic_write, number, to_json
-from easi_jax.io.metrics import read_metrics
+from easi_jax.io.metrics import MetricsLog, read_metrics
+from easi_jax.io.report import Report, write_report
 from easi_jax.io.runs import RunFolder, config_hash, read_config
+from easi_jax.io.video import write_video
 
 
 @dataclasses.dataclass(frozen=True)
@@ -225,3 +228,71 @@ def test_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
     with pytest.raises(UserError, match=r"cannot write .*a\.json: No space left"):
         atomic_write(path, "new")
     assert _contents(tmp_path) == {"a.json": b"old"}
+
+
+@pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+def test_metrics_on_a_disk_that_takes_no_more(tmp_path, monkeypatch, reason):
+    log = MetricsLog(tmp_path)
+    log.write("train", 1, {"loss": 1.0})
+
+    class Full:
+        def write(self, _):
+            raise OSError(reason, os.strerror(reason))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(log, "_file", Full())
+        with pytest.raises(UserError, match=f"{os.strerror(reason)}.*--resume"):
+            log.write("train", 2, {"loss": 1.0})
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", _fails(reason))
+        with pytest.raises(UserError, match=os.strerror(reason)):
+            log.rewind("train", 0)
+    # As before, and still open.
+    log.write("train", 3, {"loss": 1.0})
+    log.close()
+    lines = read_metrics(tmp_path / "metrics.jsonl")
+    assert [line["step"] for line in lines] == [1, 3]
+
+
+def test_curves_on_a_disk_that_takes_no_more(tmp_path, monkeypatch):
+    log = MetricsLog(tmp_path)
+    monkeypatch.setattr(log, "_board", _fails(errno.ENOSPC))
+    with pytest.raises(UserError, match=r"cannot write .*tensorboard: No space left"):
+        log.write("train", 1, {"loss": 1.0})
+    log.close()
+
+
+@pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EROFS])
+def test_results_and_videos_on_a_full_or_read_only_disk(tmp_path, monkeypatch, reason):
+    frames = np.zeros((2, 4, 4, 3), np.uint8)
+    write_report(tmp_path / "report.html", Report("old", []))
+    write_video(tmp_path / "a.gif", frames, 10)
+    before = _contents(tmp_path)
+    said = os.strerror(reason)
+    with RunFolder.open(tmp_path / "run", {}) as run:
+        run.write_json("results.json", {"a": 1})
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "replace", _fails(reason))
+            patch.setattr(Path, "replace", _fails(reason))
+            with pytest.raises(UserError, match=rf"results\.json: {said}"):
+                run.write_json("results.json", {"a": 2})
+            with pytest.raises(UserError, match=rf"report\.html: {said}"):
+                write_report(tmp_path / "report.html", Report("new", []))
+            with pytest.raises(UserError, match=rf"a\.gif: {said}"):
+                write_video(tmp_path / "a.gif", frames + 9, 10)
+    kept = _contents(tmp_path)
+    assert {name: kept[name] for name in before} == before
+    assert json.loads(kept["run/results.json"]) == {"a": 1}
+    assert not [name for name in kept if "part" in name or ".results" in name]
+
+
+def test_names_that_are_no_utf8_are_written(tmp_path):
+    atomic_write(tmp_path / "a.txt", "log \udcff.csv")
+    assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "log \\udcff.csv"
+
+
+def _fails(reason):
+    def fails(*_args, **_kwargs):
+        raise OSError(reason, os.strerror(reason))
+
+    return fails

@@ -290,3 +290,9 @@ def test_commands_import_without_jax():
         check=True,
     )
     assert found.stdout.strip() == "[]"
+
+
+def test_what_a_file_put_into_a_message_is_shown_as_text():
+    line = _command._line("bad\n name \x1b[31mred\x07 µ \ud800 " + "x" * 10_000)
+    assert line.startswith("bad name \\x1b[31mred\\x07 µ \\ud800 xxx")
+    assert len(line) < 2100
