@@ -12,7 +12,7 @@ CONFIG = {"format": int, "command": str, "config": {}}
 MADE_WITH = {"robot": str, "env?": str, "option?": [str]}
 TRAINED = {
     **MADE_WITH,
-    "env_steps": int,
+    "env_steps?": int,
     "seeds": [int],
     "algorithm?": str,
     "effects?": {},

@@ -14,8 +14,9 @@ from easi_jax.errors import UserError
 from easi_jax.export.randomization import read_randomization, to_yaml
 from easi_jax.io.files import read_json
 from easi_jax.io.metrics import read_metrics
-from easi_jax.io.run_files import checked, read_distribution
+from easi_jax.io.run_files import TRAINED, checked, read_distribution
 from easi_jax.io.runs import RunFolder, read_config
+from train import udr
 from train._robots import read_policies
 
 
@@ -30,6 +31,14 @@ def test_a_distribution_with_open_bounds_is_exported(tmp_path: Path) -> None:
     assert found["parameters"][0]["bounds"] == [0.001, math.inf]
     text = write(tmp_path, "r.yaml", to_yaml(found, "1", "cart"))
     assert read_randomization(text).bounds[1, 0] == math.inf
+
+
+def test_a_run_with_nothing_but_defaults_is_one(tmp_path: Path) -> None:
+    with RunFolder.open(tmp_path / "udr", udr.Config(), command="train.udr"):
+        pass
+    config = read_config(tmp_path / "udr")
+    assert config["env_steps"] is None, "the robot's own"
+    assert checked(config, TRAINED, "it") == config
 
 
 @pytest.mark.parametrize(
