@@ -63,7 +63,10 @@ def main(
     """
     import tyro
 
-    config = tyro.cli(config_class, prog=f"python -m {name}", args=args)
+    try:
+        config = tyro.cli(config_class, prog=f"python -m {name}", args=args)
+    except BrokenPipeError:
+        _unheard()
     try:
         from easi_jax import distributed
         from easi_jax.errors import UserError
@@ -78,9 +81,7 @@ def main(
             said = f"error: {_line(str(error))}" if _heard() else ""
             _stop(said, USER_ERROR, args is None)
     except BrokenPipeError:
-        # The reader of our output has gone, as in `... | head`.
-        sys.stderr.close()
-        raise SystemExit(1) from None
+        _unheard()
     except BaseException as error:
         # An event loop or a callback turns the interrupt into an error of its own.
         told = isinstance(error, KeyboardInterrupt) or _interrupt.asked()
@@ -91,6 +92,13 @@ def main(
             raise
         out = getattr(config, "out", None)
         _stop(_interrupted(out, hasattr(config, "resume")), INTERRUPTED, args is None)
+
+
+def _unheard() -> NoReturn:
+    """The reader of our output has gone, as in ``... | head``."""
+    # Else the interpreter's end writes what is left, and complains.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    raise SystemExit(1) from None
 
 
 def show_table(

@@ -296,3 +296,12 @@ def test_what_a_file_put_into_a_message_is_shown_as_text():
     line = _command._line("bad\n name \x1b[31mred\x07 µ \ud800 " + "x" * 10_000)
     assert line.startswith("bad name \\x1b[31mred\\x07 µ \\ud800 xxx")
     assert len(line) < 2100
+
+
+def test_a_reader_that_leaves_early_is_no_error():
+    """``--help | head``: the text is longer than what the pipe's reader takes."""
+    command = f"{sys.executable} -m train.easi --help | head -n 1"
+    done = subprocess.run(
+        command, shell=True, capture_output=True, text=True, timeout=120, cwd=ROOT
+    )
+    assert done.stdout.startswith("usage:") and done.stderr == ""
