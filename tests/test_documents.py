@@ -103,7 +103,7 @@ def test_equations_become_mathml() -> None:
 )
 def test_the_site_builds(tmp_path: Path) -> None:
     command = ("-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path))
-    subprocess.run([sys.executable, *command], cwd=ROOT, check=True)
+    subprocess.run([sys.executable, *command], cwd=ROOT, check=True, timeout=1200)
     assert (
         'id="easi_jax.search.Search' in (tmp_path / "reference/index.html").read_text()
     )

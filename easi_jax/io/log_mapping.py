@@ -11,7 +11,7 @@ import numpy as np
 
 from easi_jax.errors import UserError, nearest
 from easi_jax.io.log_tables import Table
-from easi_jax.io.strict_yaml import read_yaml
+from easi_jax.io.strict_yaml import check_keys, read_yaml
 
 _KEYS = ("columns", "scale", "offset")
 
@@ -81,12 +81,7 @@ def read_mapping(path: str | os.PathLike[str]) -> LogMapping:
     content = read_yaml(path)
     if not isinstance(content, dict):
         raise UserError(f'{path}: a mapping file has the key "columns:"')
-    for key in content:
-        if key not in _KEYS:
-            raise UserError(
-                f'{path}: unknown key "{key}"{nearest(str(key), _KEYS)} '
-                f"(known: {', '.join(_KEYS)})"
-            )
+    check_keys(path, content, _KEYS)
     columns = {
         str(theirs): str(ours)
         for theirs, ours in _section(path, content, "columns").items()

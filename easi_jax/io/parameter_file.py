@@ -20,7 +20,7 @@ import yaml
 
 from easi_jax.errors import UserError, nearest
 from easi_jax.io.files import atomic_write
-from easi_jax.io.strict_yaml import read_yaml
+from easi_jax.io.strict_yaml import check_keys, read_yaml
 from easi_jax.parameters import ParameterSpace, Range, declare
 
 _KEYS = ("name", "address", "nominal", "initial", "bounds", "scale", "unit")
@@ -86,12 +86,7 @@ def _entry(path: Path, number: int, entry: Any, mj_model: mujoco.MjModel) -> Any
     where = f"{path}: parameter {number}"
     if not isinstance(entry, dict):
         raise UserError(f'{where}: write "- name: ..." and "address: ..."')
-    for key in entry:
-        if key not in _KEYS:
-            raise UserError(
-                f'{where}: unknown key "{key}"{nearest(str(key), _KEYS)} '
-                f"(known: {', '.join(_KEYS)})"
-            )
+    check_keys(where, entry, _KEYS)
     for key in ("name", "address"):
         if key not in entry:
             raise UserError(f'{where}: the key "{key}" is missing')

@@ -1,5 +1,6 @@
 """Plain data from YAML, strictly: no tags, no key twice, no aliases that explode."""
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ from yaml.composer import ComposerError
 from yaml.constructor import ConstructorError
 from yaml.scanner import ScannerError
 
-from easi_jax.errors import UserError
+from easi_jax.errors import UserError, nearest
 from easi_jax.io.files import os_reason, regular_file
 
 _MOST = 1_000_000  # values in a file, what aliases repeat counted each time
@@ -72,6 +73,20 @@ def read_yaml(path: Path) -> Any:
         raise UserError(
             f"{path}: not valid YAML{where}{f' ({problem})' if problem else ''}"
         ) from None
+
+
+def check_keys(where: object, keys: Iterable[object], known: Sequence[str]) -> None:
+    """Refuses what is not among the known keys.
+
+    Raises:
+        UserError: ``where``, the first unknown key, and the nearest known one.
+    """
+    for key in keys:
+        if key not in known:
+            raise UserError(
+                f'{where}: unknown key "{key}"{nearest(str(key), known)} '
+                f"(known: {', '.join(known)})"
+            )
 
 
 def _count(node: yaml.Node, known: dict[int, int]) -> int:

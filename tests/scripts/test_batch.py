@@ -51,9 +51,9 @@ def test_there_is_one_for_each_kind_of_job() -> None:
 
 @pytest.mark.parametrize("script", BATCH, ids=lambda p: p.stem)
 def test_bash_reads_it(script: Path) -> None:
-    subprocess.run(["bash", "-n", script], check=True)
+    subprocess.run(["bash", "-n", script], check=True, timeout=60)
     if shutil.which("shellcheck"):
-        subprocess.run(["shellcheck", script], check=True)
+        subprocess.run(["shellcheck", script], check=True, timeout=60)
 
 
 @pytest.mark.parametrize("script", BATCH, ids=lambda p: p.stem)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from easi_jax.errors import UserError, nearest
-from easi_jax.io.strict_yaml import read_yaml
+from easi_jax.io.strict_yaml import check_keys, read_yaml
 
 _KEYS = ("joints", "actuators", "columns", "scale", "offset")
 
@@ -86,12 +86,7 @@ def read_import_mapping(path: str | os.PathLike[str]) -> ImportMapping:
     content = read_yaml(path)
     if not isinstance(content, dict):
         raise UserError(f"{path}: a mapping file has the keys {', '.join(_KEYS)}")
-    for key in content:
-        if key not in _KEYS:
-            raise UserError(
-                f'{path}: unknown key "{key}"{nearest(str(key), _KEYS)} '
-                f"(known: {', '.join(_KEYS)})"
-            )
+    check_keys(path, content, _KEYS)
     scale = _numbers(path, content, "scale")
     for name, value in scale.items():
         if value == 0:

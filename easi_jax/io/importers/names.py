@@ -1,5 +1,6 @@
 """Which channel of a recording becomes which column of the log."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -91,14 +92,17 @@ class _Assignment:
         joint = self._joint(stream, name)
         return None if joint is None else f"{stream.role}.{joint}"
 
+    def _check_mapped(self, kind: str, name: str | None, known: Sequence[str]) -> None:
+        if name is not None and name not in known:
+            raise UserError(
+                f'{self.mapping.source}: the model has no {kind} "{name}"'
+                f"{nearest(name, known)}"
+            )
+
     def _joint(self, stream: Stream, name: str) -> str | None:
         if name in self.mapping.joints:
             joint = self.mapping.joints[name]
-            if joint is not None and joint not in self.joints:
-                raise UserError(
-                    f'{self.mapping.source}: the model has no joint "{joint}"'
-                    f"{nearest(joint, self.joints)}"
-                )
+            self._check_mapped("joint", joint, self.joints)
         elif stream.named:
             joint = name
         else:
@@ -123,11 +127,7 @@ class _Assignment:
     def _actuator(self, stream: Stream, name: str) -> str | None:
         if name in self.mapping.actuators:
             actuator = self.mapping.actuators[name]
-            if actuator is not None and actuator not in self.actuators:
-                raise UserError(
-                    f'{self.mapping.source}: the model has no actuator "{actuator}"'
-                    f"{nearest(actuator, self.actuators)}"
-                )
+            self._check_mapped("actuator", actuator, self.actuators)
             return None if actuator is None else f"ctrl.{actuator}"
         if stream.named and name in self.actuators:
             return f"ctrl.{name}"
