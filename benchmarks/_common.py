@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,17 @@ def command_of(module: str, config: Any) -> str:
             items = value if isinstance(value, tuple) else (value,)
             words += [f"--{flag}", *map(str, items)]
     return " ".join(words)
+
+
+def wander(env: Any) -> Callable[[Any, Any], Any]:
+    """A controller that draws its actions, ``act(obs, key) -> action``."""
+    import jax
+    import jax.numpy as jnp
+
+    def act(_: Any, key: Any) -> Any:
+        return jnp.clip(0.3 * jax.random.normal(key, (env.action_size,)), -1.0, 1.0)
+
+    return act
 
 
 def first_start(words: Sequence[str], folder: Path, limit: float) -> float:

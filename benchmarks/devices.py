@@ -92,20 +92,19 @@ def moved(name: str, population: int) -> Any:
     import jax.numpy as jnp
     import numpy as np
 
+    from benchmarks._common import wander
     from easi_jax.rollout import policy_rollout
     from envs import make
 
     env = make(name)
     low, high = (jnp.asarray(x) for x in env.space.initial)
+    act = wander(env)
 
     def one(key: jax.Array) -> jax.Array:
         k_model, k_run = jax.random.split(key)
         theta = jax.random.uniform(k_model, low.shape, minval=low, maxval=high)
 
-        def wander(_: jax.Array, k: jax.Array) -> jax.Array:
-            return jnp.clip(0.3 * jax.random.normal(k, (env.action_size,)), -1.0, 1.0)
-
-        seg = policy_rollout(env, env.model(theta), wander, k_run, max(STEPS) + 1)
+        seg = policy_rollout(env, env.model(theta), act, k_run, max(STEPS) + 1)
         return seg.qpos[1:]
 
     keys = jax.random.split(jax.random.key(0), population)

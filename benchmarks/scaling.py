@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks._common import RESULTS
+from benchmarks._common import RESULTS, wander
 from train._command import main, say
 
 FEWEST = 4  # parameters
@@ -117,13 +117,9 @@ def _generation(
     chosen = preset("default", generations=config.generations, **search)
     space = env.space if names is None else env.space.select(names)
     made = Search(env.machine.rebuilt(space=space), chosen, mesh=mesh)
-    n = env.action_size
-
-    def wander(_: jax.Array, key: jax.Array) -> jax.Array:
-        return jnp.clip(0.3 * jax.random.normal(key, (n,)), -1.0, 1.0)
 
     def data(key: jax.Array) -> SearchData:
-        demos = collect(env, env.model(), wander, key, 20, env.episode_length)
+        demos = collect(env, env.model(), wander(env), key, 20, env.episode_length)
         pieces = windows(demos, chosen.horizon, max(1, chosen.horizon // 2))
         return SearchData(pieces, jnp.zeros(2 * env.mj_model.nv), ())
 
