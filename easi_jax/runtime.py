@@ -18,7 +18,9 @@ _WAIT = 10**7  # s
 _EXTRA = "xla_backend_extra_options"
 _NEXT = (0, 13)  # first jaxlib that these were not tried with
 # Bytes that a loop may touch and still run as one piece; beyond, compiling takes long.
-_LOOPS = "xla_cpu_small_while_loop_byte_threshold=2000000"
+_LOOPS, _LARGER = (
+    f"xla_cpu_small_while_loop_byte_threshold={n}" for n in (2_000_000, 8_000_000)
+)
 # An unknown flag ends the process: each only up to the jaxlib that is known to have it.
 _FLAGS: dict[str, tuple[object, tuple[int, int]]] = {
     _EMITTERS: ("false", (0, 11)),
@@ -112,6 +114,20 @@ def _ready_flags(version: tuple[int, ...]) -> None:
         os.environ["XLA_FLAGS"] = flags
 
 
+def larger_loops() -> None:
+    """Loops that touch up to 8 MB become one function as well.
+
+    For a process that simulates one machine for minutes: an arm of six joints is then
+    predicted three times as fast, which takes a minute more to compile (jaxlib 0.10.2,
+    benchmarks/gap_times.py). Nothing changes where a backend has started, or where the
+    environment says otherwise.
+    """
+    prepare()
+    if not backend_started():
+        flags = os.environ.get("XLA_FLAGS", "")
+        os.environ["XLA_FLAGS"] = flags.replace(_LOOPS, _LARGER)
+
+
 def fast_loops() -> dict[str, Any]:
     """``compiler_options`` of ``jax.jit`` for programs that simulate for long.
 
@@ -169,7 +185,9 @@ def status() -> dict[str, object]:
         "one_device_per_core": devices[0].platform != "cpu" or len(devices) == cores(),
         "compilation_cache": _setting("jax_compilation_cache_dir"),
         "quick_compile": f"{_EMITTERS}=false" in os.environ.get("XLA_FLAGS", ""),
-        "loops_in_one_piece": _LOOPS in os.environ.get("XLA_FLAGS", ""),
+        "loops_in_one_piece": any(
+            loops in os.environ.get("XLA_FLAGS", "") for loops in (_LOOPS, _LARGER)
+        ),
         "matmul_precision": _setting("jax_default_matmul_precision"),
         "x64": bool(_setting("jax_enable_x64")),
         "prepared_before_backend": not _state["late"],

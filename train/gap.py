@@ -55,6 +55,7 @@ class Config:
 
 def run(config: Config) -> None:
     """Reads and checks, finds, writes."""
+    from easi_jax import runtime
     from easi_jax.errors import UserError
     from easi_jax.io.runs import RunFolder
     from train._gap_problem import read_gap_problem
@@ -64,6 +65,7 @@ def run(config: Config) -> None:
 
     if not config.model or not config.data:
         raise UserError("give --model M.xml (or a robot's name) and --data LOG...")
+    runtime.larger_loops()
     check_seeds(config.retrain_seeds)
     problem = read_gap_problem(config)
     if config.retrain is not None:

@@ -10,6 +10,7 @@ one size.
 import copy
 import math
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -111,6 +112,7 @@ class Predictor:
                 (True, quick_compile()),
             )
         )
+        self._compiled: list[Future[Any]] = []
         width = [i for i, c in enumerate(layout.columns) if c.field == "width"]
         self._width = self.own + np.array(width, int)
 
@@ -160,6 +162,7 @@ class Predictor:
         theirs = [getattr(windows, f).shape[1:] for f in parts]
         if mine != theirs or len(windows) > self.capacity:
             raise ValueError("windows of another shape, or more than there is room for")
+        self._program(False)
         other = copy.copy(self)
         other.windows = windows
         other._data = other._placed(windows)
@@ -190,6 +193,21 @@ class Predictor:
         readings = (start + late)[:, None] + step[:, None]
         commands = start + step[:-1]
         return Rows(np.round(readings).astype(int), np.round(commands).astype(int))
+
+    def _program(self, play: bool) -> Any:
+        """One of the two, compiled: for an arm each takes a minute, so side by side."""
+        if not self._compiled:
+            batch = _ITEMS * self._mesh.size
+            like = (
+                np.zeros((batch, len(self.neutral)), np.float32),
+                np.zeros(batch, np.int32),
+                np.zeros((batch, BLOCK, 2 * self.nv), np.float32),
+            )
+            with_data = [p.lower(*like, *self._data) for p in self._programs]
+            threads = ThreadPoolExecutor(len(with_data), "compile")
+            self._compiled = [threads.submit(p.compile) for p in with_data]
+            threads.shutdown(wait=False)
+        return self._compiled[play].result()
 
     def _sharded(
         self,
@@ -331,9 +349,12 @@ class Predictor:
         loose = (vectors[:, self._width] > 0).any(1)
         for play in (False, True):
             chosen = np.flatnonzero(loose == play)
+            if not len(chosen):
+                continue
+            program = self._program(play)
             for part in self._batches(chosen):
                 args = vectors[part], which[part], offsets[part]
-                got = self._programs[play](*args, *self._data)
+                got = program(*args, *self._data)
                 out[part] = np.asarray(got)
         out = out.reshape(count, nb * BLOCK, self.steps, self.nv)
         return out[:, : self.count(windows)]

@@ -3,6 +3,8 @@
 import numpy as np
 
 SHAPES = ("multisine", "chirp", "steps")
+SLOWEST = 0.15
+"""Lowest frequency of a multisine [Hz]."""
 LEAD = 0.8
 """Seconds of motion before a run's first row, so that hidden states have settled."""
 
@@ -20,7 +22,7 @@ def _pace(rng: np.random.Generator, time: np.ndarray) -> np.ndarray:
 
 
 def _multisine(rng: np.random.Generator, phase: np.ndarray, speed: float) -> np.ndarray:
-    frequency = np.exp(rng.uniform(np.log(0.15), np.log(speed), size=5))
+    frequency = np.exp(rng.uniform(np.log(SLOWEST), np.log(speed), size=5))
     offset = rng.uniform(0.0, 2 * np.pi, size=5)
     waves = np.sin(2 * np.pi * np.outer(phase, frequency) + offset)
     return waves @ (1.0 / np.sqrt(frequency))
@@ -57,7 +59,8 @@ def reference(
 ) -> np.ndarray:
     """Reference motion about zero, one column per amplitude: (T, n).
 
-    `speed` is the highest frequency in Hz. The first moments are at rest.
+    `speed` is the highest frequency in Hz, above `SLOWEST`. The first moments are at
+    rest.
     """
     pace = _pace(rng, time)
     columns = []

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from tests.gap_cases.effects import CaseError, Context
-from tests.gap_cases.excitation import SHAPES
+from tests.gap_cases.excitation import SHAPES, SLOWEST
 from tests.gap_cases.gap import measure
 from tests.gap_cases.logs import Log, Noise
 from tests.gap_cases.mechanisms import GRAVITY, Mechanism
@@ -127,6 +127,8 @@ def settle(mechanism: Mechanism, rng: np.random.Generator) -> Setting:
             std = needed
         else:
             mechanism = replace(mechanism, speed=0.8 * mechanism.speed)
+            if mechanism.speed <= SLOWEST:
+                raise CaseError("slow enough for its floor, it hardly moves")
             logs = []
     else:
         raise CaseError("the perfect model stays above its floor")

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from tests.gap_cases import CaseError, Effect, Stated, draw_case, make_case
+from tests.gap_cases import CaseError, Effect, Stated, draw_case, make_case, settings
 from tests.gap_cases.commands import Deadband, Delayed, Dropped, Gain, Lag
 from tests.gap_cases.draw import CASE_KINDS, is_one_spring
 from tests.gap_cases.effects import KINDS, OUTSIDE
@@ -487,3 +487,10 @@ def test_twins_of_a_slide() -> None:
     late = twins(machine, Effect("actuator_delay", "drive"))
     assert late == ["sensor_delay@slider"]
     assert twins(machine, Effect("viscous_damping", "slider")) == []
+
+
+def test_a_machine_that_would_have_to_stand_still_is_drawn_anew(monkeypatch):
+    monkeypatch.setattr(settings, "_needed", lambda *_: np.inf)
+    monkeypatch.setattr(settings, "record", lambda *_: None)
+    with pytest.raises(CaseError, match="hardly moves"):
+        settings.settle(carriage(), np.random.default_rng(0))

@@ -93,3 +93,44 @@ def test_a_batch_of_simulations_runs_in_one_piece():
     program = go.lower(batch, jnp.zeros(machine.mj_model.nu))
     text = program.compile(runtime.fast_loops()).as_text()
     assert "xla_cpu_small_call" in text
+
+
+_LOOP = """
+import jax, jax.numpy as jnp
+from easi_jax import runtime
+{before}
+runtime.larger_loops()
+step = lambda x, _: (jnp.sin(x) + x[::-1], None)
+go = jax.jit(lambda x: jax.lax.scan(step, x, None, length=9)[0])
+print("xla_cpu_small_call" in go.lower(jnp.ones({size})).compile().as_text())
+"""
+
+
+@pytest.mark.skipif(
+    jax.__version_info__[:2] != (0, 10), reason="flags of this jax are unknown"
+)
+@pytest.mark.parametrize(
+    ("before", "size", "one_piece"),
+    [
+        ("", 400_000, True),  # about 5 MB a round
+        ("", 4_000_000, False),
+        ("jax.devices()", 400_000, False),  # too late
+    ],
+)
+def test_larger_loops_run_in_one_piece_where_asked_in_time(before, size, one_piece):
+    env = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    done = subprocess.run(
+        [sys.executable, "-c", _LOOP.format(before=before, size=size)],
+        **dict(capture_output=True, text=True, timeout=120, cwd=ROOT),
+        env=env,
+        check=True,
+    )
+    assert done.stdout.strip() == str(one_piece)
+
+
+def test_larger_loops_leave_what_the_environment_says(monkeypatch):
+    mine = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1"
+    monkeypatch.setenv("XLA_FLAGS", mine)
+    monkeypatch.setattr(runtime, "backend_started", lambda: False)
+    runtime.larger_loops()
+    assert os.environ["XLA_FLAGS"] == mine
