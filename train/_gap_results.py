@@ -137,7 +137,7 @@ def write_results(
     """Writes all files; returns the report's path. ``retrained``: see `_retrain`."""
     from easi_jax.found_effects import EffectEntry
     from easi_jax.io.effects_file import write_effects
-    from easi_jax.io.repaired_model import repaired_xml
+    from easi_jax.io.repaired_model import repaired_model
 
     entries = []
     for f in outcome.found:
@@ -165,8 +165,11 @@ def write_results(
     own = {r["address"]: r["to"] for r in outcome.refitted}
     left: list[str] = []
     if problem.model.path is not None:
-        xml, left = repaired_xml(problem.model.path, entries, own)
-        folder.write("model.xml", xml)
+        model = repaired_model(problem.model.path, entries, own)
+        for name, place in model.assets.items():
+            folder.write(name, place.read_bytes())
+        folder.write("model.xml", model.xml)
+        left = model.left
     content = gap_json(problem, outcome)
     content["not_in_model_xml"] = left
     if retrained is not None:

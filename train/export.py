@@ -130,16 +130,16 @@ def _parameter_files(
     if "randomization" in chosen:
         files["randomization.yaml"] = to_yaml(found, seed, Path(robot).stem)
     if "mjcf" in chosen:
-        files["model.xml"] = _model_text(config, settings, found, seed)
+        files |= _model_files(config, settings, found, seed)
     return files
 
 
-def _model_text(
+def _model_files(
     config: Config, settings: dict[str, Any], found: dict[str, Any], seed: str
-) -> str:
+) -> dict[str, str | bytes]:
     import numpy as np
 
-    from easi_jax.export.mjcf import identified_xml
+    from easi_jax.export.mjcf import identified_model
 
     values = dict(
         zip(
@@ -150,10 +150,11 @@ def _model_text(
     )
     source, machine, entries = _machine_of(config, settings, found, values)
     theta = np.array([values[name] for name in machine.space.names], float)
-    text, lost = identified_xml(source, machine, theta, entries)
-    if lost:
-        say(f"note: MJCF has no word for {', '.join(lost)}: not in model.xml")
-    return text
+    model = identified_model(source, machine, theta, entries)
+    if model.left:
+        say(f"note: MJCF has no word for {', '.join(model.left)}: not in model.xml")
+    assets = {name: place.read_bytes() for name, place in model.assets.items()}
+    return {**assets, "model.xml": model.xml}
 
 
 def _machine_of(

@@ -1,5 +1,6 @@
 """An identified machine as MJCF that plain MuJoCo loads."""
 
+import dataclasses
 import re
 import tempfile
 from collections.abc import Sequence
@@ -11,25 +12,22 @@ import numpy as np
 from easi_jax.errors import UserError
 from easi_jax.found_effects import EffectEntry
 from easi_jax.in_mujoco import InMujoco
-from easi_jax.io.repaired_model import repaired_xml
+from easi_jax.io.repaired_model import Repaired, repaired_model
 from easi_jax.machine import Machine
 
 
-def identified_xml(
+def identified_model(
     source: Path,
     machine: Machine,
     theta: np.ndarray,
     entries: Sequence[EffectEntry] = (),
-) -> tuple[str, list[str]]:
+) -> Repaired:
     """The MJCF of ``source`` with parameters ``theta (n,)``, SI, and effects in it.
 
     Args:
         source: file that the machine's model came from.
         machine: whose parameters they are.
         entries: effects that the machine has besides.
-
-    Returns:
-        The text, and names of the parameters and effects that MJCF has no word for.
 
     Raises:
         UserError: ``source`` is another model than the machine's.
@@ -50,9 +48,9 @@ def identified_xml(
         path = Path(folder) / "model.xml"
         mujoco.mj_saveLastXML(str(path), model)
         # MuJoCo writes it and then warns that it is of no use.
-        path.write_text(re.sub(r'\s*meaninertia="[^"]*"', "", path.read_text()))
-        text, left = repaired_xml(path, entries, {})
-    return text, [*lost, *left]
+        text = re.sub(r'\s*meaninertia="[^"]*"', "", path.read_text())
+    model = repaired_model(source, entries, {}, text)
+    return dataclasses.replace(model, left=[*lost, *model.left])
 
 
 def _sizes(m: mujoco.MjModel) -> tuple[object, ...]:

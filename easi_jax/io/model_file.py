@@ -86,7 +86,7 @@ def check_assets(path: Path, allowed: Sequence[Path] = ()) -> None:
         if len(folders) * len(below) * len(named) > _MOST:
             raise UserError(f"{path}: names too many files and folders")
         for folder, part, (parent, value) in itertools.product(folders, below, named):
-            for text in _ways(value):
+            for text in ways(value):
                 place = folder / part / text
                 if (parent, place) in tried or not os.path.lexists(place):
                     continue
@@ -111,7 +111,7 @@ def _refuse_circles(path: Path, leads: dict[Path, set[Path]]) -> None:
         left = {file: named for file, named in left.items() if file not in ends}
 
 
-def _ways(value: str) -> set[str]:
+def ways(value: str) -> set[str]:
     """Ways in which MuJoCo may read a file name; URDF's have a scheme before them."""
     plain = re.sub(r"^\w+://", "", value)
     return {value, plain, value.replace("\\", "/"), plain.replace("\\", "/")} - {""}

@@ -2,13 +2,16 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from easi_jax.found_effects import EffectEntry
+from easi_jax.io.model_file import ways
 
+_ASSETS = "assets"  # folder beside the model
 _SAID = {
     "coulomb_friction",
     "viscous_damping",
@@ -26,20 +29,44 @@ _SAID = {
 }
 
 
-def repaired_xml(
-    path: Path, entries: Sequence[EffectEntry], own: Mapping[str, float]
-) -> tuple[str, list[str]]:
-    """The model's XML with effects and refitted values, and names of what it lacks.
+@dataclass(frozen=True)
+class Repaired:
+    """A model that loads in plain MuJoCo.
 
-    The text loads in plain MuJoCo. What MJCF cannot say (a constant torque at a joint,
-    torque ripple, late sensors ...) is only in ``effects.yaml``.
+    Attributes:
+        xml: its text.
+        assets: files that it names (meshes, textures, height fields), by the names
+            that it has for them; they belong beside it.
+        left: what MJCF has no word for (a constant torque at a joint, torque ripple,
+            late sensors ...).
+    """
+
+    xml: str
+    assets: dict[str, Path]
+    left: list[str]
+
+
+def repaired_model(
+    path: Path,
+    entries: Sequence[EffectEntry],
+    own: Mapping[str, float],
+    text: str | None = None,
+) -> Repaired:
+    """A model with effects and refitted values.
 
     Args:
         path: the model as given.
         entries: effects.
         own: values of the model's own parameters, by address.
+        text: taken in place of what ``path`` holds; its files are still looked for
+            from there.
     """
-    spec = mujoco.MjSpec.from_file(str(path))
+    if text is None:
+        spec = mujoco.MjSpec.from_file(str(path))
+        spec.compile()  # says where files named by included ones are
+    else:
+        spec = mujoco.MjSpec.from_string(text)
+    assets = _gathered(spec, path.parent)
     compiled = spec.compile()
     for address, value in own.items():
         kind, rest = address.split(".", 1)
@@ -51,7 +78,44 @@ def repaired_xml(
         if e.effect not in _SAID or not _add(spec, compiled, e):
             left.append(f"{e.effect}@{e.at}" if e.at else e.effect)
     spec.compile()
-    return spec.to_xml(), left
+    return Repaired(spec.to_xml(), assets, left)
+
+
+def _gathered(spec: mujoco.MjSpec, folder: Path) -> dict[str, Path]:
+    """Files of a model, which is changed to name them beside it."""
+    out: dict[str, Path] = {}
+
+    def renamed(file: str, below: str) -> str:
+        place = _found(file, folder, below) if file else None
+        if place is None:
+            return file
+        count, name = 1, f"{_ASSETS}/{place.name}"
+        while out.setdefault(name, place) != place:
+            count += 1
+            name = f"{_ASSETS}/{place.stem}_{count}{place.suffix}"
+        return name
+
+    for item in (*spec.meshes, *spec.hfields, *spec.skins):
+        item.file = renamed(item.file, spec.meshdir)
+    for texture in spec.textures:
+        texture.file = renamed(texture.file, spec.texturedir)
+        for i, file in enumerate(texture.cubefiles):
+            texture.cubefiles[i] = renamed(file, spec.texturedir)
+    spec.meshdir = spec.texturedir = ""
+    spec.assets = {name: place.read_bytes() for name, place in out.items()}
+    return out
+
+
+def _found(file: str, folder: Path, below: str) -> Path | None:
+    """The file that MuJoCo read; of an attached model its name alone is left."""
+    tried = [
+        folder / part / way
+        for way in sorted(ways(file), key=len, reverse=True)
+        for part in (below, "")
+    ]
+    tried += [folder / below / Path(file).name]
+    tried += sorted(folder.rglob(Path(file).name))
+    return next((place.resolve() for place in tried if place.is_file()), None)
 
 
 def _set(joint: mujoco.MjsJoint, quantity: str, value: float) -> None:

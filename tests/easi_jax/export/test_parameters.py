@@ -14,7 +14,7 @@ from mujoco import mjx
 
 from easi_jax import distribution
 from easi_jax.errors import UserError
-from easi_jax.export.mjcf import identified_xml
+from easi_jax.export.mjcf import identified_model
 from easi_jax.export.randomization import (
     domain_randomizer,
     read_randomization,
@@ -52,9 +52,9 @@ def test_the_model_moves_as_identified(robot: str, tmp_path: Path) -> None:
     env = make(robot)
     unit = np.random.default_rng(0).uniform(0.2, 0.8, env.space.size)
     theta = np.asarray(env.space.to_si(unit), float)
-    text, lost = identified_xml(source(robot), env.machine, theta)
-    assert lost == (["cart_speed_limit"] if robot == "cartpole" else [])
-    (tmp_path / "model.xml").write_text(text)
+    model = identified_model(source(robot), env.machine, theta)
+    assert model.left == (["cart_speed_limit"] if robot == "cartpole" else [])
+    (tmp_path / "model.xml").write_text(model.xml)
     got = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
     want = InMujoco(env.machine).at(np.asarray(env.space.to_unit(theta), float))
     given = mujoco.MjModel.from_xml_path(str(source(robot)))
@@ -66,11 +66,9 @@ def test_the_model_moves_as_identified(robot: str, tmp_path: Path) -> None:
 def test_effects_are_in_the_model_where_mjcf_has_a_word() -> None:
     env = make("cartpole")
     theta = np.asarray(env.space.nominal, float)
-    text, lost = identified_xml(
-        source("cartpole"), env.machine, theta, [FRICTION, LATE]
-    )
-    assert lost == ["cart_speed_limit", "sensor_delay@cart"]
-    m = mujoco.MjModel.from_xml_string(text)
+    model = identified_model(source("cartpole"), env.machine, theta, [FRICTION, LATE])
+    assert model.left == ["cart_speed_limit", "sensor_delay@cart"]
+    m = mujoco.MjModel.from_xml_string(model.xml)
     own = theta[env.space.names.index("pole_friction")]
     assert m.joint("pole").frictionloss[0] == pytest.approx(own + 0.05, rel=1e-4)
 
@@ -78,7 +76,7 @@ def test_effects_are_in_the_model_where_mjcf_has_a_word() -> None:
 def test_a_foreign_model_is_refused() -> None:
     env = make("cartpole")
     with pytest.raises(UserError, match="not the model"):
-        identified_xml(source("ant"), env.machine, np.asarray(env.space.nominal))
+        identified_model(source("ant"), env.machine, np.asarray(env.space.nominal))
 
 
 def found(space: ParameterSpace, mean: Any, cov: Any) -> dict[str, Any]:
