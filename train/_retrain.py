@@ -35,11 +35,12 @@ def retrain(
     effects: Path,
     seeds: tuple[int, ...],
     env_steps: int | None,
+    resume: bool = False,
 ) -> dict[str, Any]:
     """Trains a policy with the effects and one without, and tests both with them.
 
     Runs of ``train.udr`` in ``folder/retrain_with`` and ``folder/retrain_without``; the
-    robot with the effects stands for the real one.
+    robot with the effects stands for the real one. ``resume`` goes on with them.
 
     Returns:
         ``robot``, ``env_steps`` and returns by seed, ``without`` and ``with``.
@@ -63,6 +64,7 @@ def retrain(
                 target_effects=effects,
                 seeds=seeds,
                 env_steps=env_steps,
+                resume=resume,
             )
         )
         told = read_json(out / "results.json")

@@ -8,6 +8,7 @@ from typing import Any
 from train._command import main, progress, say, show_table
 
 _HORIZON = 0.2
+_LAST = "report.html"
 _PATIENCE = 5.0  # s; a stage that takes no longer shows no progress
 
 
@@ -49,6 +50,8 @@ class Config:
     """Control steps of each of both trainings; the robot's preset where not given."""
     retrain_seeds: tuple[int, ...] = (0,)
     """Seeds of the trainings."""
+    resume: bool = False
+    """Go on with the analysis in the folder."""
     overwrite: bool = False
     """Delete the results in the folder first."""
 
@@ -58,6 +61,7 @@ def run(config: Config) -> None:
     from easi_jax import runtime
     from easi_jax.errors import UserError
     from easi_jax.io.runs import RunFolder
+    from easi_jax.io.versions import versions
     from train._gap_problem import read_gap_problem
     from train._gap_results import retrained_line, write_results
     from train._retrain import check_robot, retrain
@@ -71,6 +75,7 @@ def run(config: Config) -> None:
     if config.retrain is not None:
         check_robot(config.retrain, problem.model.mj_model)
     from easi_jax.gap.analysis import Analysis
+    from easi_jax.gap.journal import Journal, key_of
 
     analysis = Analysis(
         problem.model.mj_model,
@@ -84,8 +89,21 @@ def run(config: Config) -> None:
         progress=partial(progress, patience=_PATIENCE),
     )
     with RunFolder.open(
-        config.out, config, command="train.gap", overwrite=config.overwrite
+        config.out,
+        config,
+        command="train.gap",
+        resume=config.resume,
+        overwrite=config.overwrite,
     ) as folder:
+        journal = folder.checkpoints / "analysis"
+        if folder.resumed and not journal.exists() and (folder.path / _LAST).exists():
+            say(f"this analysis is finished; report: {folder.path / _LAST}")
+            return
+        made_by = versions()
+        key = key_of(analysis.key, made_by["commit"], made_by["packages"])
+        analysis.selector.journal = Journal(journal, key)
+        if analysis.selector.journal.kept:
+            say(f"going on after {analysis.selector.journal.kept} steps that are done")
         for note in problem.notes:
             say(f"note: {note}")
         outcome = analysis.run()
@@ -102,8 +120,10 @@ def run(config: Config) -> None:
                 config.out / "effects.yaml",
                 config.retrain_seeds,
                 config.retrain_steps,
+                config.resume,
             )
             write_results(folder, config, problem, analysis, outcome, retrained)
+        analysis.selector.journal.clear()
     _show(outcome)
     if retrained is not None:
         say(retrained_line(retrained))

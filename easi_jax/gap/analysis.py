@@ -25,6 +25,7 @@ from easi_jax.gap.evidence import (
     simplest,
 )
 from easi_jax.gap.fit import bounds_of, window_weights
+from easi_jax.gap.journal import key_of
 from easi_jax.gap.layout import Layout
 from easi_jax.gap.models import Candidate, Model
 from easi_jax.gap.numbers import Numbers
@@ -83,6 +84,7 @@ class Analysis:
         progress: Progress = silent,
     ) -> None:
         self.m, self.space, self.tell = mj_model, space, tell
+        self.fixed = dict(fixed or {})
         self.runs = [*fit, *held]
         self.noise = np.asarray(noise)[: mj_model.nv]
         dt = fit[0].dt
@@ -151,6 +153,25 @@ class Analysis:
         span = float(self.scales.span[int(self.m.jnt_dofadr[j])])
         slow = 1 if self.m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE else 2
         return [slow * k * 2 * math.pi / span for k in _RIPPLES]
+
+    @property
+    def key(self) -> str:
+        """A digest of all that the results depend on, for a `Journal`."""
+        windows, held = vars(self.fit_windows), vars(self.held)
+        model = np.zeros(mujoco.mj_sizeModel(self.m), np.uint8)
+        mujoco.mj_saveModel(self.m, None, model)
+        return key_of(
+            model,
+            self.fixed,
+            *(repr(p) for p in self.space.parameters),
+            *windows.values(),
+            *held.values(),
+            self.noise,
+            self.slack,
+            self.predictor.machine.dt,
+            self.predictor.steps,
+            self.predictor.devices,
+        )
 
     # -- pieces ----------------------------------------------------------------
 

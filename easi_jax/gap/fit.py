@@ -5,7 +5,7 @@ of a visible size, which also see effects that have no slope at zero (play, dead
 lag, saturation). Every round asks for all predictions of all candidates at once.
 """
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,6 +42,15 @@ class Fitted:
     residual: np.ndarray
     slope: np.ndarray
     cost: float
+
+    def arrays(self) -> list[tuple[str, np.ndarray]]:
+        """Its parts by name, to be kept; `of` makes it again, to the last bit."""
+        return [(k, np.asarray(getattr(self, k))) for k in self.__dataclass_fields__]
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, np.ndarray]) -> "Fitted":
+        """From `arrays`."""
+        return cls(**{**arrays, "cost": float(arrays["cost"])})
 
 
 @dataclass(frozen=True)

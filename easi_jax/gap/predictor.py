@@ -143,6 +143,11 @@ class Predictor:
         )
 
     @property
+    def devices(self) -> int:
+        """That share the work."""
+        return self._mesh.size
+
+    @property
     def capacity(self) -> int:
         """Windows that the compiled program has room for."""
         return self.blocks * BLOCK

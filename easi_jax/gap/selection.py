@@ -13,12 +13,14 @@ import numpy as np
 
 from easi_jax.gap.evidence import better, contains, rank
 from easi_jax.gap.fit import (
+    Asks,
     Bounds,
     Fitted,
     difference,
     least_squares,
     lockstep,
 )
+from easi_jax.gap.journal import Arrays, Journal
 from easi_jax.gap.models import Candidate, Model
 from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.residuals import Residuals
@@ -27,6 +29,7 @@ from easi_jax.progress import Progress, silent
 
 _SHORTLIST = 7  # names that are fitted in full at each stage
 _STARTS = 2  # of each
+_TRIED = ("cost", "which", "end")
 _HOPELESS = 4.0  # times the best promise; beyond, only the first few are fitted
 
 
@@ -34,7 +37,7 @@ class Selector:
     """Fits sets of effects to some windows.
 
     Its ``residuals`` have to be set before it fits, and ``floor``, the gap of a perfect
-    model, before it chooses.
+    model, before it chooses. ``journal`` keeps what takes long.
 
     Args:
         predictor: predictions.
@@ -59,6 +62,7 @@ class Selector:
         self.predictor, self.progress = predictor, progress
         self.residuals: Residuals
         self.floor = 0.0
+        self.journal = Journal()
         self.blocks, self.count, self.bounds = blocks, count, bounds
         self.group, self.own = group, tuple(own)
         self.weight = np.ones(count)
@@ -104,7 +108,20 @@ class Selector:
     def fit(self, places: list[Place], x: np.ndarray) -> Model:
         """The best fit of some effects from ``x``."""
         problem = least_squares(x[None], self.active(places), self.bounds, self.weight)
-        return self.model(places, lockstep([problem], self.simulate)[0])
+        return self.model(places, self._solved([problem])[0])
+
+    def _solved(self, problems: Sequence[Asks]) -> list[Fitted]:
+        def solve() -> Arrays:
+            name = "fitting effects" if len(problems) > 1 else "fitting"
+            with self.progress(name, len(problems)) as shown:
+                found = lockstep(problems, self.simulate, ended=shown.advance)
+            return {f"{i}.{k}": v for i, f in enumerate(found) for k, v in f.arrays()}
+
+        kept = self.journal.remember(solve)
+        return [
+            Fitted.of({k: kept[f"{i}.{k}"] for k in Fitted.__dataclass_fields__})
+            for i in range(len(problems))
+        ]
 
     def cross_validated(self, fit: Fitted) -> np.ndarray:
         """Squared error of each window by a fit without its block, weighted,
@@ -151,6 +168,15 @@ class Selector:
         self, base: Model, candidates: Sequence[Candidate]
     ) -> list[tuple[float, Candidate]]:
         """Candidates with the cost that one Gauss-Newton step promises, best first."""
+        kept = self.journal.remember(lambda: self._tried(base, candidates))
+        out = [
+            (float(cost), replace(candidates[i], ends=tuple(end)))
+            for cost, i, end in zip(*(kept[k] for k in _TRIED), strict=True)
+        ]
+        return sorted(out, key=lambda item: item[0])
+
+    def _tried(self, base: Model, candidates: Sequence[Candidate]) -> Arrays:
+        """Costs, indices and ends of the candidates that predict finite numbers."""
         x, w = base.fit.x, self.weight
         asks, spans = [], []
         for c in candidates:
@@ -163,8 +189,9 @@ class Selector:
             spans.append((cols, step))
         got, at = self._many(np.concatenate(asks)), 0
         known = base.fit.slope * self.bounds.size[base.fit.active]
-        out = []
-        for c, ask, (cols, step) in zip(candidates, asks, spans, strict=True):
+        costs, which, ends = [], [], []
+        for i, (c, ask) in enumerate(zip(candidates, asks, strict=True)):
+            cols, step = spans[i]
             part = got[at : at + len(ask)]
             at += len(ask)
             r = part[0]
@@ -183,8 +210,12 @@ class Selector:
             end[index] = np.clip(
                 end[index], self.bounds.low[index], self.bounds.high[index]
             )
-            out.append((cost, replace(c, ends=tuple(end))))
-        return sorted(out, key=lambda item: item[0])
+            costs.append(cost)
+            which.append(i)
+            ends.append(end)
+        shape = (len(ends), len(base.fit.x))
+        found = np.array(costs), np.array(which, int), np.reshape(ends, shape)
+        return dict(zip(_TRIED, found, strict=True))
 
     def _many(self, x: np.ndarray, most: int = 256) -> np.ndarray:
         got = []
@@ -207,8 +238,7 @@ class Selector:
             )
             for c in chosen
         ]
-        with self.progress("fitting effects", len(problems)) as shown:
-            fits = lockstep(problems, self.simulate, ended=shown.advance)
+        fits = self._solved(problems)
         best: dict[str, tuple[float, Place, Fitted]] = {}
         for c, f in zip(chosen, fits, strict=True):
             key = c.place.key

@@ -1,6 +1,7 @@
 """train.gap on a machine whose friction the model lacks, and its messages."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ import pytest
 
 from easi_jax.errors import UserError
 from easi_jax.found_effects import FoundEffects, machine_with
+from easi_jax.gap.journal import Journal
+from easi_jax.gap.selection import Selector
 from easi_jax.io.effects_file import read_effects
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
@@ -103,6 +106,73 @@ def test_results_are_not_overwritten(
         )
     assert stop.value.code == 2
     assert "--overwrite" in capsys.readouterr().err
+
+
+def test_a_stopped_analysis_goes_on(
+    case: Any,
+    results: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out, remember = tmp_path / "gap", Journal.remember
+    data = [shutil.copy(p, tmp_path) for p in sorted(case.directory.glob("run*.csv"))]
+    words = ("--model", case.directory / "model.xml", "--out", out, "--data", *data)
+
+    def stopping(self: Journal, make: Any) -> Any:
+        if self.kept == 5:
+            raise KeyboardInterrupt
+        return remember(self, make)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Journal, "remember", stopping)
+        with pytest.raises(SystemExit) as stop:
+            run(*words)
+    assert stop.value.code == 130
+    assert "--resume" in capsys.readouterr().err
+    kept = sorted((out / "checkpoints" / "analysis").iterdir())
+    assert len(kept) == 5
+
+    with pytest.raises(SystemExit) as stop:
+        run(*words)
+    assert stop.value.code == 2
+
+    log = Path(data[0])
+    measured = log.read_text()
+    log.write_text(measured.rstrip().rpartition("\n")[0])  # a row less
+    with pytest.raises(SystemExit) as stop:
+        run(*words, "--resume")
+    assert stop.value.code == 2
+    assert "other logs" in capsys.readouterr().err
+    log.write_text(measured)
+
+    # What was written last may be damaged.
+    kept[-1].write_bytes(kept[-1].read_bytes()[:-100])
+    made = []
+    with monkeypatch.context() as patched:
+        patched.setattr(Selector, "simulate", counted(Selector.simulate, made))
+        run(*words, "--resume")
+    assert "going on after" in capsys.readouterr().out
+    old, new = (json.loads((p / "gap.json").read_text()) for p in (results, out))
+    for told in (old, new):
+        del told["seconds"]
+    assert new == old
+    for name in ("model.xml", "effects.yaml"):
+        assert (out / name).read_bytes() == (results / name).read_bytes()
+    assert not (out / "checkpoints" / "analysis").exists()
+
+    count = len(made)
+    run(*words, "--resume")
+    assert "is finished" in capsys.readouterr().out
+    assert 0 < len(made) == count
+
+
+def counted(method: Any, calls: list[int]) -> Any:
+    def counting(self: Any, x: Any) -> Any:
+        calls.append(len(x))
+        return method(self, x)
+
+    return counting
 
 
 @pytest.mark.parametrize(
