@@ -11,7 +11,13 @@ import math
 from pathlib import Path
 from typing import Any
 
-from benchmarks import coverage_summary, gap_summary, paper_tables, scaling_summary
+from benchmarks import (
+    coverage_summary,
+    crash_summary,
+    gap_summary,
+    paper_tables,
+    scaling_summary,
+)
 from benchmarks._common import RESULTS, markdown_table
 from benchmarks.physics import GOALS
 from benchmarks.recovery import CASES
@@ -47,6 +53,7 @@ def run(config: Config) -> None:
             _transfer,
             _real,
             _fuzz,
+            crash_summary.crashes,
         ),
         *(gap_summary.generated, gap_summary.real, gap_summary.times, gap_summary.loop),
         paper_tables.sections,

@@ -14,7 +14,7 @@ class Config:
 
     The same functions as train.udr and train.easi, composed into one jit: no transfer
     to the host in between, and nothing to see until it ends. For long runs that show
-    progress and can be resumed, take the two commands.
+    progress and keep what is done on the way, take the two commands.
     """
 
     robot: str = "cartpole"
@@ -63,6 +63,9 @@ class Config:
     """Sensor noise of the demonstrations (positions, then velocities, SI)."""
     eval_episodes: int = 100
     """Episodes of the final evaluation."""
+    resume: bool = False
+    """Go on with the run in the folder: from its start where the program had not ended,
+    since it keeps nothing on its way."""
     overwrite: bool = False
     """Delete the run in the folder first."""
     distributed: bool = False
@@ -89,6 +92,7 @@ def run(config: Config) -> None:
 
     from easi_jax import distributed
     from easi_jax.errors import UserError
+    from easi_jax.io import checkpoints
     from easi_jax.io.runs import RunFolder
     from easi_jax.pipeline import (
         Pipeline,
@@ -133,16 +137,34 @@ def run(config: Config) -> None:
         config.out,
         given.recorded(config),
         command="train.pipeline",
+        resume=config.resume,
         overwrite=config.overwrite,
     ) as folder:
-        say("compiling one program for the whole chain ...")
-        begin = time.monotonic()
-        program = jax.jit(pipe.run).lower(keys, target).compile()
-        compiled = time.monotonic()
-        say(f"compiled in {compiled - begin:.0f} s; running ...")
-        out = jax.block_until_ready(program(keys, target))
-        seconds = time.monotonic() - compiled
-        out = distributed.local(out)
+        place, stamp = folder.checkpoints / "program", folder.config_hash
+        found = None
+        if folder.resumed:
+            shapes = {
+                "out": jax.eval_shape(pipe.run, keys, target),
+                "seconds": jax.ShapeDtypeStruct((2,), jnp.float32),
+            }
+            found = checkpoints.restore(place, shapes, config_hash=stamp)
+            for stage in ("search", "udr", "easi"):
+                folder.rewind(stage, -1)
+        if found is not None:
+            out, (compiling, running) = found.state["out"], found.state["seconds"]
+        else:
+            say("compiling one program for the whole chain ...")
+            begin = time.monotonic()
+            program = jax.jit(pipe.run).lower(keys, target).compile()
+            compiling = time.monotonic() - begin
+            say(f"compiled in {compiling:.0f} s; running ...")
+            begin = time.monotonic()
+            out = jax.block_until_ready(program(keys, target))
+            running = time.monotonic() - begin
+            seconds = jnp.array([compiling, running], jnp.float32)
+            state = {"out": out, "seconds": seconds}
+            checkpoints.save(place, 1, state, config_hash=stamp)
+            out = distributed.local(out)
         info = jax.device_get(out["search"])
         for step, row in search_rows(config.seeds, env.space.names, pipe.space.to_si)(
             0, info
@@ -173,14 +195,13 @@ def run(config: Config) -> None:
             pipe, out["estimate"], theta, out["udr"], evaluate_keys
         )
         folder.write_json(
-            "timing.json", {"compile_s": compiled - begin, "run_s": seconds}
+            "timing.json", {"compile_s": float(compiling), "run_s": float(running)}
         )
         write_pseudo_real(
             folder, pipe, out["estimate"], theta, config.seeds, returns, errors, curves,
             out["motion"][0],
             [
-                f"one program: compiled in {compiled - begin:.0f} s, ran "
-                f"{seconds:.0f} s",
+                f"one program: compiled in {compiling:.0f} s, ran {running:.0f} s",
                 *effect_notes(given),
             ],
             {"option": list(config.option), **given.results()},
@@ -193,7 +214,7 @@ def run(config: Config) -> None:
             for name, r in returns.items()
         ],
     )
-    say(f"compiled in {compiled - begin:.0f} s, ran in {seconds:.0f} s")
+    say(f"compiled in {compiling:.0f} s, ran in {running:.0f} s")
     say(f"report: {config.out / 'report.html'}")
 
 

@@ -179,6 +179,17 @@ def test_pipeline_equals_the_two_commands(chain: Path, tmp_path: Path) -> None:
     other = json.loads((chain / "easi" / "results.json").read_text())["returns"]
     np.testing.assert_allclose(result["UDR"]["0"], other["UDR"]["0"], rtol=0.05)
 
+    # As a kill after the program would have left it, then one before it ended.
+    files = ("results.json", "distribution.json")
+    whole = [(out / name).read_text() for name in files]
+    for lost in ("results.json", "checkpoints/program"):
+        path = out / lost
+        path.unlink() if path.is_file() else shutil.rmtree(path)
+        command(pipeline, "--out", out, *SMALL, *SEARCH, *SETTINGS, *TARGET, "--resume")
+        assert [(out / name).read_text() for name in files] == whole
+    steps = [json.loads(x) for x in (out / "metrics.jsonl").read_text().splitlines()]
+    assert len({(x["stage"], x["step"]) for x in steps}) == len(steps)
+
 
 @pytest.mark.parametrize(
     ("module", "args", "said"),

@@ -1,0 +1,70 @@
+"""The comparison of a command that was killed with one that was left alone."""
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+
+from benchmarks.crash import Cell, Jobs, differences, started
+from benchmarks.crash_summary import crashes
+
+RESULT = {"returns": {"UDR": 1.25}, "seconds": 3.0}
+LINES = [{"step": k, "time": 0.1 * k, "score": 2.0**k} for k in range(3)]
+
+
+def job(folder: Path, result: dict = RESULT, lines: list[dict] = LINES) -> Path:
+    folder.mkdir()
+    (folder / "results.json").write_text(json.dumps(result))
+    text = "".join(json.dumps(x) + "\n" for x in lines)
+    (folder / "metrics.jsonl").write_text(text)
+    (folder / "effects.yaml").write_text("effects: []\n")
+    (folder / "versions.json").write_text(json.dumps({"started": str(folder)}))
+    return folder
+
+
+def test_times_may_differ_and_nothing_else(tmp_path: Path) -> None:
+    one = job(tmp_path / "one")
+    later = [{**x, "time": 9.0} for x in LINES]
+    same = job(tmp_path / "same", {**RESULT, "seconds": 4.0}, later)
+    assert differences(one, same) == []
+    value = job(tmp_path / "value", {**RESULT, "returns": {"UDR": 1.25 + 1e-15}})
+    assert differences(one, value) == ["results.json"]
+    twice = job(tmp_path / "twice", lines=[*LINES, LINES[-1]])
+    assert differences(one, twice) == ["metrics.jsonl"]
+    (same / "effects.yaml").unlink()
+    assert differences(one, same) == ["effects.yaml"]
+
+
+def test_a_process_is_killed_at_its_moment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "sleeper.py").write_text("import time; time.sleep(60)")
+    (tmp_path / "quick.py").write_text("")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    begin = time.monotonic()
+    assert started(["sleeper"], 0.5)
+    assert not started(["quick"], 20.0)
+    assert time.monotonic() - begin < 20
+
+
+def test_what_was_not_run_and_what_went_wrong_is_said(tmp_path: Path) -> None:
+    assert "Not run" in "".join(crashes(tmp_path))
+    row = {"command": "gap", "killed": True, "checkpoints": 2, "different": []}
+    lost = {**row, "key": "gap, kill 1", "different": ["gap.json"]}
+    rows = [{**r, "versions": {"commit": "0123456789"}} for r in (row, lost)]
+    text = "".join(json.dumps(r) + "\n" for r in rows)
+    (tmp_path / "crash.jsonl").write_text(text)
+    page = "\n".join(crashes(tmp_path))
+    assert "| train.gap | 2 | 2 | 1 | gap, kill 1: gap.json |" in page
+    assert "| train.udr | not run |" in page
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("command", ["udr", "easi", "gap"])
+def test_killed_and_gone_on(command: str, tmp_path: Path) -> None:
+    jobs = Jobs(tmp_path, seed=1)
+    for kill in range(2):
+        row = jobs.solve(Cell(command, kill))
+        assert row["different"] == []
