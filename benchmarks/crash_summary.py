@@ -1,5 +1,6 @@
-"""Section of the results page on commands that were killed."""
+"""Sections of the results page on kills and on long use."""
 
+import json
 from pathlib import Path
 
 from benchmarks._cells import read_rows
@@ -35,6 +36,29 @@ def crashes(folder: Path) -> list[str]:
         "`--resume`; every number and policy is compared, to the last bit, with those "
         "of a job that was left alone.",
         markdown_table(head, lines),
+    ]
+
+
+def soak(folder: Path) -> list[str]:
+    """Memory over many searches in one process."""
+    out = ["## Many searches in one process"]
+    path = folder / "soak.json"
+    if not path.exists():
+        return [*out, "Not run: `python -m benchmarks.soak`."]
+    r = json.loads(path.read_text())
+    commit = (r["versions"]["commit"] or "unknown")[:7]
+    counts = [k for k in r["megabytes"] if int(k) % 500 == 0]
+    first = str(r["config"]["warm_up"])
+    shown = {k: r["megabytes"][k] for k in dict.fromkeys((first, *counts))}
+    return [
+        *out,
+        f"`{r['command']}`, commit {commit}: {r['config']['searches']} searches, "
+        f"{r['finite']} with finite results, in {r['seconds']:.0f} s; the process grows "
+        f"by {r['growth_megabytes']:.1f} MB after the first {first}.",
+        markdown_table(
+            ("after searches", *shown),
+            [("memory [MB]", *(f"{x:.1f}" for x in shown.values()))],
+        ),
     ]
 
 

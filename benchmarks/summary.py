@@ -54,6 +54,7 @@ def run(config: Config) -> None:
             _real,
             _fuzz,
             crash_summary.crashes,
+            crash_summary.soak,
         ),
         *(gap_summary.generated, gap_summary.real, gap_summary.times, gap_summary.loop),
         paper_tables.sections,

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import soak
 from benchmarks.crash import Cell, Jobs, differences, started
 from benchmarks.crash_summary import crashes
+from tests.commands import command
 
 RESULT = {"returns": {"UDR": 1.25}, "seconds": 3.0}
 LINES = [{"step": k, "time": 0.1 * k, "score": 2.0**k} for k in range(3)]
@@ -61,10 +63,19 @@ def test_what_was_not_run_and_what_went_wrong_is_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_many_searches_hold_their_memory(tmp_path: Path) -> None:
+    words = ("--searches", 300, "--warm-up", 100, "--folder", tmp_path)
+    command(soak, *words)
+    told = json.loads((tmp_path / "soak.json").read_text())
+    assert told["finite"] == 300
+    assert told["growth_megabytes"] < 10
+
+
+@pytest.mark.slow
 @pytest.mark.timeout(1200)
-@pytest.mark.parametrize("command", ["udr", "easi", "gap"])
-def test_killed_and_gone_on(command: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("which", ["udr", "easi", "gap"])
+def test_killed_and_gone_on(which: str, tmp_path: Path) -> None:
     jobs = Jobs(tmp_path, seed=1)
     for kill in range(2):
-        row = jobs.solve(Cell(command, kill))
+        row = jobs.solve(Cell(which, kill))
         assert row["different"] == []
