@@ -53,8 +53,8 @@ def soak(folder: Path) -> list[str]:
     return [
         *out,
         f"`{r['command']}`, commit {commit}: {r['config']['searches']} searches, "
-        f"{r['finite']} with finite results, in {r['seconds']:.0f} s; the process grows "
-        f"by {r['growth_megabytes']:.1f} MB after the first {first}.",
+        f"{r['finite']} with finite results, in {r['seconds']:.0f} s; the process "
+        f"grows by {r['growth_megabytes']:.1f} MB after the first {first}.",
         markdown_table(
             ("after searches", *shown),
             [("memory [MB]", *(f"{x:.1f}" for x in shown.values()))],
