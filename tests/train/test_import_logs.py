@@ -12,6 +12,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from easi_jax.errors import UserError
+from easi_jax.io.importers.minari import read_minari
+from easi_jax.io.importers.streams import Selection
 from easi_jax.io.logs import read_logs
 from easi_jax.recording import Run
 from tests.commands import command, refused
@@ -634,6 +637,25 @@ def test_wrong_minari_datasets(tmp_path: Path, refuse: Any) -> None:
     file = folder / "data" / "main_data.hdf5"
     file.write_bytes(file.read_bytes()[:1000])
     assert "not an HDF5 file, damaged or cut short" in refuse(*step, mapping=MINARI)
+
+
+def test_damaged_minari_datasets_are_read_or_refused(tmp_path: Path) -> None:
+    """Lists of groups, links and chunks that lead nowhere, in every block of a file."""
+    folder = minari(tmp_path / "cart-v0", episodes=1, rows=4)
+    file = folder / "data" / "main_data.hdf5"
+    whole = file.read_bytes()
+    rng, refused = np.random.default_rng(0), 0
+    for start in range(0, len(whole), 48):
+        raw = bytearray(whole)
+        raw[start : start + 8] = rng.bytes(8)
+        file.write_bytes(raw)
+        try:
+            for _ in read_minari(folder, Selection(step=STEP)):
+                pass
+        except UserError as error:
+            assert str(file) in str(error)
+            refused += 1
+    assert refused > 20
 
 
 def test_earlier_logs_are_kept(tmp_path: Path, call: Any, refuse: Any) -> None:
