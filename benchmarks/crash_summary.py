@@ -18,12 +18,11 @@ def crashes(folder: Path) -> list[str]:
     lines = []
     for command in COMMANDS:
         mine = [r for r in rows if r["command"] == command]
-        alive = [r for r in mine if r["killed"]]
         lines.append(
             (
                 f"train.{command}",
                 len(mine) or "not run",
-                sum(r["checkpoints"] > 0 for r in alive),
+                sum(r["checkpoints"] > 0 for r in mine),
                 sum(not r["different"] for r in mine),
                 "; ".join(f"{r['key']}: {r['different'][0]}" for r in bad(mine)),
             )

@@ -34,6 +34,12 @@ def test_times_may_differ_and_nothing_else(tmp_path: Path) -> None:
     assert differences(one, value) == ["results.json"]
     twice = job(tmp_path / "twice", lines=[*LINES, LINES[-1]])
     assert differences(one, twice) == ["metrics.jsonl"]
+    (same / "metrics.jsonl").write_text("")
+    assert differences(one, same) == ["metrics.jsonl"]
+    for folder in (one, same):
+        (folder / "metrics.jsonl").unlink()
+    (same / "metrics.jsonl").write_text("")
+    assert differences(one, same) == []
     (same / "effects.yaml").unlink()
     assert differences(one, same) == ["effects.yaml"]
 
@@ -52,7 +58,7 @@ def test_a_process_is_killed_at_its_moment(
 
 def test_what_was_not_run_and_what_went_wrong_is_said(tmp_path: Path) -> None:
     assert "Not run" in "".join(crashes(tmp_path))
-    row = {"command": "gap", "killed": True, "checkpoints": 2, "different": []}
+    row = {"command": "gap", "checkpoints": 2, "different": []}
     lost = {**row, "key": "gap, kill 1", "different": ["gap.json"]}
     rows = [{**r, "versions": {"commit": "0123456789"}} for r in (row, lost)]
     text = "".join(json.dumps(r) + "\n" for r in rows)
