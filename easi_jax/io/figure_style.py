@@ -4,9 +4,11 @@ The colors are Okabe and Ito's ("Color Universal Design", 2008), which people wi
 of the common color vision deficiencies can tell apart.
 """
 
+import html
 import io
 import math
 import re
+import urllib.parse
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from typing import Any, ParamSpec
@@ -27,6 +29,7 @@ SERIES = (BLUE, VERMILION, GREEN, PURPLE, SKY, ORANGE)
 _P = ParamSpec("_P")
 ROUND = (1, 2, 5, 10)
 DASHED: Any = {"color": INK, "lw": 1.2, "ls": (0, (4, 2.5))}
+_TOLD = "told-"
 _WIDTH = 9.0  # inches; the report's text column
 _STYLE: Any = {
     "svg.fonttype": "none",
@@ -155,9 +158,26 @@ def with_unit(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
+def tell(axis: Axes, x: Any, y: Any, text: str, color: str = INK) -> None:
+    """Says ``text`` where the pointer is near a curve or, of one number each, a dot.
+
+    What lies there is not seen until then (class ``told``; the page shows it).
+    """
+    one = np.size(x) == 1
+    mark: Any = {"marker": "o", "ms": 11, "mew": 0} if one else {"lw": 9}
+    (line,) = axis.plot(x, y, color=color, alpha=0.0, **mark)
+    line.set_gid(_TOLD + urllib.parse.quote(text, safe=""))
+
+
+def _titled(found: re.Match[str]) -> str:
+    words = html.escape(urllib.parse.unquote(found[1]))
+    return f'<g class="told"><title>{words}</title>'
+
+
 def svg(figure: Figure) -> str:
     """SVG text, the same for the same figure: no date, no random names."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    text = re.sub(rf'<g id="{_TOLD}([^"]*)">', _titled, buffer.getvalue())
     # matplotlib's metadata name addresses on the network.
-    return re.sub(r"\s*<metadata>.*?</metadata>", "", buffer.getvalue(), flags=re.S)
+    return re.sub(r"\s*<metadata>.*?</metadata>", "", text, flags=re.S)

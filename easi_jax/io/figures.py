@@ -25,6 +25,7 @@ from easi_jax.io.figure_style import (
     legend_above,
     styled,
     svg,
+    tell,
     with_unit,
 )
 
@@ -68,6 +69,8 @@ def parameters_by_generation(
         fit(axis, np.concatenate([low, high, starts[i], goals[i : i + 1]]), flags[i])
         axis.fill_between(generations, low, high, color=BLUE, alpha=0.2, lw=0)
         axis.plot(generations, mean[:, i], color=BLUE, lw=1.6)
+        end = with_unit(f"{mean[-1, i]:.4g} ± {std[-1, i]:.2g}", units[i])
+        tell(axis, generations, mean[:, i], f"{names[i]}: {end} at the end", BLUE)
         if np.isfinite(goals[i]):
             axis.axhline(goals[i], **DASHED)
         axis.plot(
@@ -114,6 +117,9 @@ def returns_by_step(
         middle = np.array([_median(row) for row in y])
         axis.plot(x, middle, color=color, lw=2.2, ls=dash(i))
         ends.append((middle[-1], x[-1], name, color))
+        for k, column in enumerate(y.T):
+            tell(axis, x, column, f"{name}, seed {k + 1} of {y.shape[1]}", color)
+        tell(axis, x, middle, f"{name}, median: {middle[-1]:.4g} at the end", color)
     _name_ends(axis, ends)
     axis.set_xlabel("environment steps")
     axis.set_ylabel(ylabel)
@@ -137,11 +143,13 @@ def returns_by_method(
     """
     count = len(returns)
     figure, (axis,) = grid(1, columns=1, height=0.9 + 0.45 * count)
-    for i, (_, values) in enumerate(returns.items()):
+    for i, (name, values) in enumerate(returns.items()):
         row = np.asarray(values, float)
         color = SERIES[i % len(SERIES)]
         spread = 0.18 * np.sin(2.4 * np.arange(row.size))  # seeds side by side
         axis.scatter(row, i + spread, s=26, color=color, alpha=0.75, lw=0)
+        for x, y in zip(row, i + spread, strict=True):
+            tell(axis, [x], [y], f"{name}: {x:.4g}", color)
         middle = _median(row)
         axis.plot([middle] * 2, [i - 0.32, i + 0.32], color=INK, lw=2)
         axis.annotate(

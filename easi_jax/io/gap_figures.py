@@ -1,6 +1,7 @@
 """Figures of the gap workflow: traces before and after, the gap step by step."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -15,8 +16,11 @@ from easi_jax.io.figure_style import (
     legend_above,
     styled,
     svg,
+    tell,
     with_unit,
 )
+
+_DASHES: Any = {"color": VERMILION, "lw": 1.3, "ls": (0, (4, 2))}
 
 
 @styled
@@ -36,24 +40,25 @@ def traces(
     """
     windows, _, count = measured.shape
     figure, axes = grid(count * windows, windows, 1.9)
+    handles = []
     for c in range(count):
         for w in range(windows):
             axis = axes[c * windows + w]
-            axis.plot(time, measured[w, :, c], color=INK, lw=2.2, label="measured")
-            axis.plot(
-                time,
-                before[w, :, c],
-                color=VERMILION,
-                lw=1.3,
-                ls=(0, (4, 2)),
-                label="model as given",
-            )
-            axis.plot(time, after[w, :, c], color=BLUE, lw=1.3, label="repaired")
+            for label, motion, style in (
+                ("measured", measured, {"color": INK, "lw": 2.2}),
+                ("model as given", before, _DASHES),
+                ("repaired", after, {"color": BLUE, "lw": 1.3}),
+            ):
+                y = motion[w, :, c]
+                lines = axis.plot(time, y, label=label, **style)
+                handles += lines if w == c == 0 else []
+                end = with_unit(f"{y[-1]:.4g}", units[c])
+                tell(axis, time, y, f"{names[c]}, {label}: {end} at the end")
             if w == 0:
                 axis.set_ylabel(with_unit(names[c], units[c]))
             if c == count - 1:
                 axis.set_xlabel("time in the window [s]")
-    legend_above(figure, axes[0].get_lines())
+    legend_above(figure, handles)
     return svg(figure)
 
 
