@@ -130,14 +130,20 @@ def loop(folder: Path) -> list[str]:
             r = read_json(path)
             methods = list(r["returns"])
             named = ", ".join(f"{e['effect']}@{e['at']}" for e in r["found"]["effects"])
-            mean = [sum(v.values()) / len(v) for v in r["returns"].values()]
-            seeds = len(next(iter(r["returns"].values())))
-            lines.append((effect, named, seeds, *(f"{x:.1f}" for x in mean)))
+            each = [[*v.values()] for v in r["returns"].values()]
+            lines.append((effect, named, *map(_mean_and_all, each)))
         if lines:
-            head = (f"{robot}, hidden", "named by train.gap", "seeds", *methods)
+            head = (f"{robot}, hidden", "named by train.gap", *methods)
             out.append(markdown_table(head, lines))
-            out.append("`python -m benchmarks.loop`: mean return in the target.")
+            out.append(
+                "`python -m benchmarks.loop`: mean return in the target (every seed)."
+            )
     return out
+
+
+def _mean_and_all(values: list[float]) -> str:
+    each = ", ".join(f"{x:.1f}" for x in values)
+    return f"{sum(values) / len(values):.1f} ({each})"
 
 
 def times(folder: Path) -> list[str]:
