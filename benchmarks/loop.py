@@ -3,7 +3,7 @@
     python -m benchmarks.loop --effect friction
     python -m benchmarks.loop --effect delay
     python -m benchmarks.loop --robot go2 --seeds 0 1 2
-    python -m train.udr --robot go2 --out results/go2_udr
+    python -m train.udr --robot go2 --env-steps 5000000 --out results/go2_udr
     python -m benchmarks.loop --robot go2 --start-from results/go2_udr --seeds 0 1 2
 
 The target has an effect that no training knows of. UDR policies act in it; from their

@@ -165,6 +165,8 @@ def run(config: Config) -> None:
             state = {"out": out, "seconds": seconds}
             checkpoints.save(place, 1, state, config_hash=stamp)
             out = distributed.local(out)
+        # On one device, as what is read back: what follows is the same to the last bit.
+        out = jax.tree.map(jnp.asarray, jax.device_get(out))
         info = jax.device_get(out["search"])
         for step, row in search_rows(config.seeds, env.space.names, pipe.space.to_si)(
             0, info
