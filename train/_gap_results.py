@@ -183,10 +183,12 @@ def retrained_line(retrained: dict[str, Any]) -> str:
     from statistics import median
 
     with_, without = (median(retrained[k].values()) for k in ("with", "without"))
+    count = len(retrained["with"])
+    seeds = f"medians of {count} seeds" if count > 1 else "one seed"
     return (
         f"In the repaired model the policy of {retrained['robot']} that was trained "
         f"with the effects returns {with_:.1f}, the one trained without them "
-        f"{without:.1f} (medians of {len(retrained['with'])} seeds)."
+        f"{without:.1f} ({seeds})."
     )
 
 
