@@ -143,6 +143,7 @@ def run(config: "Config") -> None:
                 lambda s, n: step(s, dist, target, n),
                 training_rows(seeds, pipe.trainer.config.steps_per_iteration),
                 notes,
+                per_step=pipe.trainer.config.steps_per_iteration,
             )
 
         final = train(

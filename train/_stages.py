@@ -25,6 +25,7 @@ def run_stage(
     rows: Callable[[int, Any], Rows],
     notes: list[str] | None = None,
     check: Callable[[int, Any], None] | None = None,
+    per_step: int = 1,
 ) -> Any:
     """Takes ``total`` steps in chunks and returns the last state.
 
@@ -39,6 +40,7 @@ def run_stage(
         notes: where remarks of a resume are added.
         check: ``check(first_step, info)`` raises where going on is useless; called
             before the checkpoint is written.
+        per_step: what the metrics count in one of these steps, such as control steps.
     """
     import jax
 
@@ -59,7 +61,7 @@ def run_stage(
     # Every chunk runs the same compiled program, so a resumed run ends bit-equal.
     state = placed(state)
     if run.resumed:
-        run.rewind(name, done)
+        run.rewind(name, done * per_step)
     with progress(name, total, done) as meter:
         while done < total:
             n = min(chunk, total - done)

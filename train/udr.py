@@ -131,6 +131,7 @@ def run(config: Config) -> None:
             lambda s, n: step(s, wide, target, n),
             training_rows(config.seeds, training.steps_per_iteration),
             notes,
+            per_step=training.steps_per_iteration,
         )
         policies = pipe.policies(states)
         returns, motion = jax.jit(pipe.play)(policies, target, keys["evaluate"])

@@ -1,0 +1,52 @@
+"""A stage that was stopped keeps what it had told, and tells the rest once."""
+
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import pytest
+
+from easi_jax.io.metrics import read_metrics
+from easi_jax.io.runs import RunFolder
+from train._stages import run_stage
+
+
+@pytest.mark.parametrize("per_step", [1, 100])
+@pytest.mark.parametrize("at", ["check", "rows told, no checkpoint"])
+def test_metrics_of_a_stage_that_goes_on(
+    tmp_path: Path, per_step: int, at: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stage(resume: bool, stop: bool) -> None:
+        def check(first: int, _: Any) -> None:
+            if stop and at == "check" and first == 4:
+                raise KeyboardInterrupt
+
+        def advance(x: Any, n: int) -> tuple[Any, Any]:
+            return x + n, x + jnp.arange(1, n + 1)
+
+        def rows(first: int, info: Any) -> Any:
+            return [(int(k) * per_step, {"value": float(k)}) for k in info]
+
+        with RunFolder.open(tmp_path / "run", {}, resume=resume) as run:
+            run_stage(
+                *(run, "train", 6, 2, lambda: jnp.zeros((), int), advance, rows),
+                check=check,
+                per_step=per_step,
+            )
+
+    from easi_jax.io import checkpoints
+
+    save = checkpoints.save
+
+    def lost(folder: Path, step: int, *more: Any, **named: Any) -> Any:
+        if step == 6 and at != "check":
+            raise KeyboardInterrupt
+        return save(folder, step, *more, **named)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoints, "save", lost)
+        with pytest.raises(KeyboardInterrupt):
+            stage(resume=False, stop=True)
+    stage(resume=True, stop=False)
+    told = read_metrics(tmp_path / "run" / "metrics.jsonl", "train")
+    assert [row["step"] for row in told] == [k * per_step for k in range(1, 7)]
