@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,11 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str
         for row in rows
     ]
     return "\n".join(lines)
+
+
+def commits_of(rows: Iterable[Mapping[str, Any]]) -> str:
+    """Commits that lines or results were made with, short."""
+    return ", ".join(sorted({(r["versions"]["commit"] or "unknown")[:7] for r in rows}))
 
 
 def command_of(module: str, config: Any) -> str:

@@ -18,12 +18,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from benchmarks._cells import Share, run_cells
+from benchmarks._cells import Share, read_rows, run_cells
 from benchmarks._common import RESULTS
 from train._command import main
 
@@ -195,15 +195,15 @@ def differences(one: Path, other: Path) -> list[str]:
     import jax
     import numpy as np
 
+    from easi_jax.io.files import read_json
     from train._robots import load_policies
 
-    names = {
-        *(p.name for folder in (one, other) for p in folder.glob("*.json*")),
-        *(p.name for folder in (one, other) for p in folder.glob("*.yaml")),
-        *(p.name for folder in (one, other) for p in folder.glob("*.xml")),
-    } - {"versions.json"}
+    kinds = {".json", ".jsonl", ".yaml", ".xml"}
+    files = (p for folder in (one, other) for p in folder.iterdir())
+    names = {p.name for p in files if p.suffix in kinds} - {"versions.json"}
     out = [n for n in sorted(names) if not _equal(one / n, other / n)]
-    if "methods" in _json(one / "results.json"):
+    results = one / "results.json"
+    if results.exists() and "methods" in read_json(results):
         policies = (load_policies(f, None, None)["policies"] for f in (one, other))
         a, b = (jax.tree.leaves(p) for p in policies)
         same = [np.array_equal(x, y) for x, y in zip(a, b, strict=True)]
@@ -213,23 +213,13 @@ def differences(one: Path, other: Path) -> list[str]:
 
 def _equal(one: Path, other: Path) -> bool:
     if one.suffix == ".jsonl":  # may not be there where nothing was told
-        rows = ([*map(_timeless, _rows(p))] for p in (one, other))
-        return next(rows) == next(rows)
+        return _timeless(read_rows(one)) == _timeless(read_rows(other))
     if not (one.exists() and other.exists()):
         return False
     a, b = one.read_text(), other.read_text()
     if one.suffix == ".json":
         return _timeless(json.loads(a)) == _timeless(json.loads(b))
     return a == b
-
-
-def _rows(path: Path) -> Iterator[Any]:
-    text = path.read_text() if path.exists() else ""
-    return (json.loads(line) for line in text.splitlines())
-
-
-def _json(path: Path) -> Any:
-    return json.loads(path.read_text()) if path.exists() else {}
 
 
 def _timeless(x: Any) -> Any:

@@ -1,10 +1,9 @@
 """Sections of the results page on kills and on long use."""
 
-import json
 from pathlib import Path
 
 from benchmarks._cells import read_rows
-from benchmarks._common import markdown_table
+from benchmarks._common import commits_of, markdown_table
 from benchmarks.crash import COMMANDS
 
 
@@ -14,7 +13,6 @@ def crashes(folder: Path) -> list[str]:
     rows = read_rows(folder / "crash.jsonl")
     if not rows:
         return [*out, "Not run: `python -m benchmarks.crash`."]
-    commits = sorted({(r["versions"]["commit"] or "unknown")[:7] for r in rows})
     lines = []
     for command in COMMANDS:
         mine = [r for r in rows if r["command"] == command]
@@ -24,13 +22,15 @@ def crashes(folder: Path) -> list[str]:
                 len(mine) or "not run",
                 sum(r["checkpoints"] > 0 for r in mine),
                 sum(not r["different"] for r in mine),
-                "; ".join(f"{r['key']}: {r['different'][0]}" for r in bad(mine)),
+                "; ".join(
+                    f"{r['key']}: {r['different'][0]}" for r in mine if r["different"]
+                ),
             )
         )
     head = ("command", "kills", "with a checkpoint", "to the same end", "others")
     return [
         *out,
-        f"`python -m benchmarks.crash`, commits {', '.join(commits)}: killed by signal "
+        f"`python -m benchmarks.crash`, commits {commits_of(rows)}: killed by signal "
         "9 at moments drawn from the time that the command takes, then gone on with "
         "`--resume`; every number and policy is compared, to the last bit, with those "
         "of a job that was left alone.",
@@ -40,27 +40,23 @@ def crashes(folder: Path) -> list[str]:
 
 def soak(folder: Path) -> list[str]:
     """Memory over many searches in one process."""
+    from easi_jax.io.files import read_json
+
     out = ["## Many searches in one process"]
     path = folder / "soak.json"
     if not path.exists():
         return [*out, "Not run: `python -m benchmarks.soak`."]
-    r = json.loads(path.read_text())
-    commit = (r["versions"]["commit"] or "unknown")[:7]
+    r = read_json(path)
     counts = [k for k in r["megabytes"] if int(k) % 500 == 0]
     first = str(r["config"]["warm_up"])
     shown = {k: r["megabytes"][k] for k in dict.fromkeys((first, *counts))}
     return [
         *out,
-        f"`{r['command']}`, commit {commit}: {r['config']['searches']} searches, "
-        f"{r['finite']} with finite results, in {r['seconds']:.0f} s; the process "
+        f"`{r['command']}`, commit {commits_of([r])}: {r['config']['searches']} "
+        f"searches, {r['finite']} with finite results, in {r['seconds']:.0f} s; the process "
         f"grows by {r['growth_megabytes']:.1f} MB after the first {first}.",
         markdown_table(
             ("after searches", *shown),
             [("memory [MB]", *(f"{x:.1f}" for x in shown.values()))],
         ),
     ]
-
-
-def bad(rows: list[dict]) -> list[dict]:
-    """Those that ended otherwise."""
-    return [r for r in rows if r["different"]]

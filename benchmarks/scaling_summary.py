@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks._cells import read_rows
-from benchmarks._common import markdown_table
+from benchmarks._common import commits_of, markdown_table
 
 OF = {
     "parameters": "generation by parameters searched",
@@ -21,9 +21,8 @@ def growth(folder: Path) -> list[str]:
     rows = read_rows(folder / "scaling.jsonl")
     if not rows:
         return [*out, "Not run: `python -m benchmarks.scaling`."]
-    commits = sorted({(r["versions"]["commit"] or "unknown")[:7] for r in rows})
     out.append(
-        f"`python -m benchmarks.scaling`, commits {', '.join(commits)}: seconds once "
+        f"`python -m benchmarks.scaling`, commits {commits_of(rows)}: seconds once "
         "compiled, the least of three; control steps simulated a second in brackets."
     )
     for what, title in OF.items():

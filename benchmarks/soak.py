@@ -4,7 +4,7 @@
 
 Many small searches on Cartpole in one process, each with demonstrations and a key of
 its own, from data to the estimate on the host, by programs that are compiled once.
-About ten minutes on two cores; written to ``benchmarks/results/soak.json``.
+About two minutes on two cores; written to ``benchmarks/results/soak.json``.
 """
 
 import dataclasses

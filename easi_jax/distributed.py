@@ -10,6 +10,7 @@ import os
 import pickle
 import re
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, TypeVar
 
 from easi_jax.errors import UserError
@@ -190,6 +191,22 @@ def _broadcast(value: Any) -> Any:
     size = int(broadcast_one_to_all(np.int32(0 if raw is None else len(raw))))
     data = np.zeros(size, np.uint8) if raw is None else raw
     return pickle.loads(np.asarray(broadcast_one_to_all(data)).tobytes())
+
+
+def started(work: Callable[[], T]) -> Callable[[], T]:
+    """Begins ``work`` beside what follows; the function waits for its result.
+
+    For compiling, which leaves other cores and the interpreter mostly free. Several
+    processes of one run must begin their programs in one order, so there it is done
+    at once.
+    """
+    if count() > 1:
+        done = work()
+        return lambda: done
+    pool = ThreadPoolExecutor(1)
+    result = pool.submit(work).result
+    pool.shutdown(wait=False)
+    return result
 
 
 def local(tree: T) -> T:

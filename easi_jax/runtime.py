@@ -118,9 +118,9 @@ def larger_loops() -> None:
     """Loops that touch up to 8 MB become one function as well.
 
     For a process that simulates one machine for minutes: an arm of six joints is then
-    predicted three times as fast, which takes a minute more to compile (jaxlib 0.10.2,
-    benchmarks/gap_times.py). Nothing changes where a backend has started, or where the
-    environment says otherwise.
+    predicted about three times as fast, which takes a minute more to compile (jaxlib
+    0.10.2, tried by hand; the whole: benchmarks/gap_times.py). Nothing changes where a
+    backend has started, or where the environment says otherwise.
     """
     prepare()
     if not backend_started():

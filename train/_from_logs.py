@@ -30,8 +30,8 @@ def run(config: Any) -> None:
         resume=config.resume,
         overwrite=config.overwrite,
     ) as folder:
+        from easi_jax.distributed import started
         from train._log_results import ready_errors, write
-        from train._stages import started
 
         finish = started(lambda: _ready_finish(problem, search, config.refine))
         states = _search(folder, config, search, problem, seeds)

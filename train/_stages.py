@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -103,24 +102,6 @@ def placed(tree: Any) -> Any:
     if distributed.count() > 1:
         return distributed.everywhere(tree, everywhere)
     return jax.device_put(tree, everywhere)
-
-
-def started(work: Callable[[], T]) -> Callable[[], T]:
-    """Begins ``work`` beside what follows; the function waits for its result.
-
-    For compiling, which leaves other cores and the interpreter mostly free. Several
-    processes of one run must begin their programs in one order, so there it is done
-    at once.
-    """
-    from easi_jax import distributed
-
-    if distributed.count() > 1:
-        done = work()
-        return lambda: done
-    pool = ThreadPoolExecutor(1)
-    result = pool.submit(work).result
-    pool.shutdown(wait=False)
-    return result
 
 
 def training_rows(seeds: Sequence[int], per_step: int) -> Callable[[int, Any], Rows]:

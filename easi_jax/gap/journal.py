@@ -88,13 +88,11 @@ class Journal:
 
 
 def key_of(*parts: object) -> str:
-    """A digest of arrays, bytes and what prints as text."""
+    """A digest of arrays, and of what prints as text."""
     digest = hashlib.sha256()
     for part in parts:
         if isinstance(part, np.ndarray):
             head, raw = f"{part.dtype}{part.shape}", part.tobytes()
-        elif isinstance(part, bytes):
-            head, raw = "bytes", part
         else:
             head, raw = "text", repr(part).encode()
         digest.update(f"{head} {len(raw)} ".encode() + raw)

@@ -9,8 +9,7 @@ one size.
 
 import copy
 import math
-from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -22,6 +21,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from easi_jax import backlash, effects
 from easi_jax.backlash import Rotor
+from easi_jax.distributed import started
 from easi_jax.effect_quantities import EFFECT_TABLE
 from easi_jax.effects import Effects
 from easi_jax.gap.layout import Layout
@@ -112,7 +112,7 @@ class Predictor:
                 (True, quick_compile()),
             )
         )
-        self._compiled: list[Future[Any]] = []
+        self._compiled: list[Callable[[], Any]] = []
         width = [i for i, c in enumerate(layout.columns) if c.field == "width"]
         self._width = self.own + np.array(width, int)
 
@@ -208,11 +208,9 @@ class Predictor:
                 np.zeros(batch, np.int32),
                 np.zeros((batch, BLOCK, 2 * self.nv), np.float32),
             )
-            with_data = [p.lower(*like, *self._data) for p in self._programs]
-            threads = ThreadPoolExecutor(len(with_data), "compile")
-            self._compiled = [threads.submit(p.compile) for p in with_data]
-            threads.shutdown(wait=False)
-        return self._compiled[play].result()
+            lowered = [p.lower(*like, *self._data) for p in self._programs]
+            self._compiled = [started(p.compile) for p in lowered]
+        return self._compiled[play]()
 
     def _sharded(
         self,

@@ -38,9 +38,10 @@ def run(config: Config) -> None:
     import jax.numpy as jnp
     import numpy as np
 
+    from easi_jax.distributed import started
     from easi_jax.io.runs import RunFolder
     from easi_jax.mesh import make_mesh, sharded_map
-    from train._stages import jit_chunks, run_stage, started
+    from train._stages import jit_chunks, run_stage
 
     mesh = make_mesh()
     keys = jax.vmap(jax.random.key)(jnp.arange(5, dtype=jnp.uint32))
