@@ -52,8 +52,9 @@ def soak(folder: Path) -> list[str]:
     shown = {k: r["megabytes"][k] for k in dict.fromkeys((first, *counts))}
     return [
         *out,
-        f"`{r['command']}`, commit {commits_of([r])}: {r['config']['searches']} "
-        f"searches, {r['finite']} with finite results, in {r['seconds']:.0f} s; the process "
+        f"`{r['command']}`, commit {commits_of([r])}: "
+        f"{r['config']['searches']} searches, {r['finite']} with finite results, in "
+        f"{r['seconds']:.0f} s; the process "
         f"grows by {r['growth_megabytes']:.1f} MB after the first {first}.",
         markdown_table(
             ("after searches", *shown),
