@@ -85,19 +85,22 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return walked(tmp_path_factory.mktemp("alone") / "run", 1, devices=2)[0]
 
 
-def test_two_processes_give_what_one_gives(tmp_path: Path, alone: Any) -> None:
+@pytest.mark.parametrize("count", [2, 4])
+def test_several_processes_give_what_one_gives(
+    tmp_path: Path, alone: Any, count: int
+) -> None:
     folder = tmp_path / "run"
-    result, (first, second) = walked(folder, 2)
+    result, (first, *others) = walked(folder, count)
     np.testing.assert_allclose(result["points"], alone["points"], rtol=SAME)
     assert result["mean"] == pytest.approx(alone["mean"], rel=SAME)
-    assert first[0].startswith("devices: 2") and "walk  6/6" in first[1]
-    assert second[0] == "" and "walk" not in second[1]
+    assert first[0].startswith(f"devices: {count}") and "walk  6/6" in first[1]
+    assert all(out == "" and "walk" not in error for out, error in others)
     lines = (folder / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(x)["step"] for x in lines] == [2, 4, 6]
-    again = Processes(2, WALK, "--out", folder).ended()
-    assert [status for status, *_ in again] == [2, 2]
+    again = Processes(count, WALK, "--out", folder).ended()
+    assert [status for status, *_ in again] == [2] * count
     assert "already holds a run" in again[0][2]
-    assert "error" not in again[1][2]
+    assert all("error" not in error for _, _, error in again[1:])
 
 
 @pytest.mark.parametrize("victim", [0, 1])
