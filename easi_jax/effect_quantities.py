@@ -165,7 +165,12 @@ EFFECT_TABLE: dict[str, EffectQuantity] = {
     "ripple": _joint("ripple", "amplitude", _TORQUE),
     "cycles": _joint("cycles", "cycles_per_rev", ("1", "1"), 1e-6, 1.0),
     "phase": _joint("phase", "phase", ("rad", "rad"), -_INF),
-    "armature": _joint("armature", "armature", ("kg", "kg m2")),
+    "armature": _joint(
+        "armature",
+        "armature",
+        ("kg", "kg m2"),
+        lambda m, j: -float(m.dof_armature[m.jnt_dofadr[j]]),
+    ),
     "width": _joint("width", "width", ("m", "rad"), refuse=_geared),
     "rotor": _joint("rotor", "rotor_inertia", ("kg", "kg m2"), 1e-9, refuse=_geared),
     "gain": _actuator("gain", "gain", _unit("1"), 1e-3, neutral=1.0),

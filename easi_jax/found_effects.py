@@ -46,6 +46,11 @@ class EffectEntry:
     columns: Mapping[str, float]
     std: Mapping[str, float]
 
+    @property
+    def of_readings(self) -> bool:
+        """Whether it is in the readings of a sensor, not in the physics."""
+        return all(column.split(".")[0] in READINGS for column in self.columns)
+
     def address(self, column: str) -> str:
         """The address of one of its numbers."""
         field, *part = column.split(".")
@@ -64,6 +69,11 @@ class FoundEffects:
     entries: tuple[EffectEntry, ...] = ()
     own: Mapping[str, float] | None = None
 
+    @property
+    def physical(self) -> tuple[EffectEntry, ...]:
+        """Those of the physics; the others are in the readings of sensors."""
+        return tuple(e for e in self.entries if not e.of_readings)
+
     def __bool__(self) -> bool:
         return bool(self.entries or self.own)
 
@@ -78,15 +88,18 @@ def joined(
     least; its bounds are those of physics. Parameters of ``space`` whose own values
     were refitted start about the new ones.
 
+    Effects in the readings change no motion: they are left out here, and measured logs
+    are mended by `easi_jax.log_data.true_readings`.
+
     Raises:
-        UserError: a joint, actuator or body that the model lacks, an effect that is in
-            the readings, a value outside what physics allows.
+        UserError: a joint, actuator or body that the model lacks, a value outside what
+            physics allows.
     """
     own = dict(found.own or {})
     space, rest = _renewed(m, space, own)
     new: list[Parameter] = []
     stay = dict(rest)
-    for entry in found.entries:
+    for entry in found.physical:
         _check(m, entry)
         for column, value in entry.columns.items():
             p = _parameter(m, entry, column, value)
@@ -100,12 +113,6 @@ def joined(
 def _check(m: mujoco.MjModel, entry: EffectEntry) -> None:
     where = f'effect {entry.effect} at "{entry.at}"' if entry.at else entry.effect
     for column in entry.columns:
-        if column.split(".")[0] in READINGS:
-            raise UserError(
-                f"{where}: it is in the readings, not in the physics, and cannot be "
-                "simulated; take it out of the effects file (a delay of all readings "
-                "acts as one of all commands: actuator_delay)"
-            )
         if column not in EFFECT_TABLE:
             raise UserError(f'{where}: no column "{column}"')
         row = EFFECT_TABLE[column]
@@ -190,7 +197,7 @@ def env_with(env: Any, found: FoundEffects) -> Any:
         UserError: as `joined`; or the environment simulates with something else than
             its ``machine``.
     """
-    if not found:
+    if not (found.physical or found.own):
         return env
     if not isinstance(getattr(env, "machine", None), Machine):
         raise UserError(

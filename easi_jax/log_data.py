@@ -7,24 +7,28 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
-from easi_jax import replay
+from easi_jax import addresses, replay
 from easi_jax.configuration import Configuration
 from easi_jax.errors import UserError
-from easi_jax.io.log_rows import Rows, resampled
+from easi_jax.found_effects import EffectEntry
+from easi_jax.io.log_rows import Rows, mean_held, resampled
 from easi_jax.machine import Machine
 from easi_jax.recording import Run
 from easi_jax.segments import Segments, cut, join
 from easi_jax.windows import fitted_velocity
 
 _ORDERS = range(2, 7)
+_COPIES = 16  # of white noise, interpolated as a run was
 _MAD = 1.4826  # median absolute deviation -> standard deviation, Gaussian
 _JITTER = 1e-6  # rounding of a written number, as a share of the largest
 _STEPS_AGREE = 1e-3
 _AGREES = 0.1
 _ODD = 20.0  # times the noise
 _ODD_ALONE = 3.0  # times the largest of the others
+_USUAL = 98.0  # percentile of steps that is no leap
 _ODD_ROWS = 3  # left out at either end, at most
 _ODD_MINIMUM = 30  # rows of a run that can tell
 _SCALAR = Configuration(1, 1, (0,), (0,), ())
@@ -39,6 +43,7 @@ def estimate_noise(run: Run) -> np.ndarray:
     coarser than that, their few levels make a median jump, and the mean absolute value
     counts. Never below what the resolution makes, ``step / sqrt(12)``. Velocities: the
     same where they were measured, else the positions' noise through the quadratic fit.
+    Where rows were interpolated, what that has smoothed is made up for.
     """
     steps = run.configuration.difference(run.qpos[:-1], run.qpos[1:])
     sigma = _difference_noise(steps, 1, np.median, _MAD)
@@ -49,9 +54,11 @@ def estimate_noise(run: Run) -> np.ndarray:
     coarse = resolution > sigma[scalar]
     sigma[scalar] = np.where(coarse, mean[scalar], sigma[scalar])
     sigma[scalar] = np.maximum(sigma[scalar], resolution / math.sqrt(12.0))
+    kept = _kept_noise(run)
+    sigma = sigma / kept
     if run.qvel_measured:
         speed = np.maximum(
-            _difference_noise(run.qvel, 0, np.median, _MAD),
+            _difference_noise(run.qvel, 0, np.median, _MAD) / kept,
             _resolution(run.qvel) / math.sqrt(12.0),
         )
     else:
@@ -73,6 +80,15 @@ def _difference_noise(
             factor * middle(np.abs(d), 0) / math.sqrt(math.comb(2 * order, order))
         )
     return np.min(found, axis=0) if found else np.zeros(x.shape[1])
+
+
+def _kept_noise(run: Run) -> float:
+    """Share of white noise that is found after the rows' interpolation in time."""
+    if run.stamps is None:
+        return 1.0
+    noise = np.random.default_rng(0).normal(size=(_COPIES, len(run.stamps)))
+    rows = np.stack([np.interp(run.time, run.stamps, x) for x in noise], 1)
+    return float(np.median(_difference_noise(rows, 0, np.median, _MAD)))
 
 
 def _resolution(x: np.ndarray) -> np.ndarray:
@@ -140,16 +156,68 @@ def _odd_start(qpos: np.ndarray, run: Run, noise: np.ndarray) -> bool:
     return bool(np.any(jerk[0] > limit))
 
 
+def split_at_resets(
+    runs: Sequence[Run], noise: np.ndarray
+) -> tuple[list[Run], list[str]]:
+    """Runs cut where a position leaps from one row to the next, as in a reset.
+
+    A leap lies far outside of the steps before and after it, which neither motion nor
+    an impact does: the positions of an impact still follow from each other.
+
+    Args:
+        noise: of positions and velocities, ``(2 nv,)``.
+
+    Returns:
+        The runs, and a note where there are more than before.
+    """
+    out, cut = [], []
+    for run in runs:
+        at = _leaps(run, noise)
+        pieces = np.split(np.arange(len(run)), at + 1)
+        whole = [p for p in pieces if len(p) >= 2]
+        if not len(at) or not whole:
+            out.append(run)
+            continue
+        cut.append(f"{run.name} at {', '.join(f'{t:.6g} s' for t in run.time[at[:3]])}")
+        cut[-1] += ", ..." if len(at) > 3 else ""
+        for k, p in enumerate(whole, 1):
+            part = rows_of(run, int(p[0]), int(p[-1]) + 1)
+            name = f"{run.name}/{k}" if len(whole) > 1 else run.name
+            out.append(replace(part, name=name))
+    if not cut:
+        return out, []
+    return out, [
+        "positions leap from one row to the next (a reset, or a bad reading), so runs "
+        f"were cut there: {'; '.join(cut)}"
+    ]
+
+
+def _leaps(run: Run, noise: np.ndarray) -> np.ndarray:
+    """Rows after which a position leaps."""
+    if len(run) < _ODD_MINIMUM:
+        return np.zeros(0, int)
+    scalar = list(run.configuration.scalar_qvel)
+    step = run.configuration.difference(run.qpos[:-1], run.qpos[1:])[:, scalar]
+    before, after = step[:-2], step[2:]
+    high, low = np.maximum(before, after), np.minimum(before, after)
+    beyond = np.maximum(step[1:-1] - high, low - step[1:-1])
+    usual = np.percentile(np.abs(step), _USUAL, axis=0)
+    limit = np.maximum(_ODD * math.sqrt(6.0) * noise[scalar], _ODD_ALONE * usual)
+    return np.flatnonzero((beyond > limit).any(1)) + 1
+
+
 def to_common_step(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
     """Runs at the smallest of their control steps, and notes of what was changed.
 
-    Commands are held, positions and velocities interpolated linearly.
+    Commands are held, and a step gets the mean of what was held in it; positions and
+    velocities are interpolated linearly.
     """
     dt = min(run.dt for run in runs)
     out, notes = [], []
     for run in runs:
+        sent = run.ctrl if run.sent is None else run.sent
         if abs(run.dt / dt - 1) <= _STEPS_AGREE:
-            out.append(replace(run, dt=dt))
+            out.append(replace(run, dt=dt, ctrl=sent, sent=None))
             continue
         rows = Rows(
             run.time, np.full(len(run), ""), run.qpos, run.qvel, run.ctrl, run.sensors
@@ -165,7 +233,8 @@ def to_common_step(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
                 time=even.time,
                 qpos=even.qpos,
                 qvel=qvel,
-                ctrl=even.ctrl,
+                ctrl=mean_held(run.time, sent, even.time, dt),
+                sent=None,
                 sensors=even.sensors,
             )
         )
@@ -184,8 +253,45 @@ def rows_of(run: Run, first: int, last: int) -> Run:
         qpos=run.qpos[part],
         qvel=run.qvel[part],
         ctrl=run.ctrl[part],
+        sent=None if run.sent is None else run.sent[part],
         sensors={k: v[part] for k, v in run.sensors.items()},
     )
+
+
+def true_readings(
+    m: mujoco.MjModel, runs: Sequence[Run], entries: Sequence[EffectEntry]
+) -> list[Run]:
+    """Runs rid of what ``entries`` say of the readings: offsets and delays of joints.
+
+    A late reading is that of some time ago, so rows are read as much later, by linear
+    interpolation; the last rows, which nothing follows, are left out.
+
+    Raises:
+        UserError: a joint that the model lacks, or that is no hinge or slide.
+    """
+    bias, late = np.zeros(m.nv), np.zeros(m.nv)
+    for e in entries:
+        if not e.of_readings or e.at.startswith("qvel."):  # such are not used
+            continue
+        (place,) = addresses.places(m, f"joint.{e.at}.damping")
+        dof = int(m.jnt_dofadr[place[2]])
+        bias[dof] += e.columns.get("bias", 0.0)
+        late[dof] += e.columns.get("late", 0.0)
+    if not bias.any() and not late.any():
+        return list(runs)
+    out = []
+    for run in runs:
+        count = len(run) - math.ceil(late.max() / run.dt - _JITTER)
+        qpos, qvel = run.qpos.copy(), run.qvel.copy()
+        for q, d in zip(
+            run.configuration.scalar_qpos, run.configuration.scalar_qvel, strict=True
+        ):
+            row = np.arange(len(run))
+            at = row + late[d] / run.dt
+            qpos[:, q] = np.interp(at, row, run.qpos[:, q]) - bias[d]
+            qvel[:, d] = np.interp(at, row, run.qvel[:, d])
+        out.append(rows_of(replace(run, qpos=qpos, qvel=qvel), 0, max(count, 2)))
+    return out
 
 
 def trusted_velocity(run: Run) -> np.ndarray:

@@ -29,6 +29,10 @@ class Run:
         ctrl: command sent from this row to the next, ``(T, nu)``.
         sensors: readings by sensor name, ``(T, dim)``; NaN where there was none.
         configuration: where quaternions lie in ``qpos``.
+        stamps: times of the rows as they were recorded [s]; None where they were even,
+            and nothing was interpolated.
+        sent: mean over each step of the commands held in it, ``(T, nu)``; None where
+            it is ``ctrl``.
     """
 
     name: str
@@ -41,6 +45,8 @@ class Run:
     ctrl: np.ndarray
     configuration: Configuration
     sensors: Mapping[str, np.ndarray] = field(default_factory=dict)
+    stamps: np.ndarray | None = None
+    sent: np.ndarray | None = None
 
     def __len__(self) -> int:
         """Number of rows, T."""

@@ -44,15 +44,13 @@ def read_given(config: Any) -> Given:
 
 
 def _content(path: Path | None) -> dict[str, Any] | None:
-    from easi_jax.errors import UserError
     from easi_jax.io.effects_file import parsed_effects
     from easi_jax.io.strict_yaml import read_yaml
 
     if path is None:
         return None
     content = read_yaml(path)
-    if not parsed_effects(content, str(path)):
-        raise UserError(f"{path}: holds no effects and no refitted values")
+    parsed_effects(content, str(path))
     return content
 
 
@@ -85,7 +83,7 @@ def target_name(changes: Sequence[str], given: Given) -> str:
     """The target in a line: what differs from the nominal robot."""
     from easi_jax.found_effects import named
 
-    hidden = named(found_in(given.target_effects).entries)
+    hidden = named(found_in(given.target_effects).physical)
     return ", ".join([*changes, *([hidden] if hidden else [])]) or "nominal"
 
 
@@ -96,10 +94,24 @@ def effect_notes(given: Given) -> list[str]:
     notes = []
     if given.effects is not None:
         found = found_in(given.effects)
-        text = named(found.entries) or "none"
+        text = named(found.physical) or "none"
         own = f"; refitted: {', '.join(found.own)}" if found.own else ""
         notes.append(f"effects in the model: {text}{own}")
+        notes += _read_only(found)
     if given.target_effects is not None:
         found = found_in(given.target_effects)
-        notes.append(f"effects of the target: {named(found.entries) or 'none'}")
+        notes.append(f"effects of the target: {named(found.physical) or 'none'}")
+        notes += _read_only(found)
     return notes
+
+
+def _read_only(found: Any) -> list[str]:
+    from easi_jax.found_effects import named
+
+    left = [e for e in found.entries if e.of_readings]
+    if not left:
+        return []
+    return [
+        f"{named(left)}: in the readings of a sensor, not in the physics, so "
+        "simulations are without it; mend the sensor, or the program that reads it"
+    ]

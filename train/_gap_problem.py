@@ -23,6 +23,15 @@ class GivenModel:
     env: Any
 
     @property
+    def source(self) -> Path:
+        """The file that the model is from."""
+        if self.path is not None:
+            return self.path
+        from importlib import resources
+
+        return Path(str(resources.files("envs") / "assets" / f"{self.name}.xml"))
+
+    @property
     def fixed(self) -> dict[str, float]:
         """What a built-in robot has and MJCF cannot say, by address."""
         return {} if self.env is None else beyond_mjcf(self.env.space)

@@ -45,6 +45,27 @@ def parameters_text(found: Any, between: str) -> str:
     )
 
 
+def effect_rows(
+    problem: Any, o: Any, between: str, none: str
+) -> list[tuple[str, str, str, str, str]]:
+    """Rows of a table of effects: name, place, parameters, confidence, rivals."""
+    rows = [
+        (
+            f.place.effect,
+            f.place.at or "whole model",
+            parameters_text(f, between),
+            f"{f.confidence:.2f}",
+            ", ".join(f.indistinguishable) or none,
+        )
+        for f in o.found
+    ]
+    for joint, lag in problem.late.items():
+        delay = f"delay {lag.seconds:.4g} ± {lag.std:.2g} s"
+        sure = f"{lag.confidence:.2f}"
+        rows.append(("sensor_delay", f"qvel.{joint}", delay, sure, none))
+    return rows
+
+
 def disagreement(run: str, times: float) -> str:
     """What to say of a run that the others contradict."""
     return (
@@ -137,7 +158,6 @@ def write_results(
     """Writes all files; returns the report's path. ``retrained``: see `_retrain`."""
     from easi_jax.found_effects import EffectEntry
     from easi_jax.io.effects_file import write_effects
-    from easi_jax.io.repaired_model import repaired_model
 
     entries = []
     for f in outcome.found:
@@ -155,6 +175,12 @@ def write_results(
             )
         )
     shown = [{k: v for k, (v, _, _) in f.values.items()} for f in outcome.found]
+    for joint, lag in problem.late.items():
+        at = f"qvel.{joint}"
+        seconds, std = float(lag.seconds), {"late": float(lag.std)}
+        late = EffectEntry("sensor_delay", at, "sensor", {"late": seconds}, std)
+        entries.append(late)
+        shown.append({"delay": seconds})
     write_effects(
         folder.path / "effects.yaml",
         str(problem.model.path or problem.model.name),
@@ -162,20 +188,37 @@ def write_results(
         shown,
         outcome.refitted,
     )
-    own = {r["address"]: r["to"] for r in outcome.refitted}
-    left: list[str] = []
-    if problem.model.path is not None:
-        model = repaired_model(problem.model.path, entries, own)
-        for name, place in model.assets.items():
-            folder.write(name, place.read_bytes())
-        folder.write("model.xml", model.xml)
-        left = model.left
+    model = _with_found(problem, outcome, entries)
+    for name, place in model.assets.items():
+        folder.write(name, place.read_bytes())
+    folder.write("model.xml", model.xml)
     content = gap_json(problem, outcome)
-    content["not_in_model_xml"] = left
+    content["not_in_model_xml"] = model.left
     if retrained is not None:
         content["retrained"] = retrained
     folder.write_json("gap.json", content)
     return _report(folder, config, problem, outcome, content)
+
+
+def _with_found(problem: Any, outcome: Any, entries: Any) -> Any:
+    """The model with refitted values and effects, as MJCF."""
+    import numpy as np
+
+    from easi_jax.export.mjcf import identified_model
+    from easi_jax.io.repaired_model import repaired_model
+    from easi_jax.machine import Machine
+    from easi_jax.parameters import ParameterSpace
+
+    source = problem.model.source
+    values = {r["address"]: r["to"] for r in outcome.refitted}
+    moved = [p for p in problem.space.parameters if p.addresses[0] in values]
+    if not moved and problem.model.path is not None:
+        return repaired_model(source, entries)
+    machine = Machine(
+        problem.model.mj_model, ParameterSpace(tuple(moved)), problem.fit[0].dt
+    )
+    theta = np.array([values[p.addresses[0]] for p in moved], float)
+    return identified_model(source, machine, theta, entries)
 
 
 def retrained_line(retrained: dict[str, Any]) -> str:
@@ -222,7 +265,7 @@ def _report(folder: Any, config: Any, problem: Any, o: Any, content: Any) -> Pat
         said = sentence(f)
         lines.append(
             f"{said[0].upper()}{said[1:]}, which the model lacks (confidence "
-            f"{f.confidence:.2f}). With it the {config.horizon:g} s prediction error "
+            f"{f.confidence:.2f}). With it the {o.horizon:g} s prediction error "
             f"falls from {gap / o.floor:.3g} to {f.gap_after / o.floor:.3g} times the "
             "sensor noise."
         )
@@ -289,16 +332,7 @@ def _report(folder: Any, config: Any, problem: Any, o: Any, content: Any) -> Pat
         Table(
             "Effects",
             ["effect", "at", "parameters", "confidence", "as good on these data"],
-            [
-                (
-                    f.place.effect,
-                    f.place.at or "whole model",
-                    parameters_text(f, "; "),
-                    f"{f.confidence:.2f}",
-                    ", ".join(f.indistinguishable) or "none",
-                )
-                for f in o.found
-            ],
+            effect_rows(problem, o, "; ", "none"),
         ),
         Table(
             "Error by channel",
@@ -314,7 +348,7 @@ def _report(folder: Any, config: Any, problem: Any, o: Any, content: Any) -> Pat
                 )
                 for d, n in enumerate(c.names)
             ],
-            f"RMS over windows of {config.horizon:g} s, held out: {problem.held_name}.",
+            f"RMS over windows of {o.horizon:g} s, held out: {problem.held_name}.",
         ),
         Table(
             "Where the rest sits",

@@ -52,7 +52,7 @@ def read_problem(config: Any) -> Problem:
 
     from easi_jax.errors import UserError
     from easi_jax.found_effects import joined
-    from easi_jax.log_data import trusted_velocity, visible_steps
+    from easi_jax.log_data import true_readings, trusted_velocity, visible_steps
     from easi_jax.machine import Machine
 
     name, mj_model, space = _model_and_space(config)
@@ -66,6 +66,12 @@ def read_problem(config: Any) -> Problem:
     measured_runs = read_runs(config, mj_model, horizon)
     fit, held, noise = measured_runs.fit, measured_runs.held, measured_runs.noise
     held_name, notes = measured_runs.held_name, measured_runs.notes
+    fit, held = (true_readings(mj_model, r, found.entries) for r in (fit, held))
+    notes += [
+        f"{e.effect}@{e.at}: taken out of the logs' readings"
+        for e in found.entries
+        if e.of_readings
+    ]
     nv = mj_model.nv
     if config.noise:
         noise = np.asarray(config.noise, float)
@@ -134,9 +140,15 @@ def read_runs(config: Any, mj_model: Any, horizon: float) -> MeasuredRuns:
     from easi_jax.data_split import split_held_out
     from easi_jax.errors import UserError
     from easi_jax.io.logs import read_logs
-    from easi_jax.log_data import pooled_noise, to_common_step, without_odd_ends
+    from easi_jax.log_data import (
+        pooled_noise,
+        split_at_resets,
+        to_common_step,
+        without_odd_ends,
+    )
 
-    fit_files = [p for p in config.data if p not in config.held_out]
+    kept_out = {p.resolve() for p in config.held_out}
+    fit_files = [p for p in config.data if p.resolve() not in kept_out]
     if not fit_files:
         raise UserError("--held-out names all of --data: leave a log to fit")
     log = read_logs(fit_files, mj_model, config.mapping)
@@ -147,12 +159,16 @@ def read_runs(config: Any, mj_model: Any, horizon: float) -> MeasuredRuns:
         notes += held_log.notes
     # Before interpolation, which would smooth the noise.
     noise = pooled_noise(log.runs)
-    every = [*log.runs, *(held_log.runs if held_log else ())]
-    runs, changed = to_common_step(every)
+    parts = []
+    for given in (log.runs, held_log.runs if held_log else ()):
+        cut, leaps = split_at_resets(given, noise)
+        notes += leaps
+        parts.append(cut)
+    runs, changed = to_common_step([*parts[0], *parts[1]])
     notes += changed
     runs, odd = without_odd_ends(runs, noise)
     notes += odd
-    fit, held = runs[: len(log.runs)], runs[len(log.runs) :]
+    fit, held = runs[: len(parts[0])], runs[len(parts[0]) :]
     if held_log is None:
         fit, held, held_name = split_held_out(mj_model, fit, horizon)
     else:

@@ -4,17 +4,22 @@ from pathlib import Path
 from typing import Any
 
 
-def check_robot(robot: str, mj_model: Any) -> None:
-    """Whether a robot has the places of the model that was analysed.
+def check_robot(robot: str, mj_model: Any, env_steps: int | None = None) -> None:
+    """Whether a robot has the places of the model that was analysed, and can be trained
+    for ``env_steps``.
 
     Raises:
-        UserError: no such robot or file, or a joint, actuator or body is missing in it.
+        UserError: no such robot or file, a joint, actuator or body is missing in it, or
+            too few steps.
     """
     from easi_jax.addresses import names
     from easi_jax.errors import UserError
     from envs import open_env
+    from train._robots import training_config
 
-    known = open_env(*_which(robot)).mj_model
+    env = open_env(*_which(robot))
+    training_config(env, env_steps)
+    known = env.mj_model
     for kind in ("joint", "actuator", "body"):
         missing = [n for n in names(mj_model, kind) if n not in names(known, kind)]
         if missing:

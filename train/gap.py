@@ -73,7 +73,7 @@ def run(config: Config) -> None:
     check_seeds(config.retrain_seeds)
     problem = read_gap_problem(config)
     if config.retrain is not None:
-        check_robot(config.retrain, problem.model.mj_model)
+        check_robot(config.retrain, problem.model.mj_model, config.retrain_steps)
     from easi_jax.gap.analysis import Analysis
     from easi_jax.gap.journal import Journal, key_of
 
@@ -107,6 +107,8 @@ def run(config: Config) -> None:
         for note in problem.notes:
             say(f"note: {note}")
         outcome = analysis.run()
+        if problem.late and outcome.verdict == "no_gap":
+            outcome.verdict = "explained"  # the readings' effect is named
         for note in outcome.notes:
             say(f"note: {note}")
         outcome.notes = [*problem.notes, *outcome.notes]
@@ -124,7 +126,7 @@ def run(config: Config) -> None:
             )
             write_results(folder, config, problem, analysis, outcome, retrained)
         analysis.selector.journal.clear()
-    _show(outcome)
+    _show(problem, outcome)
     if retrained is not None:
         say(retrained_line(retrained))
     say(f"report: {report}")
@@ -167,22 +169,14 @@ def _record_next(
     return said
 
 
-def _show(outcome: Any) -> None:
-    from train._gap_results import disagreement, parameters_text
+def _show(problem: Any, outcome: Any) -> None:
+    from train._gap_results import disagreement, effect_rows
 
-    rows = [
-        (
-            f"{f.place.effect} at {f.place.at}" if f.place.at else f.place.effect,
-            parameters_text(f, ", "),
-            f"{f.confidence:.2f}",
-            ", ".join(f.indistinguishable) or "-",
-        )
-        for f in outcome.found
-    ]
+    rows = effect_rows(problem, outcome, ", ", "-")
     if rows:
         show_table(
             "Effects that the model lacks",
-            ["effect", "parameters", "confidence", "as good"],
+            ["effect", "at", "parameters", "confidence", "as good"],
             rows,
         )
     for item in outcome.disagreeing.items():

@@ -83,7 +83,9 @@ def effects_wanted(
     for j, (_, d) in scalar_dofs(m).items():
         found += ripples(m, j, scales, [_RIPPLE * 2 * np.pi / float(scales.span[d])])
     kept = [
-        p for p in found if (not names or p.effect in names) and not covered(p, space)
+        p
+        for p in found
+        if (not names or p.effect in names) and not covered(p, space, m)
     ]
     if not kept:
         raise UserError(

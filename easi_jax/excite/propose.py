@@ -21,6 +21,7 @@ from easi_jax.recording import Run
 _WINDOWS = 32  # of each run
 _MARGIN = 0.05
 _WORTH = 1.5  # times as far apart as in the data given
+_SEEN = 3.0  # times the noise that a test has to tell two names apart by
 _TRAVEL = 0.5  # m or rad, of a joint without a range that the data hardly move
 
 
@@ -58,7 +59,7 @@ class Proposal:
                 "that was tried tells them apart."
             )
         gain = self.apart / max(self.given, 1e-9)
-        if gain < _WORTH:
+        if gain < _WORTH or self.apart < _SEEN:
             return (
                 f"No test that was tried tells {pair} much better than the data given."
             )

@@ -49,7 +49,7 @@ def identified_model(
         mujoco.mj_saveLastXML(str(path), model)
         # MuJoCo writes it and then warns that it is of no use.
         text = re.sub(r'\s*meaninertia="[^"]*"', "", path.read_text())
-    model = repaired_model(source, entries, {}, text)
+    model = repaired_model(source, entries, text)
     return dataclasses.replace(model, left=[*lost, *model.left])
 
 

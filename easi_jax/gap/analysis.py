@@ -39,7 +39,7 @@ from easi_jax.gap.residuals import (
 )
 from easi_jax.gap.scales import scales_of
 from easi_jax.gap.selection import Selector, shortlist
-from easi_jax.gap.table import REFITTED, Place, covered
+from easi_jax.gap.table import Place, covered, does
 from easi_jax.gap.where import Conditions
 from easi_jax.gap.window_set import join, reach, spread, window_set
 from easi_jax.parameters import ParameterSpace
@@ -59,6 +59,7 @@ _UNLIKELY = 0.3  # probability of an effect beside which a rival replaces it
 _ROUNDING = 0.005  # of the gap
 _CLEAR = 1.5  # times the floor: a gap that fits see without doubt
 _BEAM = 3  # sets of effects that are followed
+_NOTHING = 1e-3  # of the largest error: a change that shows nowhere
 _DRAWS = 8  # of the noise of each held-out window
 
 Tell = Callable[[str], None]
@@ -90,7 +91,7 @@ class Analysis:
         dt = fit[0].dt
         self.scales = scales_of(mj_model, fit)
         self.everywhere = places(mj_model, self.scales)
-        self.places = [p for p in self.everywhere if not covered(p, space)]
+        self.places = [p for p in self.everywhere if not covered(p, space, mj_model)]
         self.ripples = [
             p
             for j in scalar_dofs(mj_model)
@@ -267,7 +268,11 @@ class Analysis:
         fitted = self.predictor.errors(x[None], self.fit_blocks)[0][:count]
         square = np.concatenate([measure.squares(fitted), kept.square])
         run = np.concatenate([self.fit_windows.run, self.held.run])
-        odd = measure.odd_runs(square, self.channels.scale, run)
+        scale = self.channels.scale
+        odd = measure.odd_runs(square, scale, run)
+        if len(np.unique(run)) == 2:
+            floor = measure.gap(self.floor(x), scale)
+            odd = measure.odd_of_two(square, scale, run, float(floor))
         return {self.runs[r].name: ratio for r, ratio in odd.items()}
 
     # -- the whole -------------------------------------------------------------
@@ -296,7 +301,29 @@ class Analysis:
             x[stuck] = self.predictor.neutral[stuck]
             model = self.select(self.selector.fit(model.places, x))
         model, rivals = self.exchanged(model)
+        idle = [p for p in model.places if self._idle(model, p)]
+        if idle:
+            model = self._rid_of(model, idle)
+            model, rivals = self.exchanged(model)
         return self.measured(base, model, rivals, began)
+
+    def _idle(self, model: Model, place: Place) -> bool:
+        """Whether an effect was fitted to nothing: predictions are as without it."""
+        kept = [p for p in model.places if p is not place]
+        x = self.selector.without(model.fit.x, place, kept)
+        mine, other = self.predictor.errors(
+            np.stack([model.fit.x, x]), self.fit_blocks
+        ).astype(float)
+        return float(np.abs(mine - other).max()) < _NOTHING * np.abs(mine).max()
+
+    def _rid_of(self, model: Model, idle: Sequence[Place]) -> Model:
+        kept = [p for p in model.places if p not in idle]
+        x = model.fit.x
+        for place in idle:
+            self.tell(f"- {place.key}: fitted to nothing")
+            x = self.selector.without(x, place, kept)
+        self.whiten(x)
+        return self.selector.fit(kept, x)
 
     def _stuck(self, model: Model) -> list[int]:
         """The model's own parameters that a refit moved to a bound."""
@@ -317,12 +344,7 @@ class Analysis:
 
     def _offer(self, addresses: Sequence[str]) -> None:
         for address in addresses:
-            name, quantity = address.split(".", 1)[1].rsplit(".", 1)
-            self.places += [
-                p
-                for p in self.everywhere
-                if p.at == name and REFITTED.get(p.effect) == quantity
-            ]
+            self.places += [p for p in self.everywhere if does(p, address, self.m)]
 
     def select(self, start: Model) -> Model:
         """Adds effects while they help.
@@ -423,9 +445,9 @@ class Analysis:
         after = self.figures(model.fit.x) if model.places else refit
         floor = self.floor(model.fit.x if model.places else base.fit.x)
         floor_gap = float(measure.gap(floor, scale))
-        trust = explained(refit.gap, after.gap, floor_gap)
         found = []
         numbers = Numbers(self.selector, model)
+        gap = refit.gap  # that the effects before it leave
         for k, place in enumerate(model.places):
             part = model.places[: k + 1]
             if k + 1 == len(model.places):
@@ -448,12 +470,13 @@ class Analysis:
                 Found(
                     place,
                     numbers.values(place),
-                    trust / (1.0 + odds),
+                    explained(gap, after.gap, floor_gap) / (1.0 + odds),
                     same,
                     figures.gap,
                     numbers.deviations(place),
                 )
             )
+            gap = figures.gap
         goal = GOAL * floor_gap
         fitted = float(base.gap.mean()) ** 0.5 / self.fit_floor
         notes = []
@@ -500,6 +523,7 @@ class Analysis:
             notes=notes,
             disagreeing=self.disagreeing(x, after),
             seconds=time.perf_counter() - began,
+            horizon=self.predictor.steps * self.runs[0].dt,
         )
 
     def _as_good(self, mine: Figures, theirs: Figures) -> bool:

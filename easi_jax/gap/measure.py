@@ -13,6 +13,7 @@ from easi_jax.recording import Run
 
 _VISIBLE = 5.0  # times the noise
 _ODD = 3.0  # times the error of other runs
+_FOLLOWED = 1.5  # times the floor: a run that the model predicts
 _DRAWS = 2000
 
 
@@ -124,6 +125,23 @@ def odd_runs(
         if mine > _ODD * others:
             out[r] = mine / max(others, 1e-30)
     return out
+
+
+def odd_of_two(
+    square: np.ndarray, scale: np.ndarray, run: np.ndarray, floor: float
+) -> dict[int, float]:
+    """Of two runs the one that the other's model does not predict.
+
+    Whichever is odd, the model follows the other one down to its noise, ``floor``, and
+    misses this one by far. Arguments and result: `odd_runs`.
+    """
+    error = gap(square, scale)
+    first, second = (int(r) for r in np.unique(run))
+    a, b = (float(np.median(error[run == r])) for r in (first, second))
+    odd, mine, other = (first, a, b) if a > b else (second, b, a)
+    if other < _FOLLOWED * floor and mine > _ODD * _FOLLOWED * max(other, floor):
+        return {odd: mine / max(other, 1e-30)}
+    return {}
 
 
 def resampled(count: int, seed: int) -> np.ndarray:

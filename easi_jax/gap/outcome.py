@@ -64,6 +64,7 @@ class Outcome:
             moved.
         disagreeing: runs that the model predicts far worse than the others, with how
             many times.
+        horizon: of the predictions [s].
         record_next: what to record to tell names apart, a sentence for each pair.
     """
 
@@ -83,6 +84,7 @@ class Outcome:
     disagreeing: dict[str, float] = field(default_factory=dict)
     record_next: list[str] = field(default_factory=list)
     seconds: float = 0.0
+    horizon: float = 0.0
 
 
 def for_people(

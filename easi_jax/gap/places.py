@@ -7,7 +7,7 @@ import numpy as np
 
 from easi_jax import backlash
 from easi_jax.gap.table import Column, Place, Scales, name_of
-from easi_jax.quantities import direct_solref, scalar_dofs
+from easi_jax.quantities import direct_solref, linear_drive, scalar_dofs
 
 
 def places(m: mujoco.MjModel, s: Scales) -> list[Place]:
@@ -204,7 +204,7 @@ def _at_joint(m: mujoco.MjModel, j: int, s: Scales) -> list[Place]:
                 "armature",
                 "kg m2" if hinge else "kg",
                 0.0,
-                0.0,
+                -float(m.dof_armature[d]),
                 20 * inertia,
                 0.03 * inertia,
             ),
@@ -297,7 +297,7 @@ def _at_actuator(m: mujoco.MjModel, a: int, s: Scales) -> list[Place]:
                 "limit",
                 (a,),
                 "limit",
-                "N m",
+                "N m" if linear_drive(m, a) is False else "N",
                 1e9,
                 0.02 * force,
                 max(4.0 * force, peak),

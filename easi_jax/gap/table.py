@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
+from easi_jax import addresses as language
 from easi_jax.errors import UserError
 from easi_jax.parameters import ParameterSpace
 
@@ -60,9 +61,14 @@ _UNUSUAL = {"actuator_gain": (0.4, 2.5), "gravity_tilt": (-0.25, 0.25)}
 
 # Effects that are also quantities which a model states and a refit may move.
 REFITTED = {
-    "viscous_damping": "damping",
-    "coulomb_friction": "frictionloss",
-    "joint_stiffness": "stiffness",
+    "viscous_damping": ("joint", "damping"),
+    "coulomb_friction": ("joint", "frictionloss"),
+    "joint_stiffness": ("joint", "stiffness"),
+    "armature": ("joint", "armature"),
+    "actuator_gain": ("actuator", "gain"),
+    "actuator_saturation": ("actuator", "force_limit"),
+    "actuator_lag": ("actuator", "time_constant"),
+    "payload_mass": ("body", "mass"),
 }
 
 
@@ -183,8 +189,17 @@ def object_id(m: mujoco.MjModel, kind: str, name: str) -> int:
     return i
 
 
-def covered(place: Place, space: ParameterSpace) -> bool:
+def covered(place: Place, space: ParameterSpace, m: mujoco.MjModel) -> bool:
     """Whether the refit of the model's own parameters does what an effect does."""
-    quantity = REFITTED.get(place.effect)
-    own = {a for p in space.parameters for a in p.addresses}
-    return quantity is not None and f"joint.{place.at}.{quantity}" in own
+    own = [a for p in space.parameters for a in p.addresses]
+    return any(does(place, a, m) for a in own)
+
+
+def does(place: Place, address: str, m: mujoco.MjModel) -> bool:
+    """Whether an address of the model's own parameters is what an effect changes."""
+    kind, quantity = REFITTED.get(place.effect, ("", ""))
+    found = language.places(m, address)
+    return any(
+        (kind, quantity) == (k, q) and object_id(m, kind, place.at) == i
+        for k, q, i in found
+    )

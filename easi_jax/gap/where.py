@@ -240,5 +240,5 @@ def condition_errors(
             {t: float(mine[k].mean()) for t, k in masks.items() if k.sum() >= _FEW}
         )
     names = list(dict.fromkeys(name for row in rows for name in row))
-    table = [[row.get(name, np.nan) for name in names] for row in rows]
-    return joints, names, np.sqrt(np.array(table).reshape(len(joints), -1))
+    table = np.array([[row.get(name, np.nan) for name in names] for row in rows])
+    return joints, names, np.sqrt(table.reshape(len(joints), len(names)))

@@ -78,3 +78,18 @@ def resampled(rows: Rows, dt: float, configuration: Configuration) -> Rows:
         ctrl=rows.ctrl[held],
         sensors={name: between(v) for name, v in rows.sensors.items()},
     )
+
+
+def mean_held(
+    time: np.ndarray, ctrl: np.ndarray, at: np.ndarray, dt: float
+) -> np.ndarray:
+    """Means over ``[at, at + dt]`` of commands ``(T, nu)`` that are held from ``time``
+    on: a command that changes within a step acts for a part of it."""
+    given = np.concatenate([[0.0], np.diff(time)])[:, None]
+    sent = np.cumsum(given * np.concatenate([ctrl[:1], ctrl[:-1]]), axis=0)
+
+    def until(t: np.ndarray) -> np.ndarray:
+        row = np.clip(np.searchsorted(time, t, side="right") - 1, 0, None)
+        return sent[row] + (t - time[row])[:, None] * ctrl[row]
+
+    return (until(at + dt) - until(at)) / dt

@@ -15,7 +15,7 @@ from easi_jax.errors import UserError
 from easi_jax.io import log_checks
 from easi_jax.io.log_columns import LogColumns, check_columns, log_columns
 from easi_jax.io.log_mapping import LogMapping, read_mapping
-from easi_jax.io.log_rows import EVEN, Rows, is_even, recordings, resampled
+from easi_jax.io.log_rows import EVEN, Rows, is_even, mean_held, recordings, resampled
 from easi_jax.io.log_tables import Table, read_table, write_table
 from easi_jax.recording import Log, Run
 from easi_jax.windows import fitted_velocity
@@ -55,8 +55,9 @@ def read_logs(
     files = [Path(path) for path in paths]
     if not files:
         raise UserError("no log given")
-    for path in files:
-        if files.count(path) > 1:
+    places = [path.resolve() for path in files]
+    for path, place in zip(files, places, strict=True):
+        if places.count(place) > 1:
             raise UserError(f"{path} is given more than once")
     columns = log_columns(mj_model)
     names = LogMapping(source="") if mapping is None else read_mapping(mapping)
@@ -282,10 +283,13 @@ class _Reader:
         return runs
 
     def _run(self, name: str, rows: Rows, dt: float) -> Run:
+        stamps = sent = None
         if not is_even(rows.time, dt):
+            stamps, held = rows.time, rows.ctrl
             worst = float(np.abs(np.diff(rows.time) / dt - 1).max())
             self.uneven.append((worst, name))
             rows = resampled(rows, dt, self.configuration)
+            sent = mean_held(stamps, held, rows.time, dt)
         fitted = fitted_velocity(rows.qpos, dt, self.configuration)
         given = np.isfinite(rows.qvel)
         columns_given = given.any(0)
@@ -303,6 +307,8 @@ class _Reader:
             ctrl=rows.ctrl,
             configuration=self.configuration,
             sensors=rows.sensors,
+            stamps=stamps,
+            sent=sent,
         )
 
 

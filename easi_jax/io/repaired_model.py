@@ -1,7 +1,7 @@
 """``model.xml``: a model with the effects that MJCF can express added to it."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from easi_jax.found_effects import EffectEntry
 from easi_jax.io.model_file import ways
 
 _ASSETS = "assets"  # folder beside the model
+_ROUNDING = 1e-9  # rad
 _SAID = {
     "coulomb_friction",
     "viscous_damping",
@@ -47,17 +48,13 @@ class Repaired:
 
 
 def repaired_model(
-    path: Path,
-    entries: Sequence[EffectEntry],
-    own: Mapping[str, float],
-    text: str | None = None,
+    path: Path, entries: Sequence[EffectEntry], text: str | None = None
 ) -> Repaired:
-    """A model with effects and refitted values.
+    """A model with effects.
 
     Args:
         path: the model as given.
         entries: effects.
-        own: values of the model's own parameters, by address.
         text: taken in place of what ``path`` holds; its files are still looked for
             from there.
     """
@@ -67,15 +64,10 @@ def repaired_model(
     else:
         spec = mujoco.MjSpec.from_string(text)
     assets = _gathered(spec, path.parent)
-    compiled = spec.compile()
-    for address, value in own.items():
-        kind, rest = address.split(".", 1)
-        name, quantity = rest.rsplit(".", 1)
-        if kind == "joint":
-            _set(spec.joint(name), quantity, value)
     left = []
     for e in entries:
-        if e.effect not in _SAID or not _add(spec, compiled, e):
+        # Compiled anew each time: two effects may sit at one body.
+        if e.effect not in _SAID or not _add(spec, spec.compile(), e):
             left.append(f"{e.effect}@{e.at}" if e.at else e.effect)
     spec.compile()
     return Repaired(spec.to_xml(), assets, left)
@@ -138,11 +130,7 @@ def _add(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
     if e.kind == "joint":
         joint = spec.joint(e.at)
         if e.effect == "joint_stiffness":
-            if _get(joint, "stiffness") or c["stiffness"] <= 0:
-                return False
-            _set(joint, "stiffness", c["stiffness"])
-            joint.springref = c["spring"] / c["stiffness"]
-            return True
+            return _spring(spec, m, e)
         quantity = {
             "coulomb_friction": ("frictionloss", "coulomb"),
             "viscous_damping": ("damping", "damping"),
@@ -168,6 +156,23 @@ def _add(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
         )
         return True
     return _contacts(spec, e)
+
+
+def _spring(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
+    """Another spring at a joint that may have one: stiffnesses and torques add up."""
+    joint, there = spec.joint(e.at), m.joint(e.at)
+    q = int(there.qposadr[0])
+    old = float(np.ravel(there.stiffness)[0])
+    stiffness = old + e.columns["stiffness"]
+    if stiffness <= 0:
+        return False
+    torque = old * float(m.qpos_spring[q]) + e.columns["spring"]
+    _set(joint, "stiffness", stiffness)
+    joint.springref = torque / stiffness
+    # Angles of a text are in degrees unless it says otherwise.
+    if abs(spec.compile().qpos_spring[q] - torque / stiffness) > _ROUNDING:
+        joint.springref = math.degrees(torque / stiffness)
+    return True
 
 
 def _actuator(actuator: mujoco.MjsActuator, e: EffectEntry, timestep: float) -> bool:

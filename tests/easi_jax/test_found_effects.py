@@ -324,9 +324,8 @@ def test_bad_effects_get_one_line() -> None:
         return text
 
     assert "names no joint" in refused(entry("coulomb", 0.2, at="hinge"))
-    assert "readings" in refused(
-        EffectEntry("sensor_delay", "cart", "joint", {"late": 0.01}, {})
-    )
+    late = EffectEntry("sensor_delay", "cart", "joint", {"late": 0.01}, {})
+    assert env_with(env, FoundEffects((late,))) is env  # in the readings
     wrong = EffectEntry("armature", "cart", "actuator", {"armature": 1.0}, {})
     assert "of kind joint, not actuator" in refused(wrong)
     assert "no column" in refused(EffectEntry("x", "cart", "joint", {"com": 1.0}, {}))

@@ -10,6 +10,9 @@ import pytest
 
 from easi_jax.configuration import Configuration
 from easi_jax.errors import UserError
+from easi_jax.found_effects import EffectEntry
+from easi_jax.io.log_rows import mean_held
+from easi_jax.io.logs import read_logs
 from easi_jax.log_data import (
     errors_and_floor,
     estimate_noise,
@@ -18,7 +21,9 @@ from easi_jax.log_data import (
     outlier_weights,
     rows_of,
     segments_from_runs,
+    split_at_resets,
     to_common_step,
+    true_readings,
     trusted_velocity,
     visible_steps,
     without_odd_ends,
@@ -136,9 +141,69 @@ def test_runs_of_two_rates_come_to_the_smaller_step():
     np.testing.assert_allclose(runs[0].qpos[::2], slow.qpos)
     middle = (slow.qpos[1:] + slow.qpos[:-1]) / 2
     np.testing.assert_allclose(runs[0].qpos[1::2], middle)
-    np.testing.assert_array_equal(runs[0].ctrl[1::2], slow.ctrl[:-1])  # held
+    np.testing.assert_allclose(runs[0].ctrl[1::2], slow.ctrl[:-1])  # held
     assert len(notes) == 1
     assert "slow" in notes[0]
+
+
+def test_a_command_that_changes_within_a_step_acts_for_a_part_of_it():
+    rng = np.random.default_rng(5)
+    time = np.cumsum(rng.uniform(0.006, 0.014, 60))
+    ctrl = rng.normal(size=(60, 2))
+    at = time[0] + 0.01 * np.arange(50)
+    fine = at[:, None] + 0.01 * (np.arange(4000) + 0.5) / 4000
+    held = ctrl[np.searchsorted(time, fine, side="right") - 1].mean(1)
+    np.testing.assert_allclose(mean_held(time, ctrl, at, 0.01), held, atol=2e-3)
+
+
+def test_noise_of_uneven_rows_is_not_lost_by_their_interpolation(tmp_path):
+    """Rows of a plain oscillation, with stamps off by up to a fifth of a step."""
+    rng, sigma, rows = np.random.default_rng(4), 2e-3, 3000
+    time = 0.01 * (np.arange(rows) + rng.uniform(-0.2, 0.2, rows))
+    text = ["time,qpos.slide,ctrl.push"]
+    for t, e in zip(time, sigma * rng.standard_normal(rows), strict=True):
+        text.append(f"{t:.9f},{0.3 * np.sin(3 * t) + e:.9f},{np.sin(t):.6f}")
+    (tmp_path / "log.csv").write_text("\n".join(text) + "\n")
+    model = mujoco.MjModel.from_xml_string(XML)
+    (run,) = read_logs(tmp_path / "log.csv", model).runs
+    assert run.stamps is not None and run.sent is not None
+    assert estimate_noise(run)[0] == pytest.approx(sigma, rel=0.1)
+    even = dataclasses.replace(run, stamps=None)
+    assert estimate_noise(even)[0] < 0.75 * sigma
+
+
+def test_runs_are_cut_at_leaps_and_nowhere_else():
+    rng = np.random.default_rng(2)
+    time = 0.01 * np.arange(600)
+    noise = np.full(2, 1e-3)
+    swing = np.sin(2 * time) + 1e-3 * rng.standard_normal(600)
+    bounce = np.abs(np.sin(4 * time)) + 1e-3 * rng.standard_normal(600)
+    runs, notes = split_at_resets([make_run(swing), make_run(bounce)], noise)
+    assert [len(r) for r in runs] == [600, 600] and not notes
+    swing[200:] -= 1.0
+    swing[450] += 0.8  # one bad reading
+    runs, (note,) = split_at_resets([make_run(swing)], noise)
+    assert [len(r) for r in runs] == [200, 250, 149]
+    assert [r.name for r in runs] == ["run/1", "run/2", "run/3"]
+    assert "run at 1.99 s, 4.49 s, 4.5 s" in note
+
+
+def test_readings_are_mended(machine):
+    entries = [
+        EffectEntry("sensor_bias", "slide", "joint", {"bias": 0.2}, {}),
+        EffectEntry("sensor_delay", "slide", "joint", {"late": 0.025}, {}),
+        EffectEntry("sensor_delay", "qvel.slide", "sensor", {"late": 0.01}, {}),
+        EffectEntry("armature", "slide", "joint", {"armature": 0.1}, {}),
+    ]
+    time = 0.01 * np.arange(300)
+    read = make_run(np.sin(time - 0.025) + 0.2)
+    (run,) = true_readings(machine.mj_model, [read], entries)
+    assert len(run) == 297
+    np.testing.assert_allclose(run.qpos[:, 0], np.sin(run.time), atol=2e-5)
+    assert true_readings(machine.mj_model, [read], entries[3:])[0] is read
+    entries[0] = EffectEntry("sensor_bias", "slid", "joint", {"bias": 0.2}, {})
+    with pytest.raises(UserError, match="slid"):
+        true_readings(machine.mj_model, [read], entries)
 
 
 def test_segments_never_cross_runs(machine):

@@ -91,7 +91,7 @@ def assert_same_files(got: mujoco.MjModel, want: mujoco.MjModel) -> None:
 
 
 def test_with_effects(model: Path, tmp_path: Path) -> None:
-    got = repaired_model(model, [FRICTION], {"joint.j.damping": 0.3})
+    got = repaired_model(model, [FRICTION])
     want = mujoco.MjModel.from_xml_path(str(model))
     model.parent.rename(tmp_path / "elsewhere")
     moved = {
@@ -102,7 +102,47 @@ def test_with_effects(model: Path, tmp_path: Path) -> None:
     assert_same_files(m, want)
     assert len(got.assets) == 7
     assert m.joint("j").frictionloss[0] == pytest.approx(0.05)
-    assert m.joint("j").damping[0] == pytest.approx(0.3)
+
+
+SPRUNG = """<mujoco>{0}<worldbody><body name="b"><joint name="j" stiffness="2"
+springref="{1}"/><geom size="0.1" mass="1" pos="0 0 1"/><body name="c" pos="0 0 1">
+<joint name="k"/><geom size="0.1" mass="0.2" pos="0 0 1"/></body></body></worldbody>
+</mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("compiler", "ref"), [("", "30"), ('<compiler angle="radian"/>', "0.5235988")]
+)
+def test_springs_add_up_in_degrees_and_in_radians(
+    compiler: str, ref: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "m.xml"
+    path.write_text(SPRUNG.format(compiler, ref))
+    entries = [
+        EffectEntry(
+            "joint_stiffness", at, "joint", {"stiffness": k, "spring": torque}, {}
+        )
+        for at, k, torque in (("j", 1.0, -0.4), ("k", 0.25, 0.05))
+    ]
+    got = repaired_model(path, entries)
+    m = mujoco.MjModel.from_xml_string(got.xml)
+    assert not got.left
+    np.testing.assert_allclose(m.jnt_stiffness, [3.0, 0.25])
+    torque = 2 * np.pi / 6 - 0.4
+    np.testing.assert_allclose(m.qpos_spring, [torque / 3, 0.2], rtol=1e-5)
+
+
+def test_two_effects_at_one_body(tmp_path: Path) -> None:
+    path = tmp_path / "m.xml"
+    path.write_text(SPRUNG.format("", "0"))
+    load = EffectEntry("payload_mass", "c", "body", {"mass": 0.1, "spread": 1.0}, {})
+    off = EffectEntry("com_offset", "c", "body", {"com.0": 0.05}, {})
+    for entries in ([load, off], [off, load]):
+        m = mujoco.MjModel.from_xml_string(repaired_model(path, entries).xml)
+        assert m.body("c").mass[0] == pytest.approx(0.3)
+        np.testing.assert_allclose(m.body("c").ipos, [0.05, 0.0, 1.0])
+    m = mujoco.MjModel.from_xml_string(repaired_model(path, [off]).xml)
+    assert m.body("c").mass[0] == pytest.approx(0.2)
 
 
 def test_as_identified(model: Path, tmp_path: Path) -> None:

@@ -114,7 +114,6 @@ def test_resume_needs_the_same_effects(trained: Path, files: Path, capsys) -> No
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("effects: []", "holds no effects"),
         (HIDDEN.replace("at: cart", "at: hinge"), "names no joint"),
         (HIDDEN.replace("kind: joint", "kind: body"), "of kind joint"),
         ("refitted: 3\neffects: []", "holds a list"),

@@ -60,3 +60,14 @@ def test_held_out_data_beyond_the_fit_are_told() -> None:
     assert "speed of joint rail reaches 4.99 m/s" in first and "and 2 m/s in" in first
     assert "command of actuator drive reaches 3 in the held-out data" in second
     assert coverage_notes(MODEL, fast, slow) == []
+
+
+def test_a_closed_loop_is_told_and_an_open_one_is_not() -> None:
+    rng = np.random.default_rng(0)
+    target = np.sin(2 * TIME) + 0.5 * np.sin(5.1 * TIME)
+    read = 0.8 * target + 2e-3 * rng.standard_normal(len(TIME))
+    back = 30 * (target - read)
+    (note,) = coverage_notes(MODEL, [run(read, back)], [run(read, back)])
+    assert "commands of drive follow the measured state" in note
+    for command in (target, back + 2 * rng.standard_normal(len(TIME))):
+        assert coverage_notes(MODEL, [run(read, command)], [run(read, command)]) == []

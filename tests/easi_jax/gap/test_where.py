@@ -172,3 +172,19 @@ def test_errors_of_late_readings_belong_to_what_was_read(
         late.positions[:-1, :, 1],
         runs[0].qpos[windows.row[:-1, None] + 3 + np.arange(H + 1), 1],
     )
+
+
+def test_a_machine_without_hinges_and_slides_has_no_map(
+    machine: tuple[WindowSet, list[Run]],
+) -> None:
+    ball = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><joint name="b" type="ball"/>
+<geom size="0.1" mass="1"/></body></worldbody></mujoco>"""
+    )
+    windows, runs = machine
+    rows = Rows(np.zeros((len(windows), H + 1, 3), int), np.zeros((1, 1), int))
+    found = Conditions(ball, windows, runs, rows)
+    channels = Channels(("b.0",) * 3, ("b",) * 3, ("rad",) * 3, np.ones(3), {})
+    errors = np.ones((len(windows), H, 3))
+    joints, _, table = condition_errors(errors, found, ball, channels)
+    assert joints == [] and table.shape[0] == 0
