@@ -66,10 +66,12 @@ def bounds_of(space: ParameterSpace, layout: Layout) -> Bounds:
     """Of a whole vector: the model's own parameters, then the columns of effects."""
     low, high = space.bounds
     nominal, columns = np.asarray(space.nominal, float), layout.columns
+    least, most = (np.asarray(edge, float) for edge in space.initial)
+    typical = np.where(nominal == 0, most - least, np.abs(nominal))
     return Bounds(
         np.r_[low, [c.low for c in columns]],
         np.r_[high, [c.high for c in columns]],
-        np.r_[0.05 * np.abs(nominal), [c.size for c in columns]],
+        np.r_[0.05 * typical, [c.size for c in columns]],
     )
 
 
