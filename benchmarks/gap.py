@@ -129,6 +129,7 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
         "verdict": told["verdict"],
         "verdicts": answer["verdicts"],
         "right": right,
+        "gap_after": [e["gap_after"] for e in told["effects"]],
         "parameters": [
             {k: v["value"] for k, v in e["parameters"].items()} for e in told["effects"]
         ],

@@ -13,6 +13,7 @@ _LIKELY = 1.0  # by either measure
 HELPS = 0.05  # share of the squared gap by which each of its numbers has to help
 _LARGE = 0.3
 GOAL = 1.25  # times the floor: a gap that is as good as closed
+_PLAIN = 2.0  # times as far above the floor: a gap beyond doubt
 _CLOSER = 3.0  # times as much has to be gained where it is
 _TINY = 1e-300
 _RARE = 0.1  # relative loss by which a rare effect has to be better than others
@@ -99,8 +100,9 @@ def _few(windows: np.ndarray) -> np.ndarray:
 
 
 def size_of(model: Model) -> int:
-    """Fitted numbers of its last effect."""
-    return sum(model.places[-1].fitted)
+    """Fitted numbers of its last effect that can be felt."""
+    place = model.places[-1]
+    return model.felt.get(place.key, sum(place.fitted))
 
 
 # An effect that contains another as a special case.
@@ -168,12 +170,16 @@ def probability(model: Model, rival: Model) -> float:
 
 
 def explained(before: float, after: float, floor: float) -> float:
-    """How far to trust that effects are what they seem, by the share of the gap that
-    they close: the rest may be of something that they stand in for.
+    """How far to trust that an effect is what it seems, by the share that it and those
+    after it close of the gap ``before`` it: the rest may be of something that they
+    stand in for.
 
-    Squared, which is what makes the confidence come true (`benchmarks.gap`).
+    Squared, which is what makes the confidence come true (`benchmarks.gap`). Where
+    little more than noise was left before it, it may mend what no effect is.
     """
+    clear = (before - floor) / (_PLAIN * (GOAL - 1) * floor)
+    clear = min(max(clear, 0.0), 1.0)
     if after <= GOAL * floor:
-        return 1.0
+        return clear
     left = (after - floor) / max(before - floor, after - floor)
-    return (1.0 - left) ** 2
+    return clear * (1.0 - left) ** 2

@@ -33,6 +33,8 @@ class Model:
         own: indices of the model's own fitted parameters.
         unlikely: for how many reasons few machines have these effects.
         windows: loss and gap of each window, weighted, ``(2, W)``.
+        felt: fitted numbers of each effect that the predictions depend on, by key; all
+            of them where not given. A planar arm does not feel one of two tilts.
     """
 
     places: list[Place]
@@ -42,3 +44,4 @@ class Model:
     own: tuple[int, ...] = field(default=())
     unlikely: int = 0
     windows: np.ndarray = field(default_factory=lambda: np.zeros((2, 0)))
+    felt: dict[str, int] = field(default_factory=dict)

@@ -32,6 +32,8 @@ _STARTS = 2  # of each
 _TRIED = ("cost", "which", "end")
 _HOPELESS = 4.0  # times the best promise; beyond, only the first few are fitted
 
+_FELT = 1e-3  # of the most that a number of an effect changes
+
 
 class Selector:
     """Fits sets of effects to some windows.
@@ -103,7 +105,17 @@ class Selector:
         unlikely = sum(p.unlikely(fit.x[self.columns(p, fitted=False)]) for p in places)
         windows = self.cross_validated(fit)
         loss, gap = self._of_blocks(windows)
-        return Model(places, fit, loss, gap, self.own, unlikely, windows)
+        felt = {p.key: self._felt(p, fit) for p in places}
+        return Model(places, fit, loss, gap, self.own, unlikely, windows, felt)
+
+    def _felt(self, place: Place, fit: Fitted) -> int:
+        """Fitted numbers of an effect that change predictions at all."""
+        at = np.searchsorted(fit.active, self.columns(place))
+        change = np.sqrt((fit.slope[..., at] ** 2).sum((0, 1)))
+        change = change * self.bounds.size[self.columns(place)]
+        if not np.isfinite(change).all() or not change.any():
+            return sum(place.fitted)
+        return int((change > _FELT * change.max()).sum())
 
     def fit(self, places: list[Place], x: np.ndarray) -> Model:
         """The best fit of some effects from ``x``."""

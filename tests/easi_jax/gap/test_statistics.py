@@ -336,6 +336,21 @@ def test_a_run_that_the_others_contradict_is_told() -> None:
     assert measure.odd_runs(square[20:], scale, run[20:]) == {}, "one of two: which?"
 
 
+@pytest.mark.parametrize("bad", [0, 1])
+def test_of_two_runs_that_contradict_the_one_that_is_not_followed_is_told(
+    bad: int,
+) -> None:
+    rng = np.random.default_rng(0)
+    run, scale = np.repeat([0, 1], 10), np.ones(1)
+    square = rng.uniform(0.5, 1.5, (20, 1))
+    assert measure.odd_of_two(square, scale, run, 1.0) == {}
+    square[run == bad] *= 100.0
+    ((odd, times),) = measure.odd_of_two(square, scale, run, 1.0).items()
+    assert odd == bad and times == pytest.approx(10.0, rel=0.2)
+    # A model that misses both says nothing of either.
+    assert measure.odd_of_two(square, scale, run, 0.3) == {}
+
+
 def test_what_is_not_finite_loses(model: mujoco.MjModel, runs: list[Run]) -> None:
     """Physics in single precision fails now and then; the command must not."""
     layout = Layout(model, places(model, scales_of(model, runs)))
@@ -429,6 +444,9 @@ def test_confidence_falls_with_what_is_left() -> None:
     assert explained(1.0, 0.12, 0.1) == 1.0
     assert explained(1.0, 0.5, 0.1) == pytest.approx((1 - 0.4 / 0.9) ** 2)
     assert explained(0.1, 0.5, 0.1) == 0.0
+    # What little more than noise asked for may stand for anything.
+    assert explained(0.15, 0.1, 0.1) == pytest.approx(1.0)
+    assert explained(0.11, 0.1, 0.1) == pytest.approx(0.2)
 
 
 def test_of_twins_the_one_of_a_usual_size_comes_first(
