@@ -1,13 +1,8 @@
 """Several processes are one run: same result, one writer, an end for all, resume."""
 
 import json
-import os
-import re
 import shutil
 import signal
-import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -18,55 +13,10 @@ import pytest
 from easi_jax import distributed
 from easi_jax.distributed import Place, find_place
 from easi_jax.errors import UserError
-from tests.documented import ROOT
+from tests.processes import LIMIT, Processes, own_words
 
 WALK = "tests.easi_jax.distributed_run"
-LIMIT = 110  # s
 SAME = 1e-6  # relative; sums over devices may round otherwise
-
-
-def port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
-
-
-class Processes:
-    """The processes of one run on this machine."""
-
-    def __init__(self, count: int, *words: object, devices: int = 1) -> None:
-        address = f"127.0.0.1:{port()}"
-        several = ("--distributed",) if count > 1 else ()
-        self.all = []
-        for index in range(count):
-            told = {
-                "JAX_COORDINATOR_ADDRESS": address,
-                "JAX_NUM_PROCESSES": str(count),
-                "JAX_PROCESS_ID": str(index),
-                "JAX_NUM_CPU_DEVICES": str(devices),
-                "JAX_PLATFORMS": "cpu",
-                "PYTHONPATH": str(ROOT),
-            }
-            self.all.append(
-                subprocess.Popen(
-                    [sys.executable, "-m", *map(str, words), *several],
-                    cwd=ROOT,
-                    env={**os.environ, **told},
-                    stdout=subprocess.PIPE,
-                    stderr=subprocess.PIPE,
-                    text=True,
-                )
-            )
-
-    def ended(self, limit: float = LIMIT) -> list[tuple[int, str, str]]:
-        """Exit status, output and error output of each."""
-        end = time.monotonic() + limit
-        try:
-            said = [p.communicate(timeout=end - time.monotonic()) for p in self.all]
-        finally:
-            for p in self.all:
-                p.kill()
-        return [(p.returncode, *s) for p, s in zip(self.all, said, strict=True)]
 
 
 def walked(folder: Path, count: int, *words: object, devices: int = 1) -> Any:
@@ -74,8 +24,7 @@ def walked(folder: Path, count: int, *words: object, devices: int = 1) -> Any:
     ended = Processes(count, WALK, "--out", folder, *words, devices=devices).ended()
     assert [status for status, *_ in ended] == [0] * count, ended
     result = json.loads((folder / "results.json").read_text())
-    # gloo, which carries what CPUs send, says on standard output that it is there.
-    own = [re.sub(r"(?m)^\[Gloo\].*\n", "", out) for _, out, _ in ended]
+    own = [own_words(out) for _, out, _ in ended]
     return result, [(out, error) for out, (*_, error) in zip(own, ended, strict=True)]
 
 
