@@ -161,7 +161,14 @@ def _table3(rows: Sequence[Row]) -> list[str]:
 
 
 def _table4(rows: Sequence[Row]) -> list[str]:
-    return _swept(rows, "table4", "Table 4", "elite_ratio", "μ/λ")
+    out = _swept(rows, "table4", "Table 4", "elite_ratio", "μ/λ")
+    if any("elite_ratio" in s for r in rows for s in r["settings"]):
+        out.append(
+            "Weights of the better half alone are above zero "
+            "(`easi_jax.strategies.recombination_weights`), so from μ/λ = 0.5 on it is "
+            "the same search."
+        )
+    return out
 
 
 def _table5(rows: Sequence[Row]) -> list[str]:
