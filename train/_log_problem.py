@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -147,8 +148,9 @@ def read_runs(config: Any, mj_model: Any, horizon: float) -> MeasuredRuns:
         without_odd_ends,
     )
 
-    kept_out = {p.resolve() for p in config.held_out}
-    fit_files = [p for p in config.data if p.resolve() not in kept_out]
+    # Not Path.resolve: it fails where links lead in a circle.
+    kept_out = {os.path.realpath(p) for p in config.held_out}
+    fit_files = [p for p in config.data if os.path.realpath(p) not in kept_out]
     if not fit_files:
         raise UserError("--held-out names all of --data: leave a log to fit")
     log = read_logs(fit_files, mj_model, config.mapping)

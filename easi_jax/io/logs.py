@@ -55,7 +55,7 @@ def read_logs(
     files = [Path(path) for path in paths]
     if not files:
         raise UserError("no log given")
-    places = [path.resolve() for path in files]
+    places = [os.path.realpath(path) for path in files]
     for path, place in zip(files, places, strict=True):
         if places.count(place) > 1:
             raise UserError(f"{path} is given more than once")

@@ -43,6 +43,7 @@ def outcome() -> Any:
         found=[found],
         disagreeing={EVIL: 3.0},
         notes=[EVIL, HANDLER],
+        horizon=0.2,
         record_next=[EVIL],
         refitted=[{"address": f"joint.{EVIL}.damping", "from": 1, "to": 2, "std": 1}],
     )
@@ -61,7 +62,7 @@ def test_names_do_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     )
     problem = SimpleNamespace(
         model=SimpleNamespace(name=EVIL),
-        late={HANDLER: SimpleNamespace(seconds=0.01)},
+        late={HANDLER: SimpleNamespace(seconds=0.01, std=0.001, confidence=0.9)},
         fit=[SimpleNamespace(dt=0.01)],
         held_name=EVIL,
     )
