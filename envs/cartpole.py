@@ -5,8 +5,6 @@ implementation. Coulomb friction is MuJoCo's `frictionloss` (N, N m) and the car
 speed limit clips the velocity after each physics step, since MuJoCo has none.
 """
 
-from importlib import resources
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -17,6 +15,7 @@ from easi_jax.machine import Machine
 from easi_jax.model import Model
 from easi_jax.parameters import Parameter, ParameterSpace
 from easi_jax.physics import Physics
+from envs.robot import model_file
 
 TARGET_RANGE = 0.2  # m of cart target at action 1
 FAIL_X = 0.18  # m
@@ -75,8 +74,8 @@ class Cartpole:
     action_map = ActionMap(scale=TARGET_RANGE)
 
     def __init__(self) -> None:
-        path = resources.files("envs") / "assets" / "cartpole.xml"
-        self.mj_model = mujoco.MjModel.from_xml_string(path.read_text())
+        text = model_file("cartpole").read_text()
+        self.mj_model = mujoco.MjModel.from_xml_string(text)
         self.space = space()
         self.machine = Machine(self.mj_model, self.space, self.dt)
 

@@ -72,13 +72,17 @@ class Robot:
         return self.machine.step(model, state.physics, self.control(state, action))
 
 
+def model_file(name: str) -> Path:
+    """The MJCF of a built-in robot."""
+    return Path(str(resources.files("envs") / "assets" / f"{name}.xml"))
+
+
 def _read(name: str, model: Path | mujoco.MjModel | None) -> mujoco.MjModel:
     if isinstance(model, mujoco.MjModel):
         return model
     if model is not None:
         return mujoco.MjModel.from_xml_path(str(model))
-    path = resources.files("envs") / "assets" / f"{name}.xml"
-    return mujoco.MjModel.from_xml_string(path.read_text())
+    return mujoco.MjModel.from_xml_string(model_file(name).read_text())
 
 
 def parameter_space(

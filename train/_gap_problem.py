@@ -25,11 +25,9 @@ class GivenModel:
     @property
     def source(self) -> Path:
         """The file that the model is from."""
-        if self.path is not None:
-            return self.path
-        from importlib import resources
+        from envs.robot import model_file
 
-        return Path(str(resources.files("envs") / "assets" / f"{self.name}.xml"))
+        return self.path or model_file(self.name)
 
     @property
     def fixed(self) -> dict[str, float]:

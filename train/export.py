@@ -200,11 +200,10 @@ def _machine_of(
 
 def _model_of(config: Config, settings: dict[str, Any]) -> tuple[Path, Any, Any]:
     """File of the run's model, the model, and its control step where there is one."""
-    from importlib import resources
-
     from easi_jax.errors import UserError
     from easi_jax.io.run_files import MADE_WITH, checked
     from envs import REGISTRY
+    from envs.robot import model_file
     from train._log_problem import load_model
     from train._robots import env_of
 
@@ -220,8 +219,7 @@ def _model_of(config: Config, settings: dict[str, Any]) -> tuple[Path, Any, Any]
         raise UserError(
             f"{env.name} does not say which file its model is from: give --model M.xml"
         )
-    path = resources.files("envs") / "assets" / f"{env.name}.xml"
-    return Path(str(path)), env.mj_model, env.dt
+    return model_file(env.name), env.mj_model, env.dt
 
 
 if __name__ == "__main__":

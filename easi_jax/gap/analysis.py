@@ -259,20 +259,22 @@ class Analysis:
         error = moved[:, :count] - still[:, :count] - targets
         return np.mean(error.astype(float) ** 2, (0, 1, 2))
 
-    def disagreeing(self, x: np.ndarray, kept: Figures) -> dict[str, float]:
+    def disagreeing(
+        self, x: np.ndarray, kept: Figures, floor: float
+    ) -> dict[str, float]:
         """Runs whose windows are predicted far worse than the others', by how much.
 
-        ``kept``: the held-out figures at ``x``.
+        ``kept``: the held-out figures at ``x``; ``floor``: the gap of a perfect model.
         """
         count = len(self.fit_windows)
         fitted = self.predictor.errors(x[None], self.fit_blocks)[0][:count]
         square = np.concatenate([measure.squares(fitted), kept.square])
         run = np.concatenate([self.fit_windows.run, self.held.run])
         scale = self.channels.scale
-        odd = measure.odd_runs(square, scale, run)
         if len(np.unique(run)) == 2:
-            floor = measure.gap(self.floor(x), scale)
-            odd = measure.odd_of_two(square, scale, run, float(floor))
+            odd = measure.odd_of_two(square, scale, run, floor)
+        else:
+            odd = measure.odd_runs(square, scale, run)
         return {self.runs[r].name: ratio for r, ratio in odd.items()}
 
     # -- the whole -------------------------------------------------------------
@@ -521,7 +523,7 @@ class Analysis:
             x=x,
             active=model.fit.active.tolist(),
             notes=notes,
-            disagreeing=self.disagreeing(x, after),
+            disagreeing=self.disagreeing(x, after, floor_gap),
             seconds=time.perf_counter() - began,
             horizon=self.predictor.steps * self.runs[0].dt,
         )

@@ -1,12 +1,11 @@
 """The commands themselves as several processes: what one process gives."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.commands import read
 from tests.processes import Processes
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
@@ -23,10 +22,6 @@ SAME = 1e-4  # relative; sums over devices round otherwise, and training goes on
 def ran(count: int, *words: object) -> None:
     ended = Processes(count, *words, devices=2 // count).ended(LIMIT)
     assert [status for status, *_ in ended] == [0] * count, ended
-
-
-def read(path: Path) -> Any:
-    return json.loads(path.read_text())
 
 
 def test_udr_and_easi(tmp_path: Path) -> None:
