@@ -1,4 +1,4 @@
-"""Small recordings in foreign formats, written by those formats' own libraries."""
+"""Small recordings in foreign formats, by those formats' own libraries or by hand."""
 
 import json
 import pickle
@@ -184,7 +184,7 @@ def lerobot(
 def minari(
     folder: Path, episodes: int = 2, rows: int = 30, actions: int | None = None
 ) -> Path:
-    """A dataset folder; observations are positions, then velocities."""
+    """A dataset folder by hand; observations are positions, then velocities."""
     import h5py
 
     _, qpos, qvel, ctrl = motion(rows + 1)
@@ -202,6 +202,33 @@ def minari(
             infos = group.create_group("infos")
             infos["force"] = np.arange(rows + 1.0)
     return folder
+
+
+def written_by_minari(name: str, episodes: int = 2) -> None:
+    """The same by Minari itself, below ``MINARI_DATASETS_PATH``; actions grow by 1."""
+    import gymnasium
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    _, qpos, qvel, ctrl = motion()
+    box = gymnasium.spaces.Box
+    buffer = [
+        EpisodeBuffer(
+            id=episode,
+            observations=np.concatenate([qpos, qvel], 1),
+            actions=ctrl[:-1, None] + episode,
+            rewards=[0.0] * (len(ctrl) - 1),
+            terminations=[False] * (len(ctrl) - 1),
+            truncations=[False] * (len(ctrl) - 1),
+        )
+        for episode in range(episodes)
+    ]
+    minari.create_dataset_from_buffers(
+        name,
+        buffer,
+        action_space=box(-9, 9, (1,), np.float64),
+        observation_space=box(-9, 9, (4,), np.float64),
+    )
 
 
 _STORAGES = {"f4": "FloatStorage", "f8": "DoubleStorage", "i8": "LongStorage"}

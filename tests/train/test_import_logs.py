@@ -1,7 +1,9 @@
 """``train.import_logs``: recordings of every kind become logs, or one clear line."""
 
 import json
+import os
 import pickle
+import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
@@ -18,6 +20,7 @@ from easi_jax.io.importers.streams import Selection
 from easi_jax.io.logs import read_logs
 from easi_jax.recording import Run
 from tests.commands import command, refused
+from tests.documented import ROOT
 from tests.recordings import (
     MODEL,
     STEP,
@@ -27,6 +30,7 @@ from tests.recordings import (
     motion,
     pace,
     torch_zip,
+    written_by_minari,
 )
 from train import import_logs
 
@@ -247,6 +251,29 @@ def test_lerobot_episode_without_names(tmp_path: Path, call: Any) -> None:
     check(runs["pusht_000001"], CTRL + 1, rtol=1e-6)
 
 
+WRITER = "LEROBOT_PYTHON"
+
+
+@pytest.mark.skipif(WRITER not in os.environ, reason=f"{WRITER} names no Python")
+def test_lerobot_written_by_lerobot(tmp_path: Path, call: Any) -> None:
+    actions = np.stack([CTRL, CTRL + 1])[..., None]
+    states = np.stack([QPOS, QPOS])
+    episodes = tmp_path / "episodes.npz"
+    np.savez(episodes, state=np.float32(states), action=np.float32(actions))
+    folder = tmp_path / "cart"
+    script = ROOT / "tests" / "lerobot_writer.py"
+    subprocess.run(
+        [os.environ[WRITER], script, episodes, folder, str(round(1 / STEP))],
+        env={**os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "hf")},
+        check=True,
+        timeout=300,
+    )
+    runs = call(folder)
+    assert list(runs) == ["cart_000000", "cart_000001"]
+    for episode, run in enumerate(runs.values()):
+        check(run, CTRL + episode, rtol=1e-6)
+
+
 MINARI = """
 actuators: [drive]
 columns:
@@ -272,6 +299,21 @@ def test_minari(tmp_path: Path, call: Any) -> None:
     )
     assert "cart-v0" in one
     np.testing.assert_allclose(one["cart-v0"].sensors["force"][:, 0], range(len(TIME)))
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning:minari.*")
+def test_minari_written_by_minari(
+    tmp_path: Path, call: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("minari", reason="minari is not installed (extra dev)")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    written_by_minari("rig/cart-v0", episodes=2)
+    runs = call(tmp_path / "rig" / "cart-v0", "--step", STEP, mapping=MINARI)
+    assert list(runs) == ["cart-v0_000000", "cart-v0_000001"]
+    for episode, run in enumerate(runs.values()):
+        ctrl = CTRL + episode
+        check(run, np.append(ctrl[:-1], ctrl[-2]))
+        np.testing.assert_allclose(run.qvel, QVEL)
 
 
 def test_pace(tmp_path: Path, call: Any) -> None:
