@@ -8,11 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mujoco
+import numpy as np
 import pytest
 import yaml
 
 from scripts.docs_site import equations
 from tests.documented import ROOT, commands, parsed
+from tests.recordings import Ros
 
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 DOCUMENTS = [
@@ -121,10 +124,48 @@ TINY = {
     "train.pipeline": {**_SEARCH, "--env-steps": "2500"},
     "train.evaluate": {"--episodes": "2"},
 }
-# Minutes to hours each, and run by tests of their own: here they are only parsed.
-LONG = ("benchmarks.", "scripts.", "train.gap", "train.excite")
-ELSEWHERE = {"--effects", "--target-effects"}  # tests/train/test_effects_option.py
-STAND_INS = {"LOG": "LOG.csv", "RUN": "results/easi"}
+# Run at a size of their own by the tests of notebooks, sweeps and experiments.
+SIZED_ELSEWHERE = ("benchmarks.", "scripts.")
+STAND_INS = {"LOG": "LOG.csv", "RUN": "results/easi", "RECORDING": "bag/"}
+HIDDEN = """
+effects:
+- {effect: coulomb_friction, at: cart, kind: joint, columns: {coulomb: 0.5}}
+"""
+ORDER = ("index", "your_own_robot", "export", "gap", "importers", "batch")
+
+
+def machine(folder: Path) -> None:
+    """``robot.xml``, the built-in Cartpole, and logs of one whose rail rubs more."""
+    text = (ROOT / "envs" / "assets" / "cartpole.xml").read_text()
+    (folder / "robot.xml").write_text(text)
+    model = mujoco.MjModel.from_xml_string(text)
+    model.dof_frictionloss[0] = 0.6
+    control, every = 0.02, 40
+    model.opt.timestep = control / every
+    ros = Ros()
+    for run in range(3):
+        rng = np.random.default_rng(run)
+        rates, phases = rng.uniform(2.0, 14.0, 5), rng.uniform(0, 6.3, 5)
+        data = mujoco.MjData(model)
+        data.qpos[1] = np.pi
+        lines = ["time,qpos.cart,qpos.pole,ctrl.cart"]
+        for row in range(500):
+            at = control * row
+            command = 0.05 * np.sin(rates * at + phases).sum()
+            seen = data.qpos + rng.normal(0, 1e-4, 2)
+            lines.append(f"{at:.4f},{seen[0]:.9g},{seen[1]:.9g},{command:.9g}")
+            if run == 0:
+                ros.joints(at, ["cart", "pole_hinge"], seen)
+                ros.joints(at, ["cart"], [command], topic="/joint_command")
+            data.ctrl[0] = command
+            mujoco.mj_step(model, data, every)
+        (folder / f"run{run + 1}.csv").write_text("\n".join(lines))
+    ros.write(folder / "bag")
+    (folder / "names.yaml").write_text("joints: {pole_hinge: pole}\n")
+    (folder / "hidden.yaml").write_text(HIDDEN)
+    (folder / "my_env.py").write_text(
+        "from envs.cartpole import Cartpole\n\n\nclass Mine(Cartpole):\n    pass\n"
+    )
 
 
 def shop(folder: Path) -> None:
@@ -137,27 +178,39 @@ def shop(folder: Path) -> None:
         *(("sweep.csv", "LOG.csv"), ("moves.csv", "LOG2.csv")),
     ):
         shutil.copy(arm / source, folder / target)
+    machine(folder)
 
 
-def tiny(words: list[str]) -> list[str]:
+def tiny(words: list[str], folder: Path) -> list[str]:
     """The command, small, and free to replace what an earlier one has written."""
-    found = [STAND_INS.get(w, w) for w in words]
-    for option, value in TINY.get(words[0], {}).items():
+    found = [words[0]]
+    for word in (STAND_INS.get(w, w) for w in words[1:]):
+        there = sorted(folder.glob(word)) if "*" in word and "/" in word else []
+        found += [str(p.relative_to(folder)) for p in there] or [word]
+    options = TINY.get(words[0], {})
+    if words[0] == "train.easi" and "--model" in words:
+        options = {"--generations": "3", "--population": "8"}
+    for option, value in options.items():
         found += [] if option in words else [option, value]
-    again = hasattr(parsed(words), "overwrite")
+    if words[0] == "train.import_logs" and "--mapping" not in words:
+        found += ["--mapping", "names.yaml"]
+        found = ["robot.xml" if w == "M.xml" else w for w in found]
+    again = hasattr(parsed(found), "overwrite")
     return [*found, "--overwrite"] if again else found
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(7200)
 def test_commands_run(tmp_path: Path) -> None:
+    pages = [ROOT / "README.md", *(ROOT / "docs" / f"{n}.md" for n in ORDER)]
+    assert {p.stem for p in PAGES} == {*ORDER, "method", "reference"}
+    every = [w for p in pages for w in commands(p.read_text())]
+    chosen = [w for w in every if not w[0].startswith(SIZED_ELSEWHERE)]
+    assert len(chosen) >= 25
     shop(tmp_path)
-    names = ("docs/index.md", "README.md", "docs/your_own_robot.md", "docs/export.md")
-    every = [w for n in names for w in commands((ROOT / n).read_text())]
-    chosen = [w for w in every if not w[0].startswith(LONG) and not ELSEWHERE & set(w)]
-    assert len(chosen) >= 12
     ran = set()
-    for words in map(tiny, chosen):
+    for given in chosen:
+        words = tiny(given, tmp_path)
         if tuple(words) in ran:
             continue
         ran.add(tuple(words))
@@ -170,3 +223,7 @@ def test_commands_run(tmp_path: Path) -> None:
             timeout=1200,
         )
         assert done.returncode == 0, (words, done.stderr[-2000:])
+        if words[0] == "train.gap" and "robot.xml" in words:
+            shutil.copy(tmp_path / "results" / "gap" / "effects.yaml", tmp_path)
+            told = (tmp_path / "effects.yaml").read_text()
+            assert "coulomb_friction" in told and "at: cart" in told

@@ -60,6 +60,8 @@ _ROUNDING = 0.005  # of the gap
 _CLEAR = 1.5  # times the floor: a gap that fits see without doubt
 _BEAM = 3  # sets of effects that are followed
 _NOTHING = 1e-3  # of the largest error: a change that shows nowhere
+_SHIFTS = ("actuator_delay", "actuator_lag", "sensor_delay")
+_OWN_SHIFT = 0.75  # of a physics step: less may be the steps' own doing
 _DRAWS = 8  # of the noise of each held-out window
 
 Tell = Callable[[str], None]
@@ -135,7 +137,9 @@ class Analysis:
                 "nothing moves by more than five times its noise over a horizon of "
                 f"{horizon:g} s: record larger or faster motion, or lengthen --horizon"
             )
-        self.slack = velocity_slack(fit, dt / machine.substeps)
+        self.step = dt / machine.substeps
+        self.slack = velocity_slack(fit, self.step)
+        self.dropped: set[str] = set()  # found, and then found to say nothing
         self.bounds = bounds_of(space, layout)
         count = len(self.fit_windows)
         self.group = np.arange(count) * min(_BLOCKS, count) // count
@@ -223,7 +227,7 @@ class Analysis:
         return [
             Candidate(p, s)
             for p in (*self.places, *self.ripples)
-            if p.key not in keys
+            if p.key not in keys and p.key not in self.dropped
             for s in p.starts[: 1 if p.effect == "torque_ripple" else None]
         ]
 
@@ -303,11 +307,49 @@ class Analysis:
             x[stuck] = self.predictor.neutral[stuck]
             model = self.select(self.selector.fit(model.places, x))
         model, rivals = self.exchanged(model)
-        idle = [p for p in model.places if self._idle(model, p)]
-        if idle:
-            model = self._rid_of(model, idle)
+        notes: list[str] = []
+        for _ in range(_MOST):
+            needless = self._needless(model)
+            if not needless:
+                break
+            for place, why in needless:
+                self.tell(f"- {place.key}: {why}")
+            brief = [p for p, _ in needless if self._brief(model, p)]
+            notes += [self._of_a_step(p) for p in brief]
+            self.dropped |= {p.key for p in brief}
+            model = self._rid_of(model, [p for p, _ in needless])
             model, rivals = self.exchanged(model)
-        return self.measured(base, model, rivals, began)
+        return self.measured(base, model, rivals, began, notes)
+
+    def _needless(self, model: Model) -> list[tuple[Place, str]]:
+        """Effects that were found and say nothing of the machine, with the reason."""
+        out = []
+        for place in model.places:
+            if self._idle(model, place):
+                out.append((place, "fitted to nothing"))
+            elif self._brief(model, place):
+                out.append((place, "less than a physics step"))
+        return out
+
+    def _brief(self, model: Model, place: Place) -> bool:
+        """Whether an effect is a shift in time that the model's own steps may make.
+
+        A semi-implicit step lets a command act half a step early, beside a machine, or
+        a simulation of smaller steps, where it acts when it comes.
+        """
+        if place.effect not in _SHIFTS:
+            return False
+        at = int(self.selector.columns(place, fitted=False)[0])
+        value = place.columns[0].of * float(model.fit.x[at])
+        return value < _OWN_SHIFT * self.step
+
+    def _of_a_step(self, place: Place) -> str:
+        return (
+            f"{place.key}: what looked like it is shorter than the model's physics "
+            f"step of {1000 * self.step:.3g} ms, which shifts commands by half of "
+            "itself; not named. With a smaller timestep in the model the data could "
+            "tell."
+        )
 
     def _idle(self, model: Model, place: Place) -> bool:
         """Whether an effect was fitted to nothing: predictions are as without it."""
@@ -322,7 +364,6 @@ class Analysis:
         kept = [p for p in model.places if p not in idle]
         x = model.fit.x
         for place in idle:
-            self.tell(f"- {place.key}: fitted to nothing")
             x = self.selector.without(x, place, kept)
         self.whiten(x)
         return self.selector.fit(kept, x)
@@ -439,6 +480,7 @@ class Analysis:
         model: Model,
         rivals: Mapping[str, Sequence[Model]],
         began: float,
+        notes: Sequence[str] = (),
     ) -> Outcome:
         """Looks at the held-out data, once."""
         scale = self.channels.scale
@@ -481,7 +523,7 @@ class Analysis:
             gap = figures.gap
         goal = GOAL * floor_gap
         fitted = float(base.gap.mean()) ** 0.5 / self.fit_floor
-        notes = []
+        notes = list(notes)
         if refit.gap <= goal and not (found and fitted > _CLEAR):
             verdict = "no_gap"
         elif found and after.interval[1] <= goal:

@@ -129,6 +129,37 @@ def table_text(shown: str) -> str:
     return re.sub(r"\s*│\s*", " | ", shown)
 
 
+COARSE = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+<body><joint name="hinge" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.44" size="0.02" mass="0.83"/></body>
+</worldbody><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
+
+
+def test_what_the_models_own_steps_shift_is_no_delay(tmp_path: Path) -> None:
+    """A model of 2 ms, beside a machine without any delay that knows no steps."""
+    (tmp_path / "model.xml").write_text(COARSE)
+    machine = mujoco.MjModel.from_xml_string(COARSE)
+    machine.opt.timestep = 1e-4
+    for run in range(3):
+        rng = np.random.default_rng(run)
+        data = mujoco.MjData(machine)
+        lines = ["time,qpos.hinge,ctrl.motor"]
+        for row in range(600):
+            if row % 15 == 0:
+                data.ctrl[0] = rng.uniform(-1.5, 1.5)
+            seen = data.qpos[0] + rng.normal(0, 1e-4)
+            lines.append(f"{0.01 * row:.4f},{seen:.9g},{data.ctrl[0]:.9g}")
+            mujoco.mj_step(machine, data, 100)
+        (tmp_path / f"run{run}.csv").write_text("\n".join([*lines, ""]))
+    logs = sorted(tmp_path.glob("run*.csv"))
+    out = tmp_path / "out"
+    command(gap, "--model", tmp_path / "model.xml", "--data", *logs, "--out", out)
+    told = read(out / "gap.json")
+    assert told["effects"] == []
+    assert any("shorter than the model's physics step" in n for n in told["notes"])
+    assert read_plain(out / "effects.yaml")["effects"] == []
+
+
 def test_retraining_too_short_to_train_is_told_at_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
