@@ -24,12 +24,13 @@ from easi_jax.gap.evidence import (
     rank,
     simplest,
 )
-from easi_jax.gap.fit import bounds_of, window_weights
+from easi_jax.gap.fit import Bounds, bounds_of, window_weights
 from easi_jax.gap.journal import key_of
 from easi_jax.gap.layout import Layout
 from easi_jax.gap.models import Candidate, Model
 from easi_jax.gap.numbers import Numbers
 from easi_jax.gap.outcome import Figures, Found, Outcome
+from easi_jax.gap.own_steps import error_of_steps, within_a_step
 from easi_jax.gap.places import places, ripples
 from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.residuals import (
@@ -60,8 +61,9 @@ _ROUNDING = 0.005  # of the gap
 _CLEAR = 1.5  # times the floor: a gap that fits see without doubt
 _BEAM = 3  # sets of effects that are followed
 _NOTHING = 1e-3  # of the largest error: a change that shows nowhere
-_SHIFTS = ("actuator_delay", "actuator_lag", "sensor_delay")
-_OWN_SHIFT = 0.75  # of a physics step: less may be the steps' own doing
+_STEPS_SEEN = 0.5  # of the floor: less is lost in noise (it adds a tenth)
+_WHOLE = 1.15  # of the error of steps; a finer simulation leaves some of it
+_TOLD = 0.8  # of the gap without the own steps' error: worth a note
 _DRAWS = 8  # of the noise of each held-out window
 
 Tell = Callable[[str], None]
@@ -183,9 +185,11 @@ class Analysis:
     def whiten(self, x: np.ndarray) -> None:
         """Renews the noise model of the fit at a vector."""
         chosen = self.selector
-        slope = start_sensitivity(self.predictor, x, self.start_noise, self.fit_blocks)
+        slope = start_sensitivity(
+            self.predictor, chosen.plain(x), self.start_noise, self.fit_blocks
+        )
         slope = slope[:, : chosen.count]
-        errors = self.predictor.errors(x[None], self.fit_blocks)[0][: chosen.count]
+        errors = chosen.errors(x[None])[0]
         rms = np.sqrt(np.mean(errors.astype(float) ** 2, (0, 1)))
         chosen.residuals = make_residuals(
             self.fit_windows,
@@ -210,11 +214,34 @@ class Analysis:
         position = np.maximum(1e-3 * self.scales.position, self.noise)
         return np.concatenate([position, speed])
 
+    def watch_steps(self) -> None:
+        """Lets fits see what the model's own steps do, where that can be seen.
+
+        Data of a machine have no such error and those of a simulation of the same step
+        have all of it, so its share is fitted like the model's own parameters.
+        """
+        windows, count = self.predictor.windows, len(self.fit_windows)
+        error = error_of_steps(self.m, windows, self.predictor.machine.dt)
+        mine = measure.squares(error[:count]).mean(0)
+        size = float(measure.gap(mine, self.channels.scale))
+        if size < _STEPS_SEEN * self.fit_floor:
+            return
+        first = len(self.fit_blocks) * BLOCK
+        self.selector.steps, self.held_steps = error[:count], error[first:]
+        b = self.bounds
+        self.selector.bounds = Bounds(
+            np.r_[b.low, 0.0], np.r_[b.high, _WHOLE], np.r_[b.size, 0.1]
+        )
+        self.tell(
+            f"the model's physics step of {1000 * self.step:.3g} ms makes an error of "
+            f"{size / self.fit_floor:.2g} times the noise, which is not held against it"
+        )
+
     def refit(self, own: Sequence[int]) -> Model:
         """The model as given, whitened there, with some of its own parameters
         refitted."""
         self.selector.own = tuple(own)
-        model = self.selector.fit([], self.predictor.neutral)
+        model = self.selector.fit([], self.selector.neutral)
         if own:
             self.whiten(model.fit.x)
             self.selector.weight = window_weights(model.fit.residual)
@@ -231,9 +258,13 @@ class Analysis:
             for s in p.starts[: 1 if p.effect == "torque_ripple" else None]
         ]
 
-    def figures(self, x: np.ndarray) -> Figures:
-        """Held-out gap at a vector."""
+    def figures(self, x: np.ndarray, judged: bool = False) -> Figures:
+        """Held-out gap at a vector; ``judged``: without the own steps' share."""
+        chosen = self.selector
+        share, x = x[len(self.predictor.neutral) :], chosen.plain(x)
         errors = self.predictor.errors(x[None], self.held_blocks)[0][: len(self.held)]
+        if judged and len(share):
+            errors -= share[0] * self.held_steps
         square = measure.squares(errors)
         scale = self.channels.scale
         rows = self.predictor.rows(x, self.held)
@@ -251,7 +282,7 @@ class Analysis:
 
         Noise is drawn for starts and targets and pushed through the model.
         """
-        rng = np.random.default_rng(0)
+        x, rng = self.selector.plain(x), np.random.default_rng(0)
         offsets, targets = measure.drawn_noise(
             self.held, self.runs, self.noise, self.predictor.steps, _DRAWS, rng
         )
@@ -270,7 +301,7 @@ class Analysis:
 
         ``kept``: the held-out figures at ``x``; ``floor``: the gap of a perfect model.
         """
-        count = len(self.fit_windows)
+        count, x = len(self.fit_windows), self.selector.plain(x)
         fitted = self.predictor.errors(x[None], self.fit_blocks)[0][:count]
         square = np.concatenate([measure.squares(fitted), kept.square])
         run = np.concatenate([self.fit_windows.run, self.held.run])
@@ -289,6 +320,7 @@ class Analysis:
         own = list(range(self.space.size))
         self.tell("compiling the predictions ...")
         self.whiten(self.predictor.neutral)
+        self.watch_steps()
         self.tell(
             f"gap {self.fit_gap:.3g} on the fitting data, noise floor "
             f"{self.fit_floor:.2g}"
@@ -304,7 +336,7 @@ class Analysis:
                 break
             base = self._undone(base, stuck)
             x = model.fit.x.copy()
-            x[stuck] = self.predictor.neutral[stuck]
+            x[stuck] = self.selector.neutral[stuck]
             model = self.select(self.selector.fit(model.places, x))
         model, rivals = self.exchanged(model)
         notes: list[str] = []
@@ -332,16 +364,11 @@ class Analysis:
         return out
 
     def _brief(self, model: Model, place: Place) -> bool:
-        """Whether an effect is a shift in time that the model's own steps may make.
-
-        A semi-implicit step lets a command act half a step early, beside a machine, or
-        a simulation of smaller steps, where it acts when it comes.
-        """
-        if place.effect not in _SHIFTS:
-            return False
-        at = int(self.selector.columns(place, fitted=False)[0])
-        value = place.columns[0].of * float(model.fit.x[at])
-        return value < _OWN_SHIFT * self.step
+        return within_a_step(
+            place,
+            float(model.fit.x[self.selector.columns(place, fitted=False)[0]]),
+            self.step,
+        )
 
     def _of_a_step(self, place: Place) -> str:
         return (
@@ -355,9 +382,8 @@ class Analysis:
         """Whether an effect was fitted to nothing: predictions are as without it."""
         kept = [p for p in model.places if p is not place]
         x = self.selector.without(model.fit.x, place, kept)
-        mine, other = self.predictor.errors(
-            np.stack([model.fit.x, x]), self.fit_blocks
-        ).astype(float)
+        both = self.selector.errors(np.stack([model.fit.x, x]))
+        mine, other = both.astype(float)
         return float(np.abs(mine - other).max()) < _NOTHING * np.abs(mine).max()
 
     def _rid_of(self, model: Model, idle: Sequence[Place]) -> Model:
@@ -378,7 +404,7 @@ class Analysis:
         self.tell(f"{names}: refitted to a bound, so undone")
         for i in stuck:
             self._offer(self.space.parameters[i].addresses)
-        self.whiten(self.predictor.neutral)
+        self.whiten(self.selector.neutral)
         return self.refit([i for i in base.own if i not in stuck])
 
     def _at_bound(self, x: np.ndarray, i: int) -> bool:
@@ -491,36 +517,39 @@ class Analysis:
         floor_gap = float(measure.gap(floor, scale))
         found = []
         numbers = Numbers(self.selector, model)
-        gap = refit.gap  # that the effects before it leave
+        # What follows is judged without the error of the model's own steps.
+        fair = [self.figures(m.fit.x, judged=True) for m in (base, model)]
+        gap = fair[0].gap  # that the effects before it leave
         for k, place in enumerate(model.places):
             part = model.places[: k + 1]
             if k + 1 == len(model.places):
-                figures = after
+                figures, left = after, fair[1]
             else:
                 x = model.fit.x
                 for other in model.places[k + 1 :]:
                     x = self.selector.without(x, other, part)
-                figures = self.figures(self.selector.fit(part, x).fit.x)
+                x = self.selector.fit(part, x).fit.x
+                figures, left = self.figures(x), self.figures(x, judged=True)
             mine = _last(model, place)
             odds = 0.0
             same = []
             for rival in rivals[place.key][:_RIVALS]:
                 p = probability(mine, rival)
                 odds += (1 - p) / max(p, 1e-6)
-                theirs = self.figures(rival.fit.x)
-                if self._as_good(after, theirs):
+                theirs = self.figures(rival.fit.x, judged=True)
+                if self._as_good(fair[1], theirs):
                     same.append(rival.places[-1].key)
             found.append(
                 Found(
                     place,
                     numbers.values(place),
-                    explained(gap, after.gap, floor_gap) / (1.0 + odds),
+                    explained(gap, fair[1].gap, floor_gap) / (1.0 + odds),
                     same,
                     figures.gap,
                     numbers.deviations(place),
                 )
             )
-            gap = figures.gap
+            gap = left.gap
         goal = GOAL * floor_gap
         fitted = float(base.gap.mean()) ** 0.5 / self.fit_floor
         notes = list(notes)
@@ -536,7 +565,7 @@ class Analysis:
                 f"data alone, which the model misses by {fitted:.3g} times their "
                 "noise; hold out other runs to see it confirmed"
             )
-        if found and after.gap >= refit.gap:
+        if found and fair[1].gap >= fair[0].gap:
             names = ", ".join(f.place.key for f in found)
             notes.append(
                 f"{names}: seen in the fitting data, but the held-out data are "
@@ -544,11 +573,19 @@ class Analysis:
                 "differ, or are too few"
             )
             verdict = "no_gap" if refit.gap <= goal else "unexplained"
-            found, after = [], refit
+            found, after, fair[1] = [], refit, fair[0]
         if verdict == "no_gap":
             found = []
             after = refit
+            fair[1] = fair[0]
         x = model.fit.x if found else base.fit.x
+        if fair[1].gap < _TOLD * after.gap:
+            notes.append(
+                f"the model's physics step of {1000 * self.step:.3g} ms makes much of "
+                f"the gap itself: {after.gap:.3g} would be {fair[1].gap:.3g} without "
+                "its error; a smaller timestep in the model takes it away"
+            )
+        x = self.selector.plain(x)
         return Outcome(
             verdict=verdict,
             found=found,
@@ -563,7 +600,7 @@ class Analysis:
             channels=self.channels,
             held=self.held,
             x=x,
-            active=model.fit.active.tolist(),
+            active=[i for i in model.fit.active.tolist() if i < len(x)],
             notes=notes,
             disagreeing=self.disagreeing(x, after, floor_gap),
             seconds=time.perf_counter() - began,

@@ -41,6 +41,9 @@ class Selector:
     Its ``residuals`` have to be set before it fits, and ``floor``, the gap of a perfect
     model, before it chooses. ``journal`` keeps what takes long.
 
+    ``steps``, where set, is an error of all predictions ``(count, H, nv)`` of which a
+    share is nobody's fault. That share is one number more at the end of the vectors.
+
     Args:
         predictor: predictions.
         blocks: blocks of windows that are fitted.
@@ -68,11 +71,28 @@ class Selector:
         self.blocks, self.count, self.bounds = blocks, count, bounds
         self.group, self.own = group, tuple(own)
         self.weight = np.ones(count)
+        self.steps: np.ndarray | None = None
+
+    @property
+    def neutral(self) -> np.ndarray:
+        """The vector of the model as given."""
+        more = [] if self.steps is None else [0.0]
+        return np.r_[self.predictor.neutral, more]
+
+    def plain(self, x: np.ndarray) -> np.ndarray:
+        """Vectors without the share."""
+        return x[..., : len(self.predictor.neutral)]
+
+    def errors(self, x: np.ndarray) -> np.ndarray:
+        """Errors of the fitted windows under vectors ``(B, n)``, ``(B, W, H, nv)``."""
+        found = self.predictor.errors(self.plain(x), self.blocks)[:, : self.count]
+        if self.steps is not None:
+            found -= x[:, -1, None, None, None] * self.steps
+        return found
 
     def simulate(self, x: np.ndarray) -> np.ndarray:
         """Whitened errors ``(B, W, m)`` of vectors ``(B, n)``."""
-        errors = self.predictor.errors(x, self.blocks)[:, : self.count]
-        return self.residuals.whitened(self.residuals.grouped(errors))
+        return self.residuals.whitened(self.residuals.grouped(self.errors(x)))
 
     def columns(self, place: Place, fitted: bool = True) -> np.ndarray:
         """Entries of the whole vector that belong to a place."""
@@ -82,7 +102,8 @@ class Selector:
     def active(self, places: Sequence[Place]) -> list[int]:
         """Entries that a fit of these effects moves."""
         found = [int(i) for p in places for i in self.columns(p)]
-        return sorted({*self.own, *found})
+        share = [] if self.steps is None else [len(self.predictor.neutral)]
+        return sorted({*self.own, *found, *share})
 
     def started(self, x: np.ndarray, candidate: Candidate) -> np.ndarray:
         """A vector with a candidate at its starting values."""

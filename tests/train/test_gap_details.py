@@ -135,29 +135,35 @@ COARSE = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbo
 </worldbody><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
 
 
-def test_what_the_models_own_steps_shift_is_no_delay(tmp_path: Path) -> None:
-    """A model of 2 ms, beside a machine without any delay that knows no steps."""
+@pytest.mark.parametrize("steps", [100, 5], ids=["machine", "simulation"])
+def test_what_the_models_own_steps_do_is_no_effect(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], steps: int
+) -> None:
+    """A model of 2 ms, beside what takes smaller steps, or the same."""
     (tmp_path / "model.xml").write_text(COARSE)
     machine = mujoco.MjModel.from_xml_string(COARSE)
-    machine.opt.timestep = 1e-4
+    machine.opt.timestep = 0.01 / steps
     for run in range(3):
         rng = np.random.default_rng(run)
+        rates, phases = rng.uniform(1.0, 12.0, 6), rng.uniform(0, 6.3, 6)
         data = mujoco.MjData(machine)
         lines = ["time,qpos.hinge,ctrl.motor"]
         for row in range(600):
-            if row % 15 == 0:
-                data.ctrl[0] = rng.uniform(-1.5, 1.5)
+            at = 0.01 * row
+            data.ctrl[0] = 0.5 * np.sin(rates * at + phases).sum()
             seen = data.qpos[0] + rng.normal(0, 1e-4)
-            lines.append(f"{0.01 * row:.4f},{seen:.9g},{data.ctrl[0]:.9g}")
-            mujoco.mj_step(machine, data, 100)
+            lines.append(f"{at:.4f},{seen:.9g},{data.ctrl[0]:.9g}")
+            mujoco.mj_step(machine, data, steps)
         (tmp_path / f"run{run}.csv").write_text("\n".join([*lines, ""]))
     logs = sorted(tmp_path.glob("run*.csv"))
     out = tmp_path / "out"
     command(gap, "--model", tmp_path / "model.xml", "--data", *logs, "--out", out)
     told = read(out / "gap.json")
     assert told["effects"] == []
-    assert any("shorter than the model's physics step" in n for n in told["notes"])
     assert read_plain(out / "effects.yaml")["effects"] == []
+    assert "physics step of 2 ms makes an error of" in capsys.readouterr().out
+    noted = [n for n in told["notes"] if "physics step of 2 ms" in n]
+    assert len(noted) == (steps > 5)
 
 
 def test_retraining_too_short_to_train_is_told_at_once(

@@ -1,5 +1,6 @@
 """Fits, noise floors and whitening on problems whose answers are known."""
 
+import copy
 from dataclasses import replace
 
 import mujoco
@@ -27,6 +28,7 @@ from easi_jax.gap.fit import (
 from easi_jax.gap.layout import Layout
 from easi_jax.gap.models import Candidate, Model
 from easi_jax.gap.outcome import for_people
+from easi_jax.gap.own_steps import error_of_steps, within_a_step
 from easi_jax.gap.places import places, ripples
 from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.residuals import make_residuals, start_sensitivity, step_groups
@@ -36,7 +38,7 @@ from easi_jax.gap.table import EFFECTS, Place
 from easi_jax.gap.velocities import velocity_lags
 from easi_jax.gap.window_set import window_set
 from easi_jax.parameters import ParameterSpace
-from easi_jax.recording import Run
+from easi_jax.recording import Run, physics_steps
 from easi_jax.windows import fitted_velocity
 
 PENDULUM = """
@@ -367,6 +369,41 @@ def test_what_is_not_finite_loses(model: mujoco.MjModel, runs: list[Run]) -> Non
     lost = selector.model([], fit)
     assert lost.loss.shape == lost.gap.shape == (5,)
     assert np.isinf(lost.loss).all() and np.isinf(lost.gap).all()
+
+
+def test_the_error_of_steps_is_what_smaller_ones_take_away(
+    model: mujoco.MjModel, runs: list[Run]
+) -> None:
+    windows = window_set(runs, 0.2, 0.03)
+    assert windows is not None
+    error = error_of_steps(model, windows, DT)
+    own, fine = copy.deepcopy(model), copy.deepcopy(model)
+    parts = physics_steps(DT, model.opt.timestep)
+    own.opt.timestep, fine.opt.timestep = DT / parts, DT / (8 * parts)
+    at = 7
+    ends = []
+    for m in (own, fine):
+        d = mujoco.MjData(m)
+        d.qpos = windows.start_qpos[at]
+        d.qvel = fitted_velocity(runs[windows.run[at]].qpos, DT, runs[0].configuration)[
+            windows.row[at]
+        ]
+        for u in windows.ctrl[at]:
+            d.ctrl = u
+            mujoco.mj_step(m, d, round(DT / m.opt.timestep))
+        ends.append(d.qpos.copy())
+    assert np.abs(error[at, -1]).max() > 1e-6
+    np.testing.assert_allclose(error[at, -1], ends[0] - ends[1], atol=1e-12)
+
+
+def test_shifts_shorter_than_a_physics_step(
+    model: mujoco.MjModel, runs: list[Run]
+) -> None:
+    every = {p.effect: p for p in places(model, scales_of(model, runs))}
+    delay, step = every["actuator_delay"], 0.002
+    assert within_a_step(delay, 0.7 * step / delay.columns[0].of, step)
+    assert not within_a_step(delay, 0.8 * step / delay.columns[0].of, step)
+    assert not within_a_step(every["viscous_damping"], 1e-4, step)
 
 
 def test_rare_effects_have_to_help_by_either_measure(
