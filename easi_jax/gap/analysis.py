@@ -487,7 +487,11 @@ class Analysis:
                 mine = _last(model, place)
                 for rival in rivals[place.key][:_RIVALS]:
                     p = probability(mine, rival)
-                    close = rank(rival) <= (1 + HELPS) * rank(mine)
+                    most = 1 + HELPS
+                    if _body_for_joint(place, rival.places[-1]):
+                        # Its three numbers do what one does, where there is one joint.
+                        most = 1 / most
+                    close = rank(rival) <= most * rank(mine)
                     if p < _UNLIKELY and close and _keys(rival) not in seen:
                         swaps.append((p, place, rival))
             if not swaps:
@@ -616,6 +620,11 @@ class Analysis:
         )
         # Twins differ by rounding alone.
         return bool(np.quantile(d, 0.025) <= _ROUNDING * mine.gap)
+
+
+def _body_for_joint(old: Place, new: Place) -> bool:
+    """Whether one effect would move from a joint to a body."""
+    return old.effect == new.effect and (old.kind, new.kind) == ("joint", "body")
 
 
 def _keys(model: Model) -> frozenset[str]:
