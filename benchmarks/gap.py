@@ -30,6 +30,8 @@ class Config:
     """First seed, and the one after the last."""
     cheap: bool = False
     """Mechanisms of one or two joints; without it those of three and six, and a leg."""
+    coarse: bool = False
+    """Models whose own physics step is seen in the gap; give --out gap_coarse.jsonl."""
     out: Path = RESULTS / "gap_cases.jsonl"
     """Where a line for each case is added."""
 
@@ -53,7 +55,12 @@ def run(config: Config) -> None:
             try:
                 mechanism = "" if config.cheap else LARGE[seed % len(LARGE)]
                 draw_case(
-                    seed, config.kind, data, cheap=config.cheap, mechanism=mechanism
+                    seed,
+                    config.kind,
+                    data,
+                    cheap=config.cheap,
+                    mechanism=mechanism,
+                    coarse=config.coarse,
                 )
             except CaseError as error:
                 say(f"{config.kind} {seed}: no case ({error})")

@@ -90,7 +90,25 @@ def generated(folder: Path) -> list[str]:
         "![What each true effect was named](gap_confusion.svg)",
         "The counts are in `gap_confusion.json`.",
     ]
-    return out
+    return out + coarse(folder)
+
+
+def coarse(folder: Path) -> list[str]:
+    """Cases whose model is off by its own timestep."""
+    rows = read_cases(folder / "gap_coarse.jsonl")
+    if not rows:
+        return []
+    lines = []
+    for name, (hits, count) in shares(rows).items():
+        if count:
+            low, high = wilson(hits, count)
+            lines.append((name, f"{hits} of {count}", f"{low:.0%} to {high:.0%}"))
+    return [
+        "Models whose own physics step and start velocities make a gap of 1.3 to 4 "
+        "floors where nothing is missing (`python -m benchmarks.gap --coarse --cheap "
+        "--out benchmarks/results/gap_coarse.jsonl`):",
+        markdown_table(("what", "cases", "95 % (Wilson)"), lines),
+    ]
 
 
 def figures(folder: Path) -> dict[str, str]:

@@ -28,6 +28,8 @@ from tests.gap_cases.settings import Setting, settle
 
 PERFECT = 1.1
 """Most that the owner's model may be off in a machine without effects, in floors."""
+COARSE = (1.3, 4.0)
+"""What it is off by in a coarse case, in floors: its own timestep shows."""
 REACHABLE = 1.15
 """Above this share of the floor a perfect model may not count as one."""
 
@@ -64,27 +66,32 @@ def make_case(
     stated: Stated | None = None,
     wrong_own: bool = False,
     kind: str = "",
+    coarse: bool = False,
 ) -> Case:
     """Write a case into `out_dir`.
 
     Effects that come with their main parameter keep it; the others are sized until the
     gap is between `LEAST` and `MOST` times the floor. With `wrong_own` the model's own
-    numbers are wrong instead. Raises CaseError where this cannot be had.
+    numbers are wrong instead. A `coarse` case is one whose model is off by its own
+    timestep and velocity fits. Raises CaseError where this cannot be had.
     """
     for effect in effects:
         if effect.name not in strengths.SIZERS:
             raise ValueError(f"unknown effect {effect.name!r}")
     machine = build_machine(seed, mechanism, stated or Stated())
     rngs = _streams(seed, mechanism)
-    setting = settle(machine, rngs[1])
+    setting = settle(machine, rngs[1], coarse)
     trial = Trial(setting, seed)
     context = setting.context
     perfect = trial.gap(trial.logs(setting.plans, [], {}), quick=True).ratio
-    if perfect > PERFECT:
+    least, most = COARSE if coarse else (0.0, PERFECT)
+    if not least <= perfect <= most:
         raise CaseError(f"a perfect model is at {perfect:.2f} floors")
     chosen = [strengths.filled(effect, rngs[2], context) for effect in effects]
     own: dict[str, float] = {}
     target = rngs[3].uniform(np.log(3.4), np.log(12.0 if len(chosen) < 2 else 7.0))
+    if coarse:
+        target = max(target, np.log(2.0 * perfect))
     sizing = [i for i, e in enumerate(effects) if not given(e, chosen[i], context)]
     for index in sizing:
         alternative = stronger(chosen, index, context)
@@ -95,7 +102,7 @@ def make_case(
         own = alternative(trial.search(alternative, float(np.exp(target))))[1]
     logs = trial.logs(setting.plans, chosen, own)
     gap = trial.gap(logs, chosen, own)
-    if not chosen and not wrong_own and gap.ratio > PERFECT:
+    if not chosen and not wrong_own and gap.ratio > most:
         raise CaseError(f"a perfect model is at {gap.ratio:.2f} floors")
     if (sizing or wrong_own) and not LEAST <= gap.ratio <= MOST:
         raise CaseError(f"over all runs the gap is {gap.ratio:.2f} floors")

@@ -76,10 +76,12 @@ def draw_case(
     cheap: bool = False,
     effect: str = "",
     mechanism: str = "",
+    coarse: bool = False,
 ) -> Case:
     """Write a random case of `kind` into `out_dir`, the same for the same arguments.
 
-    `cheap` keeps to one or two joints; `effect` and `mechanism` fix what is drawn.
+    `cheap` keeps to one or two joints; `effect` and `mechanism` fix what is drawn;
+    `coarse`: see `make_case`.
     """
     if kind not in CASE_KINDS:
         raise ValueError(f"unknown kind {kind!r}; choose from {CASE_KINDS}")
@@ -103,6 +105,7 @@ def draw_case(
                 stated=stated,
                 wrong_own=kind == "wrong_own",
                 kind=kind,
+                coarse=coarse,
             )
         except CaseError as error:
             reason = f"{name} with {names}: {error}"

@@ -87,11 +87,13 @@ def _context(mechanism: Mechanism, log: Log, fine: float) -> Context:
     )
 
 
-def settle(mechanism: Mechanism, rng: np.random.Generator) -> Setting:
+def settle(
+    mechanism: Mechanism, rng: np.random.Generator, coarse: bool = False
+) -> Setting:
     """Runs and noise under which a perfect model's gap is close to its floor.
 
     Where the owner's timestep and the velocity fits leave more than `EXCESS`, the
-    timestep is halved, the noise raised or the motion slowed.
+    timestep is halved, the noise raised or the motion slowed; not where ``coarse``.
     """
     cheap = len(mechanism.joints) < 3
     fine = 2.5e-4 if cheap and rng.random() < 1 / 3 else 5e-4
@@ -119,7 +121,7 @@ def settle(mechanism: Mechanism, rng: np.random.Generator) -> Setting:
                 mechanism = mechanism.calmer(0.75)
                 continue
         needed = _needed(mechanism, logs, std)
-        if needed <= std:
+        if needed <= std or coarse:
             break
         if mechanism.timestep > 1.5e-3 and (needed > NOISE[1] or rng.random() < 0.5):
             mechanism = mechanism.with_timestep(mechanism.timestep / 2)

@@ -424,6 +424,14 @@ def test_a_perfect_model_is_at_its_floor(mechanism: str, tmp_path: Path) -> None
     assert answer["verdicts"] == ["no_gap"]
 
 
+def test_a_coarse_model_is_off_by_its_own_steps(tmp_path: Path) -> None:
+    case = draw_case(0, "none", tmp_path, cheap=True, coarse=True)
+    answer = json.loads((tmp_path / "answer.json").read_text())
+    assert 1.3 < case.gap.ratio < 4.0 and not case.effects
+    setting = answer["setting"]
+    assert setting["timestep"] == setting["drawn_timestep"] > setting["truth_step"]
+
+
 def test_wrong_own_numbers_stay_within_their_factors(tmp_path: Path) -> None:
     draw_case(0, "wrong_own", tmp_path, mechanism="pendulum")
     answer = read_case(tmp_path)[2]
