@@ -156,12 +156,12 @@ def machine(folder: Path) -> None:
             lines.append(f"{at:.4f},{seen[0]:.9g},{seen[1]:.9g},{command:.9g}")
             if run == 0:
                 ros.joints(at, ["cart", "pole_hinge"], seen)
-                ros.joints(at, ["cart"], [command], topic="/joint_command")
+                ros.array(at, [command])
             data.ctrl[0] = command
             mujoco.mj_step(model, data, every)
         (folder / f"run{run + 1}.csv").write_text("\n".join(lines))
     ros.write(folder / "bag")
-    (folder / "names.yaml").write_text("joints: {pole_hinge: pole}\n")
+    (folder / "names.yaml").write_text("joints: {pole_hinge: pole}\nactuators: [cart]\n")
     (folder / "hidden.yaml").write_text(HIDDEN)
     (folder / "my_env.py").write_text(
         "from envs.cartpole import Cartpole\n\n\nclass Mine(Cartpole):\n    pass\n"
