@@ -29,6 +29,9 @@ _AGREES = 0.1
 _ODD = 20.0  # times the noise
 _ODD_ALONE = 3.0  # times the largest of the others
 _USUAL = 98.0  # percentile of steps that is no leap
+_FEWEST = 5  # rows between two leaps, of which a velocity can be told
+_WILD = 10.0  # times the usual readings
+_RETURNS = 0.1  # of a spike, which the reading after it is off at most
 _ODD_ROWS = 3  # left out at either end, at most
 _ODD_MINIMUM = 30  # rows of a run that can tell
 _SCALAR = Configuration(1, 1, (0,), (0,), ())
@@ -96,7 +99,11 @@ def _resolution(x: np.ndarray) -> np.ndarray:
     out = np.zeros(x.shape[1])
     for i, column in enumerate(x.T):
         gaps = np.asarray(np.diff(np.unique(column)), float)
-        gaps = gaps[gaps > _JITTER * max(float(np.abs(column).max()), 1e-300)]
+        size = np.abs(column)
+        largest, usual = float(size.max()), float(np.percentile(size, _USUAL))
+        if 0.0 < usual < largest / _WILD:  # wild readings
+            largest = usual
+        gaps = gaps[gaps > _JITTER * max(largest, 1e-300)]
         out[i] = gaps.min() if gaps.size else 0.0
     return out
 
@@ -162,7 +169,9 @@ def split_at_resets(
     """Runs cut where a position leaps from one row to the next, as in a reset.
 
     A leap lies far outside of the steps before and after it, which neither motion nor
-    an impact does: the positions of an impact still follow from each other.
+    an impact does: the positions of an impact still follow from each other. Rows with a
+    wild velocity are left out as well: one that the next row takes back, and that the
+    positions know nothing of. Velocities that were derived are derived again.
 
     Args:
         noise: of positions and velocities, ``(2 nv,)``.
@@ -174,26 +183,37 @@ def split_at_resets(
     for run in runs:
         at = _leaps(run, noise)
         pieces = np.split(np.arange(len(run)), at + 1)
-        whole = [p for p in pieces if len(p) >= 2]
+        whole = [p for p in pieces if len(p) >= _FEWEST]
         if not len(at) or not whole:
             out.append(run)
             continue
         cut.append(f"{run.name} at {', '.join(f'{t:.6g} s' for t in run.time[at[:3]])}")
         cut[-1] += ", ..." if len(at) > 3 else ""
+        derived = _derived(run)
         for k, p in enumerate(whole, 1):
             part = rows_of(run, int(p[0]), int(p[-1]) + 1)
+            if derived.any():
+                speed = fitted_velocity(part.qpos, part.dt, part.configuration)
+                part = replace(part, qvel=np.where(derived, speed, part.qvel))
             name = f"{run.name}/{k}" if len(whole) > 1 else run.name
             out.append(replace(part, name=name))
     if not cut:
         return out, []
     return out, [
-        "positions leap from one row to the next (a reset, or a bad reading), so runs "
+        "readings leap from one row to the next (a reset, or a bad reading), so runs "
         f"were cut there: {'; '.join(cut)}"
     ]
 
 
+def _derived(run: Run) -> np.ndarray:
+    """Which velocities were derived from the positions, ``(nv,)``."""
+    if run.qvel_measured:
+        return np.zeros(run.qvel.shape[1], bool)
+    return (run.qvel == fitted_velocity(run.qpos, run.dt, run.configuration)).all(0)
+
+
 def _leaps(run: Run, noise: np.ndarray) -> np.ndarray:
-    """Rows after which a position leaps."""
+    """Rows after which a position leaps, or a velocity to and fro."""
     if len(run) < _ODD_MINIMUM:
         return np.zeros(0, int)
     scalar = list(run.configuration.scalar_qvel)
@@ -203,7 +223,21 @@ def _leaps(run: Run, noise: np.ndarray) -> np.ndarray:
     beyond = np.maximum(step[1:-1] - high, low - step[1:-1])
     usual = np.percentile(np.abs(step), _USUAL, axis=0)
     limit = np.maximum(_ODD * math.sqrt(6.0) * noise[scalar], _ODD_ALONE * usual)
-    return np.flatnonzero((beyond > limit).any(1)) + 1
+    leaps = np.flatnonzero((beyond > limit).any(1)) + 1
+    spikes = _spikes(run, noise[run.qvel.shape[1] :])
+    return np.union1d(leaps, np.union1d(spikes - 1, spikes))
+
+
+def _spikes(run: Run, noise: np.ndarray) -> np.ndarray:
+    """Rows whose measured velocity stands apart; ``noise (nv,)`` of velocities."""
+    step = np.diff(run.qvel, axis=0)
+    there, back = step[:-1], step[1:]
+    usual = np.percentile(np.abs(step), _USUAL, axis=0)
+    limit = np.maximum(_ODD * math.sqrt(6.0) * noise, _ODD_ALONE * usual)
+    moved = run.configuration.difference(run.qpos[:-2], run.qpos[2:]) / (2 * run.dt)
+    off = np.abs(run.qvel[1:-1] - moved)
+    odd = (np.abs(there) > limit) & (np.abs(there + back) < _RETURNS * np.abs(there))
+    return np.flatnonzero((odd & (off > 0.5 * np.abs(there))).any(1)) + 1
 
 
 def to_common_step(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:

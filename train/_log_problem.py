@@ -10,6 +10,7 @@ from train._effects import found_in, read_given
 
 HORIZON = 0.2  # s, of the error that is reported; pieces are no longer
 _ABOVE_NOISE = 30.0  # RMS motion over a piece in units of its noise
+_FEW_ROWS = 30  # of a run say little of its noise
 FINISH = 0.5  # s, of pieces in the least-squares finish
 
 
@@ -166,6 +167,9 @@ def read_runs(config: Any, mj_model: Any, horizon: float) -> MeasuredRuns:
         cut, leaps = split_at_resets(given, noise)
         notes += leaps
         parts.append(cut)
+    if parts[0] != list(log.runs):
+        # Bad readings have no part in the noise, where there are rows enough.
+        noise = pooled_noise([r for r in parts[0] if len(r) > _FEW_ROWS] or log.runs)
     runs, changed = to_common_step([*parts[0], *parts[1]])
     notes += changed
     runs, odd = without_odd_ends(runs, noise)

@@ -186,6 +186,37 @@ def test_runs_are_cut_at_leaps_and_nowhere_else():
     assert [len(r) for r in runs] == [200, 250, 149]
     assert [r.name for r in runs] == ["run/1", "run/2", "run/3"]
     assert "run at 1.99 s, 4.49 s, 4.5 s" in note
+    # What was derived across a leap is derived again.
+    for run in runs:
+        assert np.abs(run.qvel).max() < 2.5
+
+
+@pytest.mark.parametrize("resolution", [0.0, 1e-3])
+def test_wild_readings_do_not_make_noise(resolution):
+    rng = np.random.default_rng(3)
+    swing = sine(600) + 1e-4 * rng.standard_normal(600)
+    if resolution:
+        swing = np.round(swing / resolution) * resolution
+    calm = estimate_noise(make_run(swing))
+    swing[[100, 300, 301]] = -3e3, 1e4, 1e4
+    (*_, wild), _ = split_at_resets([make_run(swing)], estimate_noise(make_run(swing)))
+    assert len(wild) == 298
+    np.testing.assert_allclose(estimate_noise(wild), calm, rtol=0.2)
+    if not resolution:
+        np.testing.assert_allclose(estimate_noise(make_run(swing)), calm, rtol=0.2)
+
+
+def test_wild_velocities_are_left_out_and_impacts_are_not():
+    time = 0.01 * np.arange(600)
+    run = make_run(np.abs(np.sin(4 * time)))
+    speed = 4 * np.sign(np.sin(4 * time)) * np.cos(4 * time)
+    run = dataclasses.replace(run, qvel=speed[:, None], qvel_measured=True)
+    same, notes = split_at_resets([run], np.full(2, 1e-4))
+    assert same == [run] and not notes
+    run.qvel[[50, 400]] += [[1e6], [-40.0]]
+    runs, _ = split_at_resets([run], np.full(2, 1e-4))
+    assert [len(r) for r in runs] == [50, 349, 199]
+    assert all(np.abs(r.qvel).max() <= 4 for r in runs)
 
 
 def test_readings_are_mended(machine):
