@@ -67,6 +67,23 @@ def score(config: CriticConfig, state: CriticState, x: jax.Array) -> jax.Array:
     return jax.nn.sigmoid(out) if config.loss == "gan" else out
 
 
+def fitness(
+    config: CriticConfig, state: CriticState, x: jax.Array, weight: jax.Array
+) -> jax.Array:
+    """Weighted mean of the scores of ``x (P, C, features)``, ``(P,)``; ``weight`` is
+    ``(P, C)``.
+
+    For ``gan`` its logarithm, of the same order: where the discriminator has won, all
+    scores themselves are zero in single precision, and no individual the better one.
+    """
+    out = Discriminator(config.hidden).apply(state.params, x)
+    assert isinstance(out, jax.Array)
+    count = jnp.maximum(weight.sum(1), 1.0)
+    if config.loss != "gan":
+        return (out * weight).sum(1) / count
+    return jax.nn.logsumexp(jax.nn.log_sigmoid(out), 1, weight) - jnp.log(count)
+
+
 def _clip(config: CriticConfig, params: Any) -> Any:
     if config.regularizer != "clip":
         return params

@@ -192,13 +192,13 @@ class Search:
 
         real, fake, weight, finite = self._simulate(state, data, population, k_sim)
         trained, loss = self._train_critic(state.critic, k_critic, real, fake, weight)
-        scores = critic.score(self.critic_config, trained, fake)
-        fitness = (scores * weight).sum(1) / jnp.maximum(weight.sum(1), 1.0)
+        fitness = critic.fitness(self.critic_config, trained, fake, weight)
         told, cost = _only_finite(population, -fitness, finite)
         es_new = self.strategy.tell(k_tell, told, cost, es)
         mean, cov = self.strategy.moments(es_new, told, cost)
-        # A generation without one finite simulation teaches nothing.
-        some = finite.any()
+        # A generation without one finite simulation, or with all of one score, teaches
+        # nothing: the first of them would be taken for the best.
+        some = finite.any() & (cost.min() < cost.max())
         keep = lambda new, old: jax.tree.map(  # noqa: E731
             lambda a, b: jnp.where(some, a, b), new, old
         )

@@ -161,7 +161,8 @@ def machine(folder: Path) -> None:
             mujoco.mj_step(model, data, every)
         (folder / f"run{run + 1}.csv").write_text("\n".join(lines))
     ros.write(folder / "bag")
-    (folder / "names.yaml").write_text("joints: {pole_hinge: pole}\nactuators: [cart]\n")
+    names = "joints: {pole_hinge: pole}\nactuators: [cart]\n"
+    (folder / "names.yaml").write_text(names)
     (folder / "hidden.yaml").write_text(HIDDEN)
     (folder / "my_env.py").write_text(
         "from envs.cartpole import Cartpole\n\n\nclass Mine(Cartpole):\n    pass\n"

@@ -292,6 +292,48 @@ def test_the_servo_is_found(source: str) -> None:
         assert info.std[-1, 0] < 0.5 * info.std[0, 0]
 
 
+def test_a_discriminator_that_wins_at_once() -> None:
+    """Many large steps, against simulations that start far from the truth; the
+    Wasserstein score is linear, and cannot saturate."""
+    space = ParameterSpace(
+        tuple(
+            dataclasses.replace(p, initial=(2 * v, 6 * v))
+            for p, v in zip(servo_space().parameters, TRUTH, strict=True)
+        )
+    )
+    config = SearchConfig(
+        population=64,
+        segments=32,
+        real_batch=64,
+        loss="gan",
+        regularizer="none",
+        learning_rate=0.1,
+        discriminator_updates=100,
+    )
+    search, d = make(config, servo(space=space)), data()
+    # Farther from every simulation than they are from each other.
+    apart = dataclasses.replace(d.segments, next_qvel=d.segments.next_qvel + 5.0)
+    apart = dataclasses.replace(d, segments=apart)
+    state = search.init(jax.random.key(1), d)
+    won, info = jax.jit(search.step)(state, apart)
+    ranked = info.best - info.score
+    assert ranked > 0 and np.isfinite(won.mean).all()
+    state, info = jax.jit(lambda s: search.run(s, d, 30))(state)
+    found = np.asarray(search.space.to_si(state.mean))
+    np.testing.assert_allclose(found, TRUTH, rtol=0.05)
+
+
+def test_a_discriminator_without_an_opinion_teaches_nothing() -> None:
+    search = make(dataclasses.replace(BASE, learning_rate=0.0))
+    state = search.init(jax.random.key(0), data())
+    flat = jax.tree.map(jnp.zeros_like, state.critic.params)
+    state = state.replace(critic=state.critic.replace(params=flat))
+    new, info = jax.jit(search.step)(state, data())
+    assert info.best == info.score
+    np.testing.assert_array_equal(new.mean, state.mean)
+    np.testing.assert_array_equal(new.cov, state.cov)
+
+
 def test_transitions_of_no_weight_are_never_picked() -> None:
     d = data()
     bad = jnp.arange(60) >= 30
