@@ -13,8 +13,11 @@ from easi_jax.refine import refine, step_weights
 from easi_jax.replay import motion
 from easi_jax.segments import Segments
 
+RESTARTS = 2  # of the finish on noisy data, where it has more than one minimum
 FLOOR = 1e-3  # of the motion: what a model is never trusted to be better than
 _RESOLVED = 1e-5  # smallest eigenvalue of a float32 correlation matrix worth its name
+_SHARP = 1.0 / 3.0  # of a value: its standard deviation where logarithms will do
+_KNOWN = 0.5  # of the initial range's top: a standard deviation that says something
 _INITIAL_VARIANCE = 1.0 / 12.0  # of a uniform initial range, unit coordinates
 
 
@@ -65,6 +68,7 @@ def estimate(
     robust: int | jax.Array = 6,
     free_starts: bool = True,
     near: bool | jax.Array = False,
+    restarts: int = 0,
 ) -> Estimate:
     """The result of a search at ``mean``, ``cov`` (unit coordinates); pure.
 
@@ -74,7 +78,9 @@ def estimate(
     spread, whatever the search has drifted to. Without ``informed`` it is the search's
     own covariance alone. ``misfit (2 nv,)`` is what the model itself errs by in every
     step, on top of the noise; it, ``robust``, ``free_starts`` and ``near`` go to
-    `easi_jax.refine.refine`.
+    `easi_jax.refine.refine`, which starts from so many draws of the search's spread as
+    well as ``restarts`` says. What may be as good as zero
+    is stated as `_near_zero` says.
     """
     assumed = effective_noise(machine, pieces, noise)
     n = space.size
@@ -90,6 +96,7 @@ def estimate(
             robust=robust,
             free_starts=free_starts,
             near=near,
+            others=_draws(mean, cov, restarts) if restarts else None,
         )
         center, hessian = fit.unit, fit.hessian
         cost, delta = fit.cost, fit.delta
@@ -102,6 +109,9 @@ def estimate(
         cost, delta = jnp.zeros(0), eq.start_step
     open_cov, seen = _posterior(hessian)
     own = jnp.zeros((n, n)) if refined else seen @ cov @ seen.T
+    if refined:
+        raised_cov, _ = _posterior(fit.raised_hessian)
+        center, open_cov = _near_zero(space, center, fit.raised, raised_cov)
     return Estimate(
         distribution=gaussian(space, center, open_cov + own if informed else cov),
         search_mean=mean,
@@ -131,3 +141,58 @@ def _posterior(hessian: jax.Array) -> tuple[jax.Array, jax.Array]:
     back = vectors / size[:, None] / root
     cov = back @ jnp.linalg.inv(total / root[:, None] / root) @ back.T
     return cov, jnp.eye(hessian.shape[0]) - cov / _INITIAL_VARIANCE
+
+
+def _draws(mean: jax.Array, cov: jax.Array, count: int) -> jax.Array:
+    """``count`` draws of a Gaussian, ``(count, n)``; always the same ones."""
+    values, vectors = jnp.linalg.eigh(0.5 * (cov + cov.T))
+    root = vectors * jnp.sqrt(jnp.maximum(values, 0.0))
+    return mean + jax.random.normal(jax.random.key(0), (count, mean.size)) @ root.T
+
+
+def _near_zero(
+    space: ParameterSpace, unit: jax.Array, raised: jax.Array, cov: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Mean and covariance where a logarithmic parameter may be as good as zero.
+
+    The likelihood is a Gaussian in the SI value, not in its logarithm. Where its
+    standard deviation is no small part of the value, mean and variance of the logarithm
+    are those under that likelihood and the initial range as prior. The others follow
+    the mean along the covariance, ``cov`` at ``raised``: ``unit`` with what lies below
+    its initial range raised to the low end, for further down the logarithm has no slope
+    and its spread would mean nothing.
+    """
+    width = jnp.asarray(space.log_width)
+    std = jnp.sqrt(jnp.diag(cov))
+    # What the data and the priors of the other parameters say of each.
+    precision = 1.0 / std**2 - 1.0 / _INITIAL_VARIANCE
+    alone = 1.0 / jnp.sqrt(jnp.maximum(precision, 1e-3))
+    value = jnp.exp(width * (unit - raised))  # in the SI value at `raised`
+    error = width * alone
+    top = jnp.exp(width * (1.0 - raised))  # of the initial range
+    known = error < _KNOWN * top
+    weak = space.log & known & (error > _SHARP * value)
+    mean, log_mean, log_std = _of_logarithm(raised, width, value, error)
+    moved = jnp.where(weak, (mean - value) / width, 0.0)
+    # All of them together: those near zero may be known by their sum only.
+    among = jnp.where(weak[:, None] & weak, cov, jnp.eye(space.size))
+    follow = cov @ jnp.where(weak, jnp.linalg.solve(among, moved), 0.0)
+    scale = jnp.where(weak, log_std / std, 1.0)
+    return jnp.where(weak, log_mean, unit + follow), scale[:, None] * scale * cov
+
+
+def _of_logarithm(
+    at: jax.Array, width: jax.Array, value: jax.Array, error: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Mean of x, and mean and standard deviation of u, all ``(n,)``.
+
+    x = exp(width (u - at)) is a Gaussian of mean ``value`` and standard deviation
+    ``error``, and u was one about 0.5 before.
+    """
+    u = jnp.linspace(-8.0, 4.0, 2401)
+    x = jnp.exp(width[:, None] * (u - at[:, None]))
+    score = -0.5 * ((x - value[:, None]) / error[:, None]) ** 2
+    p = jax.nn.softmax(score - 0.5 * (u - 0.5) ** 2 / _INITIAL_VARIANCE, axis=1)
+    mean = p @ u
+    variance = (p * (u - mean[:, None]) ** 2).sum(1)
+    return (p * x).sum(1), mean, jnp.sqrt(variance)

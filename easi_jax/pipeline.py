@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 from easi_jax import distribution
 from easi_jax.distribution import Distribution
 from easi_jax.errors import UserError, nearest
-from easi_jax.identify import Estimate, estimate
+from easi_jax.identify import RESTARTS, Estimate, estimate
 from easi_jax.mesh import make_mesh, sharded_map
 from easi_jax.parameters import ParameterSpace
 from easi_jax.rl.config import SacConfig
@@ -47,6 +47,9 @@ class PipelineConfig:
     """Measurement noise of positions, then velocities (SI); empty: none."""
     refine: bool = False
     """Finish with least squares on the paired data."""
+    restarts: int | None = None
+    """More starts of the least-squares finish, drawn from the search's spread; the best
+    fit counts. Not given: 2 for noisy data, none for clean ones and larger robots."""
     refine_horizon: int | None = None
     """Control steps of a piece in the least-squares finish; not given: 25, or a
     quarter of a second for larger robots, whose motion is stiffer."""
@@ -61,6 +64,8 @@ class PipelineConfig:
             raise UserError(f"trajectories is {self.trajectories}: give at least 1")
         if self.eval_episodes < 1:
             raise UserError(f"eval_episodes is {self.eval_episodes}: give at least 1")
+        if self.restarts is not None and self.restarts < 0:
+            raise UserError(f"restarts is {self.restarts}: give 0 or more")
         for name in ("refine_horizon", "refine_pieces"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -259,6 +264,9 @@ class Pipeline:
         """Results of searches, refined where asked, ``(S, ...)``."""
 
         noisy = any(x > 0 for x in self.config.noise)
+        restarts = self.config.restarts
+        if restarts is None:
+            restarts = RESTARTS if noisy and not self.machine.wide else 0
 
         def one(item: Any) -> Estimate:
             mean, cov, demo = item
@@ -273,6 +281,7 @@ class Pipeline:
                 self.config.search.informed_spread,
                 self.mesh,
                 free_starts=noisy,
+                restarts=restarts,
             )
 
         return jax.lax.map(one, (states.result_mean, states.result_cov, demos))

@@ -50,12 +50,18 @@ class RefineResult:
             the last stage, and at the result, ``(I + 2,)``; the last value from where
             the fit had settled.
         delta: corrections of the starts, ``(M, 2 nv)``.
+        raised: ``unit`` with logarithmic parameters raised to the low end of their
+            initial range: below it they may be as good as zero, where the logarithm has
+            no slope.
+        raised_hessian: information there.
     """
 
     unit: jax.Array
     hessian: jax.Array
     cost: jax.Array
     delta: jax.Array
+    raised: jax.Array
+    raised_hessian: jax.Array
 
 
 def refine(
@@ -71,6 +77,7 @@ def refine(
     robust: int | jax.Array = 6,
     free_starts: bool = True,
     near: bool | jax.Array = False,
+    others: jax.Array | None = None,
 ) -> RefineResult:
     """Levenberg-Marquardt from ``unit (n,)``; pure, for use inside jit.
 
@@ -88,6 +95,7 @@ def refine(
             stage, and a short one. Otherwise a first stage fits the beginning of each
             piece alone; the second starts from its result, or from ``unit`` where that
             fits better.
+        others: ``(K, n)`` more places to start from; what fits best is the result.
     """
     paired = PairedFit(machine, space, segments, noise, mesh, free_starts)
     low, high = space.unit_bounds
@@ -116,6 +124,7 @@ def refine(
         moving: jax.Array,
         trusting: jax.Array,
         again: jax.Array,
+        begun: jax.Array,
     ) -> Any:
         u, shift, damp, unchanged, raised, pieces, _ = carry
         unchanged, raised = (
@@ -129,10 +138,11 @@ def refine(
         reach = 0.5 * (unchanged + raised)
         hops = jnp.clip(u + (reach * sides)[..., None] * ways, low, high)
         if machine.wide:
-            eq, units, shifts, each = swept(u, shift, damp, hops, weight, trusted)
+            at = u, shift, damp, hops, begun
+            eq, units, shifts, each = swept(*at, weight, trusted)
         else:
             eq = paired.normal(u, shift, trusted)
-            units, shifts = trials(u, shift, damp, hops, eq)
+            units, shifts = trials(u, shift, damp, hops, begun, eq)
             each = paired.costs(units, shifts, weight)
         # A piece without trust may be infinitely bad.
         data = jnp.where(trust > 0, each * trust, 0.0).sum(1)
@@ -163,7 +173,7 @@ def refine(
         told = jnp.where(first, home, 0)
         return new, each[told].sum() + prior(units[told])
 
-    def trials(u: Any, shift: Any, damp: Any, hops: Any, eq: Normal) -> Any:
+    def trials(u: Any, shift: Any, damp: Any, hops: Any, begun: Any, eq: Normal) -> Any:
         """Where the cost is tried: here, Newton steps, jumps of single parameters, and
         where the fit began."""
         slope = jax.jvp(away, (u,), (jnp.ones(n),))[1]
@@ -183,12 +193,12 @@ def refine(
             return new, shift + eq.start_step + gain
 
         newton, shifted = jax.vmap(trial)(damp * _DAMPING)
-        units = jnp.concatenate([u[None], newton, hops.reshape(-1, n), anchor[None]])
+        units = jnp.concatenate([u[None], newton, hops.reshape(-1, n), begun[None]])
         stay = jnp.broadcast_to(shift, (2 * len(ways) + 1, *shift.shape))
         return units, jnp.concatenate([stay[:1], shifted, stay[1:], unmoved[None]])
 
     def swept(
-        u: Any, shift: Any, damp: Any, hops: Any, weight: Any, trusted: Any
+        u: Any, shift: Any, damp: Any, hops: Any, begun: Any, weight: Any, trusted: Any
     ) -> Any:
         """Derivatives, then trials, by one simulation that is compiled once."""
         size = jumps.stop + 1
@@ -201,7 +211,7 @@ def refine(
 
         def turn(points: Any, weights: jax.Array) -> Any:
             eq, each = paired.sweep(points[0], points[1], weights)
-            tried = trials(u, shift, damp, hops, eq)
+            tried = trials(u, shift, damp, hops, begun, eq)
             return jax.tree.map(padded, tried), (eq, tried, each[:size])
 
         points = jax.tree.map(padded, points)
@@ -212,14 +222,16 @@ def refine(
         return eq, units, shifts, each
 
     def stage(found: Any, item: Any) -> Any:
-        """From parameters and shifts ``found`` to those that fit best."""
-        weight, wanted, robust, patience, rough = item
+        """From parameters and shifts ``found``, or ``item.begun``, to a best fit."""
+        (u, shift), best = found
+        u = jnp.where(item.restart, item.begun, u)
+        shift = jnp.where(item.restart, unmoved, shift)
+        u = jnp.where(item.raised, jnp.where(space.log, best[0].clip(0.0), best[0]), u)
+        shift = jnp.where(item.raised, best[1], shift)
+        used = jnp.where(item.short, weight * begin[:, None], weight)
         init = (
-            *found,
-            jnp.asarray(1e-3),
-            *fresh,
-            jnp.ones(count),
-            jnp.zeros((n, n)),
+            *(u, shift, jnp.asarray(1e-3), *fresh),
+            *(jnp.ones(count), jnp.zeros((n, n))),
         )
 
         def going(state: Any) -> jax.Array:
@@ -229,38 +241,77 @@ def refine(
             phase, k, costs, carry = state
             # The first round only looks, and the last: cost and information at the
             # result.
-            moving = (phase == _MOVING) & (k > 0)
-            trusting = ~moving | (k > robust)
+            fitting = phase == _MOVING
+            moving = fitting & (k > 0)
+            trusting = ~moving | (k > item.robust)
             # A jump that did not help then may help now.
             again = k % _PATIENCE[1] == 0
-            carry, cost = step(carry, weight, k == 0, moving, trusting, again)
+            first = fitting & (k == 0)
+            carry, cost = step(carry, used, first, moving, trusting, again, item.begun)
             costs = jnp.where(jnp.arange(iterations + 2) >= k, cost, costs)
             # By less than this the data cannot tell two results apart.
-            told_apart = _TOLD_APART + rough * cost
-            settled = costs[jnp.maximum(k - patience, 0)] - cost < told_apart
-            settled &= k > robust + patience
+            told_apart = _TOLD_APART + item.rough * cost
+            settled = costs[jnp.maximum(k - item.patience, 0)] - cost < told_apart
+            settled &= k > item.robust + item.patience
             over = settled | (k >= iterations)
-            phase = jnp.where(
-                moving | (k == 0), jnp.where(over, _LOOKING, _MOVING), _FINISHED
-            )
+            phase = jnp.where(fitting, jnp.where(over, _LOOKING, _MOVING), _FINISHED)
             return phase, k + 1, costs, carry
 
-        phase = jnp.where(wanted, _MOVING, _FINISHED)
-        start = (phase, jnp.asarray(0), jnp.zeros(iterations + 2), init)
+        start = (item.phase, jnp.asarray(0), jnp.zeros(iterations + 2), init)
         _, _, costs, carry = jax.lax.while_loop(going, round_, start)
         u, shift, *_, hessian = carry
-        return (u, shift), (costs, hessian)
+        better = item.whole & (item.first | (costs[-1] < best[2][-1]))
+        best = jax.tree.map(
+            lambda new, old: jnp.where(better, new, old),
+            (u, shift, costs, hessian),
+            best,
+        )
+        return ((u, shift), best), (u, hessian)
 
-    stages = (
-        jnp.stack([weight * begin[:, None], weight]),
-        jnp.stack([~jnp.asarray(near), jnp.asarray(True)]),
-        jnp.stack([jnp.asarray(0), jnp.asarray(robust)]),
-        jnp.stack([jnp.asarray(_PATIENCE[0]), jnp.where(near, *_PATIENCE)]),
-        jnp.array([_NEAR_ENOUGH, rounding]),
-    )
+    starts = unit[None] if others is None else jnp.concatenate([unit[None], others])
     # As a scan, so that a stage is compiled once.
-    (u, shift), (costs, hessians) = jax.lax.scan(stage, (unit, unmoved), stages)
-    return RefineResult(u, hessians[-1], costs[-1], shift)
+    none = unit, unmoved, jnp.zeros(iterations + 2), jnp.zeros((n, n))
+    stages = _stages(starts, near, robust, rounding)
+    found, looked = jax.lax.scan(stage, ((unit, unmoved), none), stages)
+    u, shift, costs, hessian = found[1]
+    return RefineResult(u, hessian, costs, shift, looked[0][-1], looked[1][-1])
+
+
+@flax.struct.dataclass
+class _Stage:
+    """One stage of the fit, or a look at the raised result; see `_stages`."""
+
+    begun: jax.Array  # where this fit began
+    phase: jax.Array
+    restart: jax.Array
+    short: jax.Array
+    whole: jax.Array
+    first: jax.Array
+    raised: jax.Array
+    robust: jax.Array
+    patience: jax.Array
+    rough: jax.Array
+
+
+def _stages(starts: jax.Array, near: Any, robust: Any, rounding: float) -> _Stage:
+    """The beginnings of the pieces, then all of them, from each start ``(K, n)``; then
+    the look at the result."""
+    count = 2 * len(starts) + 1
+    at = jnp.arange(count)
+    look, short = at == count - 1, at % 2 == 0
+    wanted = jnp.where(near, at == 1, True)
+    return _Stage(
+        begun=starts[jnp.minimum(at // 2, len(starts) - 1)],
+        phase=jnp.where(look, _LOOKING, jnp.where(wanted, _MOVING, _FINISHED)),
+        restart=short & ~look,
+        short=short & ~look,
+        whole=~short & wanted,
+        first=at == 1,
+        raised=look,
+        robust=jnp.where(short, 0, robust),
+        patience=jnp.where(short | near, *_PATIENCE),
+        rough=jnp.where(short, _NEAR_ENOUGH, rounding),
+    )
 
 
 def _ways(space: ParameterSpace) -> tuple[np.ndarray, np.ndarray]:

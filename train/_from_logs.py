@@ -33,7 +33,9 @@ def run(config: Any) -> None:
         from easi_jax.distributed import started
         from train._log_results import ready_errors, write
 
-        finish = started(lambda: _ready_finish(problem, search, config.refine))
+        finish = started(
+            lambda: _ready_finish(problem, search, config.refine, config.restarts or 0)
+        )
         states = _search(folder, config, search, problem, seeds)
         errors = started(lambda: ready_errors(problem, search.space))
         estimates, outliers = finish()(states)
@@ -112,7 +114,7 @@ def _search(
 
 
 def _ready_finish(
-    problem: Problem, search: Any, refined: bool
+    problem: Problem, search: Any, refined: bool, restarts: int
 ) -> Callable[[Any], tuple[list[Any], list[str]]]:
     """Compiles the finish.
 
@@ -160,6 +162,7 @@ def _ready_finish(
             misfit,
             robust,
             near=near,
+            restarts=restarts,
         )
         model = machine.model(space.to_si(found.distribution.mean))
         starts = shift_start(machine, pieces, found.delta)

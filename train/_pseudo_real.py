@@ -75,6 +75,7 @@ def run(config: "Config") -> None:
             trajectories=config.trajectories,
             noise=config.noise,
             refine=config.refine,
+            restarts=config.restarts,
             eval_episodes=config.eval_episodes,
         ),
         start=config.start,

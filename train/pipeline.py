@@ -57,6 +57,9 @@ class Config:
     """Where the search starts, as factors on the nominal values."""
     refine: bool = True
     """Finish with least squares on the paired data."""
+    restarts: int | None = None
+    """More starts of the least-squares finish, drawn from the search's spread; the best
+    fit counts. Not given: 2 for noisy data, none for clean ones and larger robots."""
     trajectories: int = 200
     """Demonstration trajectories."""
     noise: tuple[float, ...] = ()
@@ -127,6 +130,7 @@ def run(config: Config) -> None:
             trajectories=config.trajectories,
             noise=config.noise,
             refine=config.refine,
+            restarts=config.restarts,
             eval_episodes=config.eval_episodes,
         ),
         start=config.start,

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import jax
 import numpy as np
 
-from easi_jax.identify import estimate
+from easi_jax.identify import RESTARTS, estimate
 from easi_jax.methods.task import Budget, Identified, Task
 from easi_jax.runtime import fast_loops
 from easi_jax.search import Search, SearchData
@@ -24,6 +24,8 @@ class Easi:
     """The search; its generations are cut to the budget."""
     refine: bool = False
     """Finish with least squares on the paired data."""
+    restarts: int | None = None
+    """More starts of it, as in `easi_jax.pipeline.PipelineConfig`."""
     refine_horizon: int = 25
     """Control steps of a piece there."""
 
@@ -57,6 +59,10 @@ class Easi:
         steps_of = min(self.refine_horizon, demonstrations.weight.shape[1])
         longer = windows(demonstrations, steps_of, steps_of + 1)
 
+        restarts = self.restarts
+        if restarts is None:
+            restarts = RESTARTS if noisy and not task.machine.wide else 0
+
         def result(mean: jax.Array, cov: jax.Array) -> object:
             return estimate(
                 task.machine,
@@ -69,6 +75,7 @@ class Easi:
                 c.informed_spread,
                 task.mesh,
                 free_starts=noisy,
+                restarts=restarts,
             ).distribution
 
         distribution = jax.jit(result)(mean, cov)

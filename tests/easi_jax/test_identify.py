@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from easi_jax.identify import _posterior
+from easi_jax.identify import _near_zero, _posterior
+from easi_jax.parameters import Parameter, ParameterSpace
 
 PRIOR = 12.0 * np.eye(11)
 
@@ -44,3 +45,44 @@ def test_no_data_leave_the_initial_spread() -> None:
     cov, seen = _posterior(jnp.zeros((3, 3)))
     np.testing.assert_allclose(cov, np.eye(3) / 12, rtol=1e-6)
     np.testing.assert_allclose(seen, np.zeros((3, 3)), atol=1e-6)
+
+
+def test_regions_cover_values_that_may_be_as_good_as_zero() -> None:
+    """Two values known by noisy linear readings: one about as large as its standard
+    deviation, which the best fit puts at zero in a sixth of the cases."""
+    low = np.array([1.0, 100.0])
+    space = ParameterSpace(
+        tuple(
+            Parameter(f"p{i}", (f"joint.j{i}.damping",), x, (x, 9 * x), (1e-9, 1e9))
+            for i, x in enumerate(low)
+        )
+    )
+    information = np.array([[1.0, 0.6], [0.6, 1.0]]) / 1.5**2
+    rng, count = np.random.default_rng(0), 3000
+    draws = np.stack([rng.uniform(0, 0.6, count), rng.uniform(size=count)], 1)
+    truth = low * 9.0**draws
+    spread = np.linalg.inv(information)
+    fitted = truth + rng.multivariate_normal(np.zeros(2), spread, count)
+    # The best fit where the first is at its bound.
+    short = 1e-6 - fitted[:, 0]
+    follow = np.stack([np.ones(count), np.full(count, spread[1, 0] / spread[0, 0])], 1)
+    fitted = np.where(short[:, None] > 0, fitted + short[:, None] * follow, fitted)
+    unit = jnp.asarray(np.log(fitted / low) / np.log(9.0), jnp.float32)
+    raised = unit.clip(0.0)
+
+    def seen(u: jax.Array) -> jax.Array:
+        slope = space.to_si(u) * space.log_width
+        return slope[:, None] * slope * jnp.asarray(information, jnp.float32)
+
+    def state(u: jax.Array, r: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return _near_zero(space, u, r, _posterior(seen(r))[0])
+
+    mean, cov = map(np.asarray, jax.jit(jax.vmap(state))(unit, raised))
+    off = mean - draws
+    assert 0.1 < (short > 0).mean() < 0.3
+    inside = np.abs(off) < 1.645 * np.sqrt(cov[:, [0, 1], [0, 1]])
+    assert ((inside.mean(0) > 0.87) & (inside.mean(0) < 0.94)).all()
+    # Not so without: the logarithm of a fit to nothing is anywhere.
+    naive = np.asarray(unit) - draws
+    here = np.asarray(jax.vmap(lambda u: _posterior(seen(u))[0])(unit))
+    assert (np.abs(naive[:, 0]) < 1.645 * np.sqrt(here[:, 0, 0])).mean() < 0.7

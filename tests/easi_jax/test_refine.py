@@ -30,10 +30,15 @@ def fit(cartpole: Cartpole, space: ParameterSpace) -> Any:
     machine = Machine(cartpole.mj_model, space, cartpole.dt)
 
     @jax.jit
-    def run(unit: jax.Array, seg: Segments, noise: jax.Array) -> RefineResult:
-        return refine(machine, space, unit, seg, noise, iterations=15)
+    def run(unit: jax.Array, seg: Segments, noise: jax.Array, more: jax.Array) -> Any:
+        return refine(machine, space, unit, seg, noise, iterations=15, others=more)
 
-    return run
+    def from_all(
+        unit: jax.Array, seg: Segments, noise: jax.Array, others: Any = None
+    ) -> RefineResult:
+        return run(unit, seg, noise, unit[None] if others is None else others)
+
+    return from_all
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +72,21 @@ def test_is_as_good_as_the_cramer_rao_bound(
     assert np.sqrt(np.mean(z**2)) > 0.2
     assert not (np.diff(np.asarray(out.cost)) > 0).any()
     assert np.abs(out.delta).max() < 6 * float(NOISE.max())
+
+
+def test_the_best_of_several_starts_is_the_result(
+    fit: Any, start: jax.Array, trajectories: Segments
+) -> None:
+    seen = rollout.measured(trajectories, NOISE, jax.random.key(7))
+    pieces = windows(seen, 10, 10)
+    lost = start + jnp.where(jnp.arange(start.size) % 2, 3.0, -3.0)
+    alone, good = fit(lost, pieces, NOISE), fit(start, pieces, NOISE)
+    best = fit(lost, pieces, NOISE, start[None])
+    assert alone.cost[-1] > good.cost[-1] + 20
+    # But for the weak pull towards where the fit began.
+    np.testing.assert_allclose(best.cost[-1], good.cost[-1], atol=2 * start.size)
+    worse = fit(start, pieces, NOISE, lost[None])
+    np.testing.assert_array_equal(worse.unit, good.unit)
 
 
 def test_what_is_as_good_as_zero_comes_back_though_little_is_known(

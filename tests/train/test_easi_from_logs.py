@@ -275,6 +275,7 @@ def test_bad_input_is_one_line(spoil, files, capsys):
         (["--set", "los=gan"], ['did you mean "loss"']),
         (["--set", "source=policy"], ["without their controller"]),
         (["--horizon", "-1"], ["--horizon"]),
+        (["--restarts", "-1"], ["--restarts is -1"]),
         (["--noise", "0.1"], ["2 numbers"]),
         (["--robot", "cartpole"], ["exclude each other"]),
         (["--held-out", "nowhere.csv"], ["nowhere.csv"]),
