@@ -38,6 +38,37 @@ def crashes(folder: Path) -> list[str]:
     ]
 
 
+def faults(folder: Path) -> list[str]:
+    """Everything that was broken on purpose, in one table."""
+    from easi_jax.io.files import read_json
+
+    out = ["## Faults tried and survived"]
+    lines: list[tuple[object, ...]] = []
+    path = folder / "faults.json"
+    if path.exists():
+        r = read_json(path)
+        out.append(f"Tests: `{r['command']}`, commit {commits_of([r])}.")
+        lines += [
+            (fault, "tests", c["tried"], c["survived"])
+            for fault, c in r["counts"].items()
+        ]
+    else:
+        out.append("Not run: `python -m benchmarks.faults`.")
+    path = folder / "fuzz.json"
+    if path.exists():
+        total = read_json(path)["total"]
+        cases, failed = total["cases"], total["failed"]
+        what = "files changed, drawn or written to do harm"
+        lines.append((what, "`benchmarks.fuzz`", cases, cases - failed))
+    rows = read_rows(folder / "crash.jsonl")
+    if rows:
+        same = sum(not r["different"] for r in rows)
+        what = "commands killed at random moments"
+        lines.append((what, "`benchmarks.crash`", len(rows), same))
+    head = ("what breaks", "by", "tried", "survived")
+    return [*out, markdown_table(head, lines)] if lines else out
+
+
 def soak(folder: Path) -> list[str]:
     """Memory over many searches in one process."""
     from easi_jax.io.files import read_json

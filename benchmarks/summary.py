@@ -53,6 +53,7 @@ def run(config: Config) -> None:
             _transfer,
             _real,
             _fuzz,
+            crash_summary.faults,
             crash_summary.crashes,
             crash_summary.soak,
         ),

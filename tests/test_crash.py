@@ -3,10 +3,11 @@
 import json
 import time
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
-from benchmarks import soak
+from benchmarks import crash_summary, faults, soak
 from benchmarks.crash import Cell, Jobs, differences, started
 from benchmarks.crash_summary import crashes
 from tests.commands import command
@@ -66,6 +67,29 @@ def test_what_was_not_run_and_what_went_wrong_is_said(tmp_path: Path) -> None:
     page = "\n".join(crashes(tmp_path))
     assert "| train.gap | 2 | 2 | 1 | gap, kill 1: gap.json |" in page
     assert "| train.udr | not run |" in page
+
+
+def test_tests_of_faults_are_counted(tmp_path: Path) -> None:
+    counted = faults.Faults()
+    marked, plain = MagicMock(nodeid="a"), MagicMock(nodeid="b")
+    marked.get_closest_marker.return_value = pytest.mark.fault("a disk").mark
+    plain.get_closest_marker.return_value = None
+    counted.pytest_collection_modifyitems([marked, plain])
+    for test, when, outcome in (
+        *(("a", "setup", "passed"), ("a", "call", "passed"), ("a", "call", "failed")),
+        *(("a", "setup", "skipped"), ("b", "call", "failed")),
+    ):
+        report = MagicMock(nodeid=test, when=when, outcome=outcome)
+        report.passed = outcome == "passed"
+        counted.pytest_runtest_logreport(report)
+    assert counted.outcomes == {"a disk": {"passed": 1, "failed": 1, "skipped": 1}}
+    counts = {"a disk": {"tried": 2, "survived": 1, "left_out": 1}}
+    told = {"command": "x", "versions": {"commit": "0123456789"}, "counts": counts}
+    (tmp_path / "faults.json").write_text(json.dumps(told))
+    (tmp_path / "fuzz.json").write_text('{"total": {"cases": 9, "failed": 1}}')
+    page = "\n".join(crash_summary.faults(tmp_path))
+    assert "| a disk | tests | 2 | 1 |" in page
+    assert "| `benchmarks.fuzz` | 9 | 8 |" in page
 
 
 @pytest.mark.slow

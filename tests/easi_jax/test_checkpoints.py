@@ -174,6 +174,7 @@ def _pipe(path):
         (_pipe, "cut short or damaged"),
     ],
 )
+@pytest.mark.fault("damaged or edited checkpoint, result or configuration")
 def test_damaged_checkpoint_falls_back_then_refuses(
     tmp_path, states, target, damage, said
 ):
@@ -201,6 +202,7 @@ def test_other_configuration_is_refused(tmp_path, states, target):
         checkpoints.restore(tmp_path, target, config_hash="b")
 
 
+@pytest.mark.fault("damaged or edited checkpoint, result or configuration")
 def test_other_shape_dtype_or_structure_is_named(tmp_path, target):
     checkpoints.save(tmp_path, 1, {"w": jnp.zeros((3, 2))}, config_hash="a")
 
@@ -229,6 +231,7 @@ def test_restores_onto_the_sharding_of_the_target(tmp_path):
     np.testing.assert_array_equal(found.state, value)
 
 
+@pytest.mark.fault("disk full, folder read-only")
 def test_full_disk_keeps_the_last_good_one(tmp_path, states, target):
     checkpoints.save(tmp_path, 1, states[1], config_hash="a")
     noise = np.random.default_rng(0).normal(size=5000)
@@ -250,6 +253,7 @@ def test_full_disk_keeps_the_last_good_one(tmp_path, states, target):
 
 @pytest.mark.parametrize("failing", ["rename", "mkdir", "fsync"])
 @pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EROFS])
+@pytest.mark.fault("disk full, folder read-only")
 def test_failure_at_any_point_keeps_the_same_step(
     tmp_path, states, target, monkeypatch, failing, reason
 ):
@@ -289,6 +293,7 @@ def test_names_that_only_look_like_steps(tmp_path, states):
     assert checkpoints.steps(tmp_path) == [3]
 
 
+@pytest.mark.fault("killed (signal 9), then resumed")
 def test_leftovers_of_a_killed_process_are_cleaned(tmp_path, states):
     (tmp_path / ".writing-1" / "state").mkdir(parents=True)
     checkpoints.save(tmp_path, 3, states[0], config_hash="a")

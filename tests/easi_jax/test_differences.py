@@ -95,6 +95,7 @@ def test_a_parameter_at_its_bound_has_its_slope(problem: Any, monkeypatch: Any) 
     assert slopes[1] == pytest.approx(slopes[0], rel=0.1)
 
 
+@pytest.mark.fault("simulations that explode, parameters at absurd corners")
 def test_a_piece_that_explodes_is_left_out(problem: Any, monkeypatch: Any) -> None:
     machine, space, pieces = problem
     monkeypatch.setattr(machine, "wide", True)

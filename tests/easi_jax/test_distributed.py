@@ -53,6 +53,7 @@ def test_several_processes_give_what_one_gives(
 
 
 @pytest.mark.parametrize("victim", [0, 1])
+@pytest.mark.fault("one of several processes lost")
 def test_one_is_killed_all_end_and_resume(
     tmp_path: Path, alone: Any, victim: int
 ) -> None:

@@ -172,6 +172,7 @@ def test_noise_of_uneven_rows_is_not_lost_by_their_interpolation(tmp_path):
     assert estimate_noise(even)[0] < 0.75 * sigma
 
 
+@pytest.mark.fault("wild readings, joints that stand still")
 def test_runs_are_cut_at_leaps_and_nowhere_else():
     rng = np.random.default_rng(2)
     time = 0.01 * np.arange(600)
@@ -192,6 +193,7 @@ def test_runs_are_cut_at_leaps_and_nowhere_else():
 
 
 @pytest.mark.parametrize("resolution", [0.0, 1e-3])
+@pytest.mark.fault("wild readings, joints that stand still")
 def test_wild_readings_do_not_make_noise(resolution):
     rng = np.random.default_rng(3)
     swing = sine(600) + 1e-4 * rng.standard_normal(600)
@@ -206,6 +208,7 @@ def test_wild_readings_do_not_make_noise(resolution):
         np.testing.assert_allclose(estimate_noise(make_run(swing)), calm, rtol=0.2)
 
 
+@pytest.mark.fault("wild readings, joints that stand still")
 def test_wild_velocities_are_left_out_and_impacts_are_not():
     time = 0.01 * np.arange(600)
     run = make_run(np.abs(np.sin(4 * time)))

@@ -99,6 +99,7 @@ def test_files_of_its_own_folder_are_read(robot: Path, inside: str) -> None:
     ],
 )
 @pytest.mark.timeout(60)
+@pytest.mark.fault("models that read outside of their folder")
 def test_other_files_are_not(robot: Path, inside: str, said: str) -> None:
     path = model(robot, inside.replace("ROOT", str(robot.parent)))
     with pytest.raises(UserError) as error:
@@ -121,6 +122,7 @@ def test_no_model_file(robot: Path) -> None:
             read_mjcf(robot / name)
 
 
+@pytest.mark.fault("models that read outside of their folder")
 def test_a_model_that_names_too_much_is_refused_at_once(robot: Path) -> None:
     many = "".join(f'<a file="{i}"/><b meshdir="{i}"/>' for i in range(400))
     with pytest.raises(UserError, match="too many files"):

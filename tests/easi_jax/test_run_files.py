@@ -63,6 +63,7 @@ def test_a_run_with_nothing_but_defaults_is_one(tmp_path: Path) -> None:
         (("best_seed",), "x", "best_seed is not a whole number"),
     ],
 )
+@pytest.mark.fault("damaged or edited checkpoint, result or configuration")
 def test_an_edited_distribution_is_refused(
     tmp_path: Path, place: tuple[Any, ...], value: Any, said: str
 ) -> None:
@@ -91,6 +92,7 @@ def test_an_edited_distribution_is_refused(
         ({"effects": [1]}, "effects is no mapping"),
     ],
 )
+@pytest.mark.fault("damaged or edited checkpoint, result or configuration")
 def test_edited_results_are_refused(
     tmp_path: Path, change: dict[str, Any], said: str
 ) -> None:
@@ -110,6 +112,7 @@ def test_edited_results_are_refused(
         {"format": 1, "command": [], "config": {}},
     ],
 )
+@pytest.mark.fault("damaged or edited checkpoint, result or configuration")
 def test_an_edited_configuration_is_refused(tmp_path: Path, head: Any) -> None:
     write(tmp_path, "config.json", head)
     with pytest.raises(UserError):
@@ -118,6 +121,7 @@ def test_an_edited_configuration_is_refused(tmp_path: Path, head: Any) -> None:
         RunFolder.open(tmp_path, {}, command="c", resume=True)
 
 
+@pytest.mark.fault("damaged or edited checkpoint, result or configuration")
 def test_json_that_is_none(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="nested too deeply"):
         read_json(write(tmp_path, "deep.json", "[" * 100_000))
@@ -138,6 +142,7 @@ def test_json_that_is_none(tmp_path: Path) -> None:
         "[" * 100_000,
     ],
 )
+@pytest.mark.fault("damaged or edited checkpoint, result or configuration")
 def test_an_edited_line_of_metrics_is_named(tmp_path: Path, line: str) -> None:
     with pytest.raises(UserError, match="line 1: not a metrics line"):
         read_metrics(write(tmp_path, "metrics.jsonl", line + "\n"))

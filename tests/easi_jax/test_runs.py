@@ -65,6 +65,7 @@ def test_new_run_writes_config_and_versions(run_at, tmp_path):
     assert str(tmp_path) not in text
 
 
+@pytest.mark.fault("two runs into one folder, a folder of something else")
 def test_second_run_into_a_used_folder_is_refused_while_the_first_lives(run_at):
     with run_at() as run:
         code = (
@@ -140,6 +141,7 @@ def test_run_without_versions_is_completed_on_resume(run_at):
         assert (run.path / "versions.json").exists()
 
 
+@pytest.mark.fault("two runs into one folder, a folder of something else")
 def test_foreign_folder_is_never_touched(tmp_path, run_at):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "thesis.tex").write_text("years of work")
@@ -149,6 +151,7 @@ def test_foreign_folder_is_never_touched(tmp_path, run_at):
     assert _contents(tmp_path / "run") == {"thesis.tex": b"years of work"}
 
 
+@pytest.mark.fault("damaged or edited checkpoint, result or configuration")
 def test_config_of_another_format_is_refused(run_at):
     with run_at() as run:
         pass
@@ -161,6 +164,7 @@ def test_config_of_another_format_is_refused(run_at):
         run_at(resume=True)
 
 
+@pytest.mark.fault("disk full, folder read-only")
 def test_folder_that_cannot_be_written(tmp_path, run_at):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="Not a directory; choose another --out"):
@@ -217,6 +221,7 @@ def test_json_keeps_what_is_not_finite():
         to_json(object())
 
 
+@pytest.mark.fault("disk full, folder read-only")
 def test_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "a.json"
     atomic_write(path, "old")
@@ -231,6 +236,7 @@ def test_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+@pytest.mark.fault("disk full, folder read-only")
 def test_metrics_on_a_disk_that_takes_no_more(tmp_path, monkeypatch, reason):
     log = MetricsLog(tmp_path)
     log.write("train", 1, {"loss": 1.0})
@@ -254,6 +260,7 @@ def test_metrics_on_a_disk_that_takes_no_more(tmp_path, monkeypatch, reason):
     assert [line["step"] for line in lines] == [1, 3]
 
 
+@pytest.mark.fault("disk full, folder read-only")
 def test_curves_on_a_disk_that_takes_no_more(tmp_path, monkeypatch):
     log = MetricsLog(tmp_path)
     monkeypatch.setattr(log, "_board", _fails(errno.ENOSPC))
@@ -263,6 +270,7 @@ def test_curves_on_a_disk_that_takes_no_more(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EROFS])
+@pytest.mark.fault("disk full, folder read-only")
 def test_results_and_videos_on_a_full_or_read_only_disk(tmp_path, monkeypatch, reason):
     frames = np.zeros((2, 4, 4, 3), np.uint8)
     write_report(tmp_path / "report.html", Report("old", []))

@@ -48,6 +48,7 @@ def test_plain_data_and_small_aliases(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.timeout(60)
+@pytest.mark.fault("wrong options and files")
 def test_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(UserError, match=said) as error:
         content(tmp_path, text)

@@ -68,6 +68,7 @@ def test_folder_of_udr(chain: Path) -> None:
     assert _restored(chain / "udr", "train").step == 24
 
 
+@pytest.mark.fault("killed (signal 9), then resumed")
 def test_killed_training_goes_on_bit_equal(chain: Path, tmp_path: Path) -> None:
     import jax
 
@@ -86,6 +87,7 @@ def test_killed_training_goes_on_bit_equal(chain: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
 
 
+@pytest.mark.fault("killed (signal 9), then resumed")
 def test_killed_search_goes_on_bit_equal(chain: Path, tmp_path: Path) -> None:
     copy = tmp_path / "easi"
     shutil.copytree(chain / "easi", copy)
@@ -209,6 +211,7 @@ def test_pipeline_equals_the_two_commands(chain: Path, tmp_path: Path) -> None:
         (pipeline, ("--noise", "0.1"), "noise"),
     ],
 )
+@pytest.mark.fault("wrong options and files")
 def test_mistakes_end_with_one_line(module, args, said, tmp_path, capsys) -> None:
     out = () if module is evaluate else ("--out", tmp_path / "run")
     assert said in refused(capsys, module, *args, *out)
@@ -265,6 +268,7 @@ def test_export_of_a_policy_alone(chain: Path, tmp_path: Path) -> None:
         (["nothing"], "holds no run"),
     ],
 )
+@pytest.mark.fault("wrong options and files")
 def test_export_says_what_is_wrong(
     chain: Path, words: list[str], said: str, tmp_path: Path, capsys
 ) -> None:

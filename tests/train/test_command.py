@@ -68,6 +68,7 @@ def test_help_shows_docstrings_and_defaults(capsys):
         (["--out", "a", "--population", "many"], "Error parsing --population"),
     ],
 )
+@pytest.mark.fault("wrong options and files")
 def test_wrong_arguments_exit_with_2_and_help(args, said, capsys):
     with pytest.raises(SystemExit) as exit_:
         _call(_nothing, *args)
@@ -102,6 +103,7 @@ def test_programming_errors_are_not_dressed_up():
     ("kept", "said"), [(True, "--resume"), (False, "before the first checkpoint")]
 )
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.fault("interrupted (Ctrl-C)")
 def test_interrupt_says_what_is_kept(tmp_path, capsys, kept, said, number):
     if kept:
         (tmp_path / "checkpoints" / "search" / "step_000000000003").mkdir(parents=True)
@@ -123,6 +125,7 @@ def test_interrupt_says_what_is_kept(tmp_path, capsys, kept, said, number):
     ("name", "said"),
     [("", "nothing was written"), ("rows.jsonl", "keeps the lines of all that")],
 )
+@pytest.mark.fault("interrupted (Ctrl-C)")
 def test_interrupt_of_what_cannot_be_resumed(tmp_path, capsys, name, said):
     @dataclasses.dataclass(frozen=True)
     class Short:
@@ -140,6 +143,7 @@ def test_interrupt_of_what_cannot_be_resumed(tmp_path, capsys, name, said):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.fault("interrupted (Ctrl-C)")
 def test_an_interrupt_that_python_drops_is_not_lost(tmp_path, capsys, number):
     """A finalizer, jax's callback of the garbage collector: exceptions end there."""
 
@@ -164,6 +168,7 @@ def test_an_interrupt_that_python_drops_is_not_lost(tmp_path, capsys, number):
     assert "interrupted" in capsys.readouterr().err.splitlines()[-1]
 
 
+@pytest.mark.fault("interrupted (Ctrl-C)")
 def test_a_cancelled_event_loop_is_an_interrupt(tmp_path, capsys):
     def run(config):
         with contextlib.suppress(KeyboardInterrupt):

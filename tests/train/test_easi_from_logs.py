@@ -259,6 +259,7 @@ CASES = (
 
 
 @pytest.mark.parametrize("spoil", CASES, ids=lambda f: f.__name__)
+@pytest.mark.fault("wrong options and files")
 def test_bad_input_is_one_line(spoil, files, capsys):
     said = spoil(files)
     before = sorted(files["out"].rglob("*")) if files["out"].exists() else None
@@ -281,6 +282,7 @@ def test_bad_input_is_one_line(spoil, files, capsys):
         (["--held-out", "nowhere.csv"], ["nowhere.csv"]),
     ],
 )
+@pytest.mark.fault("wrong options and files")
 def test_bad_options_are_one_line(more, said, files, capsys):
     refuse(capsys, arguments(files, *more), *said)
     assert not files["out"].exists()
@@ -298,6 +300,7 @@ def test_folder_that_cannot_be_written(files, capsys):
     refuse(capsys, arguments(files), "--out")
 
 
+@pytest.mark.fault("simulations that explode, parameters at absurd corners")
 def test_non_finite_simulations_stop_the_search(files, capsys):
     edit(files["parameters"], "joint.hinge.damping", "actuator.drive.gain")
     edit(files["parameters"], "[0.01, 0.3]", "[1.0e+37, 3.0e+37]")
@@ -321,6 +324,7 @@ def test_degrees_are_noticed_and_earlier_results_kept(files, capsys):
     assert {p: p.read_bytes() for p in files["out"].rglob("*") if p.is_file()} == kept
 
 
+@pytest.mark.fault("killed (signal 9), then resumed")
 def test_a_stopped_run_goes_on_bit_equal(files, tmp_path):
     """Stopped at a moment of no one's choosing, then resumed with the same command."""
     many = ("--generations", "40", "--search-chunk", "1")

@@ -108,6 +108,7 @@ def test_results_are_not_overwritten(
     assert "--overwrite" in capsys.readouterr().err
 
 
+@pytest.mark.fault("killed (signal 9), then resumed")
 def test_a_stopped_analysis_goes_on(
     case: Any,
     results: Path,
@@ -185,6 +186,7 @@ def counted(method: Any, calls: list[int]) -> Any:
         ({"--held-out": "{run}"}, "leave a log to fit"),
     ],
 )
+@pytest.mark.fault("wrong options and files")
 def test_mistakes_end_with_one_line(
     change: dict[str, str | None],
     text: str,
@@ -213,6 +215,7 @@ def test_mistakes_end_with_one_line(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.fault("wild readings, joints that stand still")
 def test_a_log_that_stands_still(
     case: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -50,6 +50,7 @@ def outcome() -> Any:
 
 
 @pytest.mark.timeout(120)
+@pytest.mark.fault("markup in names")
 def test_names_do_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one = np.ones((1, 1))
     svg = residual_maps([EVIL], [HANDLER], one, one, np.ones(1))

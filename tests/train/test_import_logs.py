@@ -342,6 +342,7 @@ class _Evil:
         return (Path.touch, (self.path,))
 
 
+@pytest.mark.fault("pickles and damaged archives")
 def test_a_malicious_pickle_does_not_run(tmp_path: Path, refuse: Any) -> None:
     trap = tmp_path / "executed"
     for protocol in (0, 2, 4, 5):
@@ -372,6 +373,7 @@ def test_a_malicious_pickle_does_not_run(tmp_path: Path, refuse: Any) -> None:
         (b"no pickle", "damaged or cut short"),
     ],
 )
+@pytest.mark.fault("pickles and damaged archives")
 def test_other_pickles_are_refused(
     tmp_path: Path, refuse: Any, program: bytes, words: str
 ) -> None:
@@ -681,6 +683,7 @@ def test_wrong_minari_datasets(tmp_path: Path, refuse: Any) -> None:
     assert "not an HDF5 file, damaged or cut short" in refuse(*step, mapping=MINARI)
 
 
+@pytest.mark.fault("pickles and damaged archives")
 def test_damaged_minari_datasets_are_read_or_refused(tmp_path: Path) -> None:
     """Lists of groups, links and chunks that lead nowhere, in every block of a file."""
     folder = minari(tmp_path / "cart-v0", episodes=1, rows=4)
