@@ -68,7 +68,7 @@ def _solver(config: Config) -> Any:
     import numpy as np
 
     from easi_jax import distribution
-    from easi_jax.identify import estimate
+    from easi_jax.identify import RESTARTS, estimate
     from easi_jax.information import PairedFit, identifiability
     from easi_jax.machine import Machine
     from easi_jax.refine import step_weights
@@ -103,7 +103,10 @@ def _solver(config: Config) -> Any:
     def judge(demos: Any, mean: jax.Array, cov: jax.Array, truth: jax.Array) -> Any:
         pieces = windows(demos, 25, 26)
         found = [
-            estimate(machine, search.space, mean, cov, pieces, noise, *how).distribution
+            estimate(
+                *(machine, search.space, mean, cov, pieces, noise, *how),
+                restarts=RESTARTS,
+            ).distribution
             for how in ((False, False), (False, True), (True, True))
         ]
         still = jnp.zeros((pieces.count, len(noise)))

@@ -1,5 +1,6 @@
 """Reads MJCF, and keeps the files that it names inside the model's folder."""
 
+import contextlib
 import itertools
 import os
 import re
@@ -15,6 +16,12 @@ from easi_jax.io.files import os_reason, regular_file
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
 _NESTED = ("include", "model")  # elements whose file is MJCF as well
 _MOST = 100_000  # places that a model may name
+# Elements whose numbers make MuJoCo build as much as they say, and what is sane.
+_COPIES = {"replicate": "count", "composite": "count", "flexcomp": "count"}
+_CELLS = {"texture": ("width", "height"), "hfield": ("nrow", "ncol")}
+_MOST_COPIES = 100_000
+_MOST_CELLS = 1 << 27
+_MOST_SIZES = 100_000  # of key frames, and of numbers for users at an element
 # What tinyxml2, MuJoCo's parser, skips: these may hold anything, quotes included.
 _SKIPPED = (("<!--", "-->"), ("<![CDATA[", "]]>"), ("<?", "?>"), ("<!", ">"))
 _TAG = re.compile(r"<((?:[^\"'>]++|\"[^\"]*+\"|'[^']*+')*+)>")
@@ -47,7 +54,7 @@ def read_mjcf(path: Path, allowed: Sequence[Path] = ()) -> mujoco.MjModel:
     mujoco.set_mju_user_warning(said.append)
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
-    except (ValueError, RecursionError, MemoryError, mujoco.FatalError) as error:
+    except (ValueError, RuntimeError, MemoryError) as error:
         reason = " ".join(f"{error} {' '.join(said)}".split())
         raise UserError(f"{path}: MuJoCo cannot read this model: {reason}") from None
     finally:
@@ -76,13 +83,17 @@ def check_assets(path: Path, allowed: Sequence[Path] = ()) -> None:
     while todo:
         document = todo.pop()
         folders.add(document.parent)
-        for element, key, value in _attributes(document):
-            if key in _FOLDERS:
-                below.add(value)
-            elif key.startswith("file"):
-                if element in _NESTED and not value:
-                    raise UserError(f'{path}: "{element}" without a file name')
-                named.add((document.resolve() if element in _NESTED else None, value))
+        tags = list(_tags(document))
+        _refuse_huge(document, tags)
+        for element, attributes in tags:
+            for key, value in attributes.items():
+                if key in _FOLDERS:
+                    below.add(value)
+                elif key.startswith("file"):
+                    nested = element in _NESTED
+                    if nested and not value:
+                        raise UserError(f'{path}: "{element}" without a file name')
+                    named.add((document.resolve() if nested else None, value))
         if len(folders) * len(below) * len(named) > _MOST:
             raise UserError(f"{path}: names too many files and folders")
         for folder, part, (parent, value) in itertools.product(folders, below, named):
@@ -132,8 +143,46 @@ def _confined(path: Path, value: str, place: Path, roots: Sequence[Path]) -> Pat
     return real
 
 
-def _attributes(path: Path) -> Iterator[tuple[str, str, str]]:
-    """Element, attribute (lower case) and value of each attribute in an XML file."""
+def _refuse_huge(path: Path, tags: Sequence[tuple[str, dict[str, str]]]) -> None:
+    """Refuses numbers for which MuJoCo would build until memory or patience ends."""
+    copies, opened = 0.0, [1.0]
+    cells = 0.0
+    for element, attributes in tags:
+        if element == "/replicate" and len(opened) > 1:
+            opened.pop()
+        elif element in _COPIES:
+            count = opened[-1] * _product([attributes.get(_COPIES[element], "")])
+            copies += count
+            if element == "replicate":
+                opened.append(count)
+        elif element in _CELLS:
+            cells += _product([attributes.get(key, "") for key in _CELLS[element]])
+        user = [v for k, v in attributes.items() if k == "nkey" or k[:6] == "nuser_"]
+        sizes = _product(user) if element == "size" else 0.0
+        for what, much, most in (
+            ("copies of elements", copies, _MOST_COPIES),
+            ("pixels and cells", cells, _MOST_CELLS),
+            ("key frames or user numbers", sizes, _MOST_SIZES),
+        ):
+            if much > most:
+                raise UserError(f"{path}: {much:.3g} {what}, more than {most:,}")
+
+
+def _product(texts: Sequence[str]) -> float:
+    """Product of all numbers in them; what is no number is left to MuJoCo."""
+    out = 1.0
+    for number in " ".join(texts).split():
+        with contextlib.suppress(ValueError):
+            out *= max(float(number), 1.0)
+    return out
+
+
+def _tags(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    """Each tag of an XML file: element and attributes (lower case).
+
+    An element that ends comes as ``/name`` without attributes; one that is empty does
+    both at once.
+    """
     broken = UserError(f"{path}: not an XML text")
     try:
         regular_file(path)
@@ -154,12 +203,20 @@ def _attributes(path: Path) -> Iterator[tuple[str, str, str]]:
         tag = _TAG.match(text, at)
         if tag is None:
             raise broken
-        name = _NAME.match(tag[1])
+        match = _NAME.search(tag[1])
+        name = match[0] if match else ""
+        attributes = {}
         for key, double, single in _ATTRIBUTE.findall(tag[1]):
             value = _REFERENCE.sub(_character, double or single)
             if "\0" in value:
                 raise broken
-            yield name[0] if name else "", key.lower(), value
+            attributes[key.lower()] = value
+        if tag[1].startswith("/"):
+            yield f"/{name}", {}
+        else:
+            yield name, attributes
+            if tag[1].endswith("/"):
+                yield f"/{name}", {}
         at = text.find("<", tag.end())
 
 

@@ -1,6 +1,7 @@
 """A model reads its own folder, and no other file."""
 
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -106,6 +107,49 @@ def test_other_files_are_not(robot: Path, inside: str, said: str) -> None:
         read_mjcf(path)
     assert said in str(error.value)
     assert str(error.value).startswith(str(path))
+
+
+@pytest.mark.parametrize(
+    ("inside", "said"),
+    [
+        ('<replicate count="3000000"><geom size=".1"/></replicate>', "3e+06 copies"),
+        (
+            '<replicate count="1000"><replicate count="1000"><geom size=".1"/>'
+            "</replicate></replicate>",
+            "1e+06 copies",
+        ),
+        ('<flexcomp name="f" count="2000 2000 2" type="grid"/>', "8e+06 copies"),
+    ],
+)
+@pytest.mark.timeout(20)
+@pytest.mark.fault("models that would fill the memory")
+def test_huge_models_are_refused(robot: Path, inside: str, said: str) -> None:
+    with pytest.raises(UserError, match=re.escape(said)):
+        read_mjcf(model(robot, f"<worldbody>{inside}</worldbody>"))
+
+
+@pytest.mark.parametrize(
+    "inside",
+    [
+        '<asset><texture name="t" type="2d" builtin="flat" width="99999" '
+        f'height="99999"/></asset>{BODY}',
+        f'<asset><hfield name="h" nrow="60000" ncol="60000"/></asset>{BODY}',
+        f'<size nkey="500000000"/>{BODY}',
+        f'<size nuser_body="1000000000"/>{BODY}',
+        f'<replicate count="nan"/>{BODY}',
+    ],
+)
+@pytest.mark.timeout(20)
+@pytest.mark.fault("models that would fill the memory")
+def test_huge_tables_are_refused(robot: Path, inside: str) -> None:
+    with pytest.raises(UserError, match=r"model.xml: "):
+        read_mjcf(model(robot, inside))
+
+
+def test_replicates_beside_each_other_add_up(robot: Path) -> None:
+    some = '<replicate count="9" offset="1 0 0"><geom size=".1"/></replicate>'
+    path = model(robot, BODY + f"<worldbody>{some * 9}</worldbody>")
+    assert read_mjcf(path).ngeom == 82
 
 
 @pytest.mark.parametrize("allowed", ["elsewhere", "elsewhere/part.xml", "."])
