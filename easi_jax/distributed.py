@@ -210,9 +210,10 @@ def started(work: Callable[[], T]) -> Callable[[], T]:
 
 
 def local(tree: T) -> T:
-    """Arrays that all devices hold alike, as arrays of this process alone.
+    """Arrays of all processes, as arrays of this process alone.
 
-    A program that closes over an array needs it so.
+    A program that closes over an array needs it so, and so does what reads its numbers.
+    What is spread over the devices is gathered: every process has to call this.
     """
     if _count == 1:
         return tree
@@ -242,10 +243,21 @@ def everywhere(tree: T, sharding: Any) -> T:
 def _rewrapped(x: Any, fun: Callable[[Any], Any]) -> Any:
     """``fun`` of the numbers of an array, which may be of keys."""
     import jax
-    import numpy as np
 
     kind = getattr(x, "dtype", None)
     if kind is None or not jax.numpy.issubdtype(kind, jax.dtypes.prng_key):
-        return fun(np.asarray(x))
-    data = fun(np.asarray(jax.random.key_data(x)))
+        return fun(_whole(x))
+    data = fun(_whole(jax.random.key_data(x)))
     return jax.random.wrap_key_data(data, impl=jax.random.key_impl(x))
+
+
+def _whole(x: Any) -> Any:
+    """The numbers of an array, gathered where other processes hold some of them."""
+    import jax
+    import numpy as np
+    from jax.experimental.multihost_utils import process_allgather
+
+    alone = not isinstance(x, jax.Array) or x.is_fully_addressable
+    if alone or x.is_fully_replicated:
+        return np.asarray(x)
+    return np.asarray(process_allgather(x, tiled=True))

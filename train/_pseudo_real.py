@@ -31,6 +31,7 @@ def run(config: "Config") -> None:
     import jax.numpy as jnp
     import numpy as np
 
+    from easi_jax import distributed
     from easi_jax.errors import UserError
     from easi_jax.io import checkpoints
     from easi_jax.io.runs import RunFolder
@@ -169,7 +170,10 @@ def run(config: "Config") -> None:
         for name, policy in trained.items():
             save_policies(folder, name, policy)
         play = jax.jit(pipe.play)
-        played = {n: play(p, target, keys["evaluate"]) for n, p in trained.items()}
+        played = {
+            name: distributed.local(play(policy, target, keys["evaluate"]))
+            for name, policy in trained.items()
+        }
         returns = {name: np.asarray(p[0]).mean(1) for name, p in played.items()}
         errors = held_out_errors(pipe, estimate, theta, policies, keys["evaluate"])
         curves = {"EASI": training_curve(folder.path, "final", seeds)}
@@ -226,9 +230,9 @@ def _saved(folder: Any, name: str, make: Any, checkpoints: Any, refined: bool) -
     if found is not None:
         return found.state
     say("least squares on the paired data ..." if refined else "Fisher information ...")
-    result = make()
+    result = distributed.local(make())
     checkpoints.save(place, 1, result, config_hash=folder.config_hash)
-    return distributed.local(result)
+    return result
 
 
 def held_out_errors(
@@ -243,6 +247,7 @@ def held_out_errors(
     import jax.numpy as jnp
     import numpy as np
 
+    from easi_jax import distributed
     from easi_jax.heldout import shares
 
     env = pipe.env
@@ -255,7 +260,7 @@ def held_out_errors(
         "EASI": means,
     }
     compute = jax.jit(lambda m: shares(pipe, policies, target, m, fresh))
-    out = {name: compute(m) for name, m in models.items()}
+    out = {name: distributed.local(compute(m)) for name, m in models.items()}
     return {
         "channels": env.machine.state_names,
         "one_step": {k: np.asarray(v[0]) for k, v in out.items()},

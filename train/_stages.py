@@ -66,7 +66,7 @@ def run_stage(
             n = min(chunk, total - done)
             state, info = advance(state, n)
             state = placed(state)
-            info = jax.device_get(info)
+            info = jax.device_get(distributed.local(info))
             if check is not None:
                 check(done, info)
             lines = rows(done, info)

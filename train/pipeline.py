@@ -165,10 +165,10 @@ def run(config: Config) -> None:
             begin = time.monotonic()
             out = jax.block_until_ready(program(keys, target))
             running = time.monotonic() - begin
+            out = distributed.local(out)
             seconds = jnp.array([compiling, running], jnp.float32)
             state = {"out": out, "seconds": seconds}
             checkpoints.save(place, 1, state, config_hash=stamp)
-            out = distributed.local(out)
         # On one device, as what is read back: what follows is the same to the last bit.
         out = jax.tree.map(jnp.asarray, jax.device_get(out))
         info = jax.device_get(out["search"])

@@ -50,7 +50,7 @@ class _UnusableError(Exception):
 def save(folder: Path, step: int, state: Any, *, config_hash: str) -> Path:
     """Writes ``state`` as the checkpoint of ``step``; keeps the newest ``KEEP``.
 
-    Of several processes of one run, the leader alone writes.
+    Of several processes of one run, the leader alone writes; each must call this.
 
     Args:
         folder: where the checkpoints of one stage live; made if missing.
@@ -62,7 +62,7 @@ def save(folder: Path, step: int, state: Any, *, config_hash: str) -> Path:
         UserError: it cannot be written; the earlier ones are as they were.
     """
     final = folder / f"step_{step:012d}"
-    raw = _raw_keys(state)
+    raw = distributed.local(_raw_keys(state))
     if not distributed.leader():
         return final
     names, leaves = _named_leaves(jax.device_get(raw))

@@ -37,8 +37,10 @@ def run(config: Config) -> None:
     import jax
     import jax.numpy as jnp
     import numpy as np
+    from jax.sharding import NamedSharding, PartitionSpec
 
-    from easi_jax.distributed import started
+    from easi_jax.distributed import local, started
+    from easi_jax.io import checkpoints
     from easi_jax.io.runs import RunFolder
     from easi_jax.mesh import make_mesh, sharded_map
     from train._stages import jit_chunks, run_stage
@@ -95,7 +97,19 @@ def run(config: Config) -> None:
         # A later program may close over what a stage has found.
         mean = jax.jit(lambda: state["point"].mean() * ready()[0] / 2)()
         points = np.asarray(state["point"])
-        folder.write_json("results.json", {"points": points, "mean": float(mean)})
+        # Spread over the devices: no process has all of it.
+        spread = NamedSharding(mesh, PartitionSpec(mesh.axis_names))
+        far = jax.jit(lambda: jnp.arange(8.0) + mean, out_shardings=spread)()
+        place, stamp = folder.checkpoints / "far", folder.config_hash
+        checkpoints.save(place, 1, {"far": far}, config_hash=stamp)
+        shape = {"far": jax.ShapeDtypeStruct((8,), jnp.float32)}
+        found = checkpoints.restore(place, shape, config_hash=stamp)
+        assert found is not None
+        far, again = np.asarray(local(far)), np.asarray(found.state["far"])
+        folder.write_json(
+            "results.json",
+            {"points": points, "mean": float(mean), "far": far, "again": again},
+        )
     for note in notes:
         say(f"note: {note}")
     say(f"devices: {jax.device_count()}, mean {float(mean):.4f}")

@@ -42,6 +42,8 @@ def test_several_processes_give_what_one_gives(
     result, (first, *others) = walked(folder, count)
     np.testing.assert_allclose(result["points"], alone["points"], rtol=SAME)
     assert result["mean"] == pytest.approx(alone["mean"], rel=SAME)
+    np.testing.assert_allclose(result["far"], np.arange(8) + result["mean"], rtol=SAME)
+    assert result["again"] == result["far"]
     assert first[0].startswith(f"devices: {count}") and "walk  6/6" in first[1]
     assert all(out == "" and "walk" not in error for out, error in others)
     lines = (folder / "metrics.jsonl").read_text().splitlines()
