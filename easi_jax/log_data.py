@@ -305,7 +305,9 @@ def true_readings(
     """
     bias, late = np.zeros(m.nv), np.zeros(m.nv)
     for e in entries:
-        if not e.of_readings or e.at.startswith("qvel."):  # such are not used
+        named = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SENSOR, e.at) >= 0
+        own = e.kind == "sensor" and named
+        if not e.of_readings or own or e.at.startswith("qvel."):  # such are not used
             continue
         (place,) = addresses.places(m, f"joint.{e.at}.damping")
         dof = int(m.jnt_dofadr[place[2]])

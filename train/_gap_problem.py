@@ -45,7 +45,7 @@ class GapProblem:
         fit, held: runs.
         held_name, held_names: which data are held out.
         noise: of positions and velocities, ``(2 nv,)``.
-        late: joints whose measured velocity lags its position (`velocities.Lag`).
+        readings: that are late or off (`readings.ReadingFault`).
         notes: what the user should know of the data.
     """
 
@@ -56,7 +56,7 @@ class GapProblem:
     held_name: str
     held_names: list[str]
     noise: Any
-    late: dict[str, Any]
+    readings: list[Any]
     notes: list[str]
 
 
@@ -69,7 +69,7 @@ def read_gap_problem(config: Any) -> GapProblem:
     from easi_jax.errors import UserError
     from easi_jax.gap.coverage import coverage_notes
     from easi_jax.gap.own import own_space
-    from easi_jax.gap.velocities import velocity_lags
+    from easi_jax.gap.readings import reading_faults
     from easi_jax.io.parameter_file import read_parameter_file
     from train._log_problem import read_runs
 
@@ -83,8 +83,6 @@ def read_gap_problem(config: Any) -> GapProblem:
         else read_parameter_file(config.parameters, mj_model)
     )
     runs = read_runs(config, mj_model, config.horizon)
-    late = velocity_lags(runs.recorded)
-    joints = {int(d): mj_model.joint(j).name for j, d in enumerate(mj_model.jnt_dofadr)}
     return GapProblem(
         model,
         space,
@@ -93,7 +91,7 @@ def read_gap_problem(config: Any) -> GapProblem:
         runs.held_name,
         [run.name for run in runs.held],
         runs.noise,
-        {joints[d]: lag for d, lag in late.items() if d in joints},
+        reading_faults(mj_model, runs.recorded),
         [*runs.notes, *coverage_notes(mj_model, runs.fit, runs.held)],
     )
 

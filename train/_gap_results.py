@@ -38,10 +38,10 @@ def sentence(found: Any) -> str:
     return _WORDS[place.effect].format(at=place.at, kind=place.kind, **shown)
 
 
-def parameters_text(found: Any, between: str) -> str:
+def parameters_text(values: Any, between: str) -> str:
     """Parameters of an effect with deviation and unit."""
     return between.join(
-        f"{k} {v:.4g} ± {s:.2g} {u}" for k, (v, s, u) in found.values.items()
+        f"{k} {v:.4g} ± {s:.2g} {u}".strip() for k, (v, s, u) in values.items()
     )
 
 
@@ -53,17 +53,31 @@ def effect_rows(
         (
             f.place.effect,
             f.place.at or "whole model",
-            parameters_text(f, between),
+            parameters_text(f.values, between),
             f"{f.confidence:.2f}",
             ", ".join(f.indistinguishable) or none,
         )
         for f in o.found
     ]
-    for joint, lag in problem.late.items():
-        delay = f"delay {lag.seconds:.4g} ± {lag.std:.2g} s"
-        sure = f"{lag.confidence:.2f}"
-        rows.append(("sensor_delay", f"qvel.{joint}", delay, sure, none))
+    for r in problem.readings:
+        told = parameters_text(r.parameters, between)
+        rows.append((r.effect, r.at, told, f"{r.confidence:.2f}", none))
     return rows
+
+
+def reading_line(reading: Any) -> str:
+    """What to say of a reading that is late or off."""
+    place = f"{reading.place[0].upper()}{reading.place[1:]}"
+    if reading.effect == "sensor_bias":
+        bias = parameters_text(reading.parameters, ", ")
+        return f"{place} is off by a constant ({bias}); no prediction uses it."
+    late = f"{1000 * reading.columns['late']:.0f} ms"
+    if reading.at.startswith("qvel."):
+        return (
+            f"The {reading.place} lags its position by {late}: a filter in the drive, "
+            "not the plant. It is not used."
+        )
+    return f"{place} comes {late} late; no prediction uses it."
 
 
 def disagreement(run: str, times: float) -> str:
@@ -97,20 +111,21 @@ def gap_json(problem: Any, outcome: Any) -> dict[str, Any]:
         }
         for f in outcome.found
     ]
-    for joint, lag in problem.late.items():
-        listed.append(
-            {
-                "effect": "sensor_delay",
-                "at": f"qvel.{joint}",
-                "kind": "sensor",
-                "parameters": {
-                    "delay": {"value": lag.seconds, "std": lag.std, "unit": "s"}
-                },
-                "confidence": lag.confidence,
-                "indistinguishable": [],
-                "gap_after": last.gap,
-            }
-        )
+    listed += [
+        {
+            "effect": r.effect,
+            "at": r.at,
+            "kind": "sensor",
+            "parameters": {
+                k: {"value": v, "std": s, "unit": u}
+                for k, (v, s, u) in r.parameters.items()
+            },
+            "confidence": r.confidence,
+            "indistinguishable": [],
+            "gap_after": last.gap,
+        }
+        for r in problem.readings
+    ]
     return {
         "schema": 1,
         "verdict": outcome.verdict,
@@ -175,12 +190,9 @@ def write_results(
             )
         )
     shown = [{k: v for k, (v, _, _) in f.values.items()} for f in outcome.found]
-    for joint, lag in problem.late.items():
-        at = f"qvel.{joint}"
-        seconds, std = float(lag.seconds), {"late": float(lag.std)}
-        late = EffectEntry("sensor_delay", at, "sensor", {"late": seconds}, std)
-        entries.append(late)
-        shown.append({"delay": seconds})
+    for r in problem.readings:
+        entries.append(EffectEntry(r.effect, r.at, "sensor", r.columns, r.std))
+        shown.append({k: v for k, (v, _, _) in r.parameters.items()})
     write_effects(
         folder.path / "effects.yaml",
         str(problem.model.path or problem.model.name),
@@ -283,12 +295,7 @@ def _report(folder: Any, config: Any, problem: Any, o: Any, content: Any) -> Pat
             f'at "{rest["at"]}", {rest["when"]}.'
         )
     lines += [disagreement(*item) for item in o.disagreeing.items()]
-    for joint, lag in problem.late.items():
-        lines.append(
-            f'The measured velocity of "{joint}" lags its position by '
-            f"{1000 * lag.seconds:.0f} ms: a filter in the drive, not the plant. It is "
-            "not used."
-        )
+    lines += [reading_line(r) for r in problem.readings]
     if "retrained" in content:
         lines.append(retrained_line(content["retrained"]))
     pictures = []

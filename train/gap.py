@@ -107,7 +107,7 @@ def run(config: Config) -> None:
         for note in problem.notes:
             say(f"note: {note}")
         outcome = analysis.run()
-        if problem.late and outcome.verdict == "no_gap":
+        if problem.readings and outcome.verdict == "no_gap":
             outcome.verdict = "explained"  # the readings' effect is named
         for note in outcome.notes:
             say(f"note: {note}")

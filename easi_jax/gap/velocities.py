@@ -12,7 +12,7 @@ from easi_jax.windows import fitted_velocity
 _LONGEST = 0.1  # s
 _LATE = 0.003  # s; less is the velocity fit's own doing
 _ALIKE = 0.5  # share of the squared difference that the shift has to explain
-_PIECES = 10
+PIECES = 10
 
 
 @dataclass(frozen=True)
@@ -45,18 +45,18 @@ def velocity_lags(runs: Sequence[Run]) -> dict[int, Lag]:
     found = {}
     for dof in range(measured[0].qvel.shape[1]):
         costs = _costs(measured, dof, shifts)
-        lag = _lag(costs.sum(0), dt)
-        if lag is None:
-            continue
-        alone = [_lag(c, dt) for c in costs]
-        late = [x for x in alone if x is not None]
-        spread = float(np.std(late, ddof=1)) if len(late) > 1 else dt
-        found[dof] = Lag(
-            lag,
-            max(spread, 0.1 * dt) / sqrt(max(len(late), 1)),
-            (len(late) + 1) / (len(alone) + 2),
-        )
+        lag = shift_of(costs.sum(0), dt)
+        if lag is not None:
+            found[dof] = Lag(lag, *alike([shift_of(c, dt) for c in costs], dt))
     return found
+
+
+def alike(alone: Sequence[float | None], dt: float) -> tuple[float, float]:
+    """Standard error and confidence of a lag, from those of single pieces."""
+    late = [x for x in alone if x is not None]
+    spread = float(np.std(late, ddof=1)) if len(late) > 1 else dt
+    std = max(spread, 0.1 * dt) / sqrt(max(len(late), 1))
+    return std, (len(late) + 1) / (len(alone) + 2)
 
 
 def _costs(runs: Sequence[Run], dof: int, shifts: int) -> np.ndarray:
@@ -73,17 +73,21 @@ def _costs(runs: Sequence[Run], dof: int, shifts: int) -> np.ndarray:
         )
     if not rows:
         return np.zeros((1, shifts))
-    pieces = np.array_split(np.concatenate(rows, 1), _PIECES, axis=1)
+    pieces = np.array_split(np.concatenate(rows, 1), PIECES, axis=1)
     return np.array([p.sum(1) for p in pieces])
 
 
-def _lag(cost: np.ndarray, dt: float) -> float | None:
-    """The shift of least cost [s]; None where it is no better than none."""
+def shift_of(cost: np.ndarray, dt: float, least: float = 0.0) -> float | None:
+    """The shift of least cost [s]; None where it is no better than none.
+
+    Args:
+        cost: squared differences by shift, ``(shifts,)``.
+        least: what is no news [s].
+    """
     best = int(np.argmin(cost))
     lag = float(best)
     if 0 < best < len(cost) - 1:
         a, b, c = cost[best - 1 : best + 2]
         lag += 0.5 * (a - c) / max(a - 2 * b + c, 1e-300)
-    if lag * dt > max(_LATE, 0.5 * dt) and cost[best] < _ALIKE * cost[0]:
-        return lag * dt
-    return None
+    enough = lag * dt > max(_LATE, 0.5 * dt, least)
+    return float(lag * dt) if enough and cost[best] < _ALIKE * cost[0] else None

@@ -14,7 +14,9 @@ import yaml
 from easi_jax.gap.places import places
 from easi_jax.gap.scales import scales_of
 from easi_jax.gap.table import covered
+from easi_jax.io.effects_file import read_effects
 from easi_jax.io.logs import read_logs
+from easi_jax.log_data import true_readings
 from easi_jax.parameters import Parameter, ParameterSpace
 from tests.commands import command, read, refused
 from tests.gap_cases import Stated, make_case
@@ -122,6 +124,42 @@ def test_late_velocities_are_named_also_where_positions_show_no_gap(
     assert f"<td>qvel.{joint}</td>" in (out / "report.html").read_text()
     (entry,) = read_plain(out / "effects.yaml")["effects"]
     assert entry["at"] == f"qvel.{joint}" and entry["columns"]["late"] > 0
+
+
+def test_a_named_sensor_that_is_off_is_named(
+    bare: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (bare.directory / "model.xml").read_text()
+    joint = mujoco.MjModel.from_xml_string(text).joint(0).name
+    model = tmp_path / "model.xml"
+    sensor = f'<sensor><jointpos name="encoder" joint="{joint}"/></sensor></mujoco>'
+    model.write_text(text.replace("</mujoco>", sensor))
+    logs = []
+    for path in sorted(bare.directory.glob("run*.csv")):
+        with path.open() as file:
+            rows = list(csv.DictReader(file))
+        logs.append(tmp_path / path.name)
+        with logs[-1].open("w") as file:
+            writer = csv.DictWriter(file, [*rows[0], "sensor.encoder"])
+            writer.writeheader()
+            for r in rows:
+                reading = float(r[f"qpos.{joint}"]) + 0.07
+                writer.writerow({**r, "sensor.encoder": reading})
+    out = tmp_path / "out"
+    command(gap, "--model", model, "--data", *logs, "--out", out)
+    (effect,) = read(out / "gap.json")["effects"]
+    assert (effect["effect"], effect["at"]) == ("sensor_bias", "encoder")
+    assert effect["kind"] == "sensor"
+    assert effect["parameters"]["bias"]["value"] == pytest.approx(0.07, abs=1e-3)
+    assert read(out / "gap.json")["not_in_model_xml"] == ["sensor_bias@encoder"]
+    assert 'Sensor "encoder" is off' in (out / "report.html").read_text().replace(
+        "&#34;", '"'
+    )
+    found = read_effects(out / "effects.yaml")[0]
+    log = read_logs([logs[0]], mujoco.MjModel.from_xml_path(str(model)))
+    (run,) = log.runs
+    (same,) = true_readings(mujoco.MjModel.from_xml_path(str(model)), [run], found)
+    assert same is run, "a sensor's own readings move no joint's"
 
 
 def table_text(shown: str) -> str:

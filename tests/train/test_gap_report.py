@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.fuzz_readers import harmless
+from easi_jax.gap.readings import ReadingFault
 from easi_jax.io.gap_figures import residual_maps
 from easi_jax.io.report import Picture
 from train import _gap_results
@@ -63,7 +64,24 @@ def test_names_do_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     )
     problem = SimpleNamespace(
         model=SimpleNamespace(name=EVIL),
-        late={HANDLER: SimpleNamespace(seconds=0.01, std=0.001, confidence=0.9)},
+        readings=[
+            ReadingFault(
+                "sensor_delay",
+                f"qvel.{HANDLER}",
+                {"late": 0.01},
+                {"late": 0.001},
+                {"delay": (0.01, 0.001, "s")},
+                0.9,
+            ),
+            ReadingFault(
+                "sensor_bias",
+                EVIL,
+                {"bias": 0.1},
+                {"bias": 0.01},
+                {"bias": (0.1, 0.01, "m")},
+                0.9,
+            ),
+        ],
         fit=[SimpleNamespace(dt=0.01)],
         held_name=EVIL,
     )
