@@ -130,7 +130,13 @@ def _generation(
     )
     seconds = least(lambda: run(state, logged)) / config.generations
     steps = chosen.population * chosen.segments * chosen.horizon
-    return {"seconds": seconds, "control_steps_per_s": steps / seconds}
+    state_size = env.mj_model.nq + env.mj_model.nv
+    return {
+        "seconds": seconds,
+        "control_steps_per_s": steps / seconds,
+        # What devices tell each other: every state that was simulated.
+        "gathered_bytes": float(4 * steps * state_size),
+    }
 
 
 def _training(config: Config, env: Any, mesh: Any, seeds: int) -> dict[str, float]:

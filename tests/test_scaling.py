@@ -49,6 +49,27 @@ def test_what_was_not_run_is_said(tmp_path: Path) -> None:
     assert "Not run" in scaling_summary.growth(tmp_path)[1]
 
 
+def test_more_machines_on_paper() -> None:
+    fixed, each = scaling_summary.line_through(
+        [300, 1024, 4096], [0.13, 0.2024, 0.5096]
+    )
+    assert (fixed, each) == pytest.approx((0.1, 1e-4))
+    assert scaling_summary.gathering(8e9, 8, 1e9, 0.5) == pytest.approx(7.0 + 1.5)
+    rows = [
+        {
+            **{"robot": "ant", "option": [], "devices": 2, "device": "cpu"},
+            **{"what": "population", "size": n, "seconds": 0.1 + 1e-4 * n},
+            **{"control_steps_per_s": 1.0, "gathered_bytes": 1e5 * n},
+        }
+        for n in (1000, 2000)
+    ]
+    told, table = scaling_summary.on_paper(rows)
+    assert told.startswith("On paper")
+    # 0.1 + 0.1 / 8 s, 1e8 bytes to 7/8 in 0.07 s and three latencies.
+    assert "| ant, 2 cores | 1000 | 0.2 | 0.183 (38%) | " in table
+    assert scaling_summary.on_paper(rows[:1]) == []
+
+
 @pytest.mark.slow
 def test_more_individuals_take_longer(tmp_path: Path) -> None:
     config = dataclasses.replace(
