@@ -13,6 +13,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 LIMIT = 800  # s; two processes share two cores, and each compiles
 SMALL = ("--env-steps", "2400", "--eval-episodes", "4", "--target", "cart_kp*0.5")
 SEARCH = (
+    # The least-squares finish drifts along the common scale of masses and forces, which
+    # the data leave open, by what sums round.
+    "--no-refine",
     *("--generations", "4", "--population", "16", "--trajectories", "8"),
     *("--set", "segments=16", "real_batch=64", "discriminator_updates=2"),
 )
