@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
+from tests.gap_cases.effects import CaseError
 from tests.gap_cases.logs import Log, Noise
 
 HORIZON = 0.2
@@ -162,7 +163,7 @@ def measure(
         return float(np.sqrt(np.mean((square / variance)[counted]))), np.sqrt(square)
 
     if not counted.any():
-        raise ValueError("no joint moves by more than its noise")
+        raise CaseError("no joint moves by more than its noise")
     (gap, rms), (floor, rms_floor) = total(errors), total(floors)
     return Gap(
         gap=gap,

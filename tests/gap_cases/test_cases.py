@@ -502,3 +502,12 @@ def test_a_machine_that_would_have_to_stand_still_is_drawn_anew(monkeypatch):
     monkeypatch.setattr(settings, "record", lambda *_: None)
     with pytest.raises(CaseError, match="hardly moves"):
         settings.settle(carriage(), np.random.default_rng(0))
+
+
+def test_a_strength_that_holds_every_joint_still_is_no_case() -> None:
+    model = assemble(carriage(), [], 1e-5).model
+    none = np.zeros((300, 1))
+    log = Log(0.01 * np.arange(300), *[none] * 7)
+    noise = Noise(np.array([1e-4]), np.zeros(1))
+    with pytest.raises(CaseError, match="no joint moves"):
+        measure(model, [log], noise, np.random.default_rng(0))
