@@ -27,6 +27,7 @@ from easi_jax.parameters import ParameterSpace
 from easi_jax.segments import Segments
 
 _DAMPING = 10.0 ** np.arange(-2, 4)  # tried together, relative to the last one
+_SHARES = 0.0, 0.3, 1.0  # of the step of its start, of which each piece takes the best
 _TINY = 1e-12
 _SHORT = 0.02  # s of each piece that the first stage fits
 _PATIENCE = 3, 6  # rounds without progress that end each stage
@@ -111,9 +112,12 @@ def refine(
         return 0.5 * jnp.sum(pull * away(u) ** 2, axis=-1)
 
     n, count = space.size, segments.count
+    shares = jnp.asarray(_SHARES if free_starts else _SHARES[:1])
+    steps = 1 + len(_DAMPING)  # trials before the jumps
+    plain = len(shares) * steps
     ways, farthest = _ways(space)
     fresh = jnp.zeros((2, len(ways))), jnp.tile(jnp.asarray(farthest), (2, 1))
-    jumps = slice(1 + len(_DAMPING), 1 + len(_DAMPING) + 2 * len(ways))
+    jumps = slice(steps, steps + 2 * len(ways))
     rounding = _ROUGH if machine.wide else _ROUNDING
     sides = jnp.array([[1.0], [-1.0]])
 
@@ -144,8 +148,9 @@ def refine(
             eq = paired.normal(u, shift, trusted)
             units, shifts = trials(u, shift, damp, hops, begun, eq)
             each = paired.costs(units, shifts, weight)
-        # A piece without trust may be infinitely bad.
-        data = jnp.where(trust > 0, each * trust, 0.0).sum(1)
+        here = _data(each[:1], trust)
+        units, shifts, each = best_starts(units, shifts, each)
+        data = _data(each, trust)
         costs = data + prior(units)
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
         home = len(costs) - 1
@@ -155,7 +160,7 @@ def refine(
         damp = damp * jnp.asarray(_DAMPING)[jnp.argmin(damped)]
         damp = jnp.where(damped.min() < costs[0], damp, 100.0 * damp)
         level = data[jumps].reshape(2, -1)
-        flat, worse = level == data[0], ~(level <= data[0])
+        flat, worse = level == here, ~(level <= here)
         chosen = (jnp.arange(level.size) == best - jumps.start).reshape(level.shape)
         unchanged = jnp.where(
             moving & flat, reach, jnp.where(chosen.any(0), 0.0, unchanged)
@@ -189,19 +194,40 @@ def refine(
             lifted = scaled + damp * jnp.eye(n)
             du = -scale * jnp.linalg.solve(lifted, scale * grad)
             new = jnp.clip(_moved(space, u, du), low, high)
-            gain = jnp.einsum("mdn,n->md", eq.start_gain, new - u)
-            return new, shift + eq.start_step + gain
+            return new, jnp.einsum("mdn,n->md", eq.start_gain, new - u)
 
-        newton, shifted = jax.vmap(trial)(damp * _DAMPING)
-        units = jnp.concatenate([u[None], newton, hops.reshape(-1, n), begun[None]])
-        stay = jnp.broadcast_to(shift, (2 * len(ways) + 1, *shift.shape))
-        return units, jnp.concatenate([stay[:1], shifted, stay[1:], unmoved[None]])
+        newton, followed = jax.vmap(trial)(damp * _DAMPING)
+        near = jnp.concatenate([u[None], newton])
+        shifted = shift + jnp.concatenate([unmoved[None], followed])
+        shifted = shifted + shares[:, None, None, None] * eq.start_step
+        units = [*[near] * len(shares), hops.reshape(-1, n), begun[None]]
+        stay = jnp.broadcast_to(shift, (2 * len(ways), *shift.shape))
+        shifts = [shifted.reshape(-1, *shift.shape), stay, unmoved[None]]
+        return jnp.concatenate(units), jnp.concatenate(shifts)
+
+    def best_starts(units: Any, shifts: Any, each: Any) -> Any:
+        """Those trials that differ in their starts alone as one: given the parameters,
+        each piece takes the start that suits it.
+
+        A step that suits most starts throws some across a change of sign of a speed,
+        and their cost would hide what all others gain.
+        """
+        tried = each[:plain].reshape(len(shares), -1, count)
+        chosen = jnp.argmin(jnp.where(jnp.isfinite(tried), tried, jnp.inf), axis=0)
+        least = jnp.take_along_axis(tried, chosen[None], axis=0)[0]
+        starts = shifts[:plain].reshape(len(shares), -1, *unmoved.shape)
+        starts = jnp.take_along_axis(starts, chosen[None, ..., None], axis=0)[0]
+        return (
+            jnp.concatenate([units[:steps], units[plain:]]),
+            jnp.concatenate([starts, shifts[plain:]]),
+            jnp.concatenate([least, each[plain:]]),
+        )
 
     def swept(
         u: Any, shift: Any, damp: Any, hops: Any, begun: Any, weight: Any, trusted: Any
     ) -> Any:
         """Derivatives, then trials, by one simulation that is compiled once."""
-        size = jumps.stop + 1
+        size = plain + 2 * len(ways) + 1
         points = paired.around(u, shift)
         most = max(size, points[0].shape[0])
 
@@ -326,6 +352,12 @@ def _ways(space: ParameterSpace) -> tuple[np.ndarray, np.ndarray]:
         return single
     common = scaled / space.log_width
     return np.vstack([single[0], common]), np.append(single[1], _FARTHEST[1])
+
+
+def _data(each: jax.Array, trust: jax.Array) -> jax.Array:
+    """Cost of the data, of pieces ``each (T, M)``; without trust they may be infinitely
+    bad."""
+    return jnp.where(trust > 0, each * trust, 0.0).sum(1)
 
 
 def _trust(pieces: jax.Array, used: jax.Array) -> jax.Array:
