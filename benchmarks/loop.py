@@ -5,6 +5,8 @@
     python -m benchmarks.loop --robot go2 --seeds 0 1 2
     python -m train.udr --robot go2 --env-steps 5000000 --out results/go2_udr
     python -m benchmarks.loop --robot go2 --start-from results/go2_udr --seeds 0 1 2
+    python -m benchmarks.loop --robot go2 --effect delay --start-from results/go2_udr \
+        --seeds 0 1 2
 
 The target has an effect that no training knows of. UDR policies act in it; from their
 noisy logs ``train.gap`` finds what the model lacks; ``train.easi`` then searches and
@@ -37,6 +39,10 @@ HIDDEN = {
 - {effect: coulomb_friction, at: RR_calf, kind: joint, columns: {coulomb: 4.0}}
 - {effect: coulomb_friction, at: RR_thigh, kind: joint, columns: {coulomb: 4.0}}
 """,
+        "delay": """effects:
+- {effect: actuator_delay, at: RR_calf, kind: actuator, columns: {delay: 0.04}}
+- {effect: actuator_delay, at: RR_thigh, kind: actuator, columns: {delay: 0.04}}
+""",
     },
 }
 # Standard deviations of a reading [m, rad], of a free joint's six, then of the others.
@@ -53,7 +59,7 @@ class Config:
     robot: str = "cartpole"
     """cartpole or go2."""
     effect: str = "friction"
-    """friction, or delay (cartpole)."""
+    """friction or delay."""
     start_from: Path | None = None
     """Run folder of train.udr that Go2's trainings go on from."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)

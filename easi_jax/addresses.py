@@ -1,7 +1,7 @@
 """The address language: text that names a quantity at one or more places of a model.
 
     joint.NAME.damping     actuator.leg_*.kp     body.torso.mass     option.gravity
-    effect.coulomb.NAME    effect.com.torso.0    effect.tilt.0
+    effect.coulomb.NAME    effect.com.torso.0    effect.tilt.0    effect.slip.FLOOR/FOOT
 
 ``*`` matches any run of characters, so that one parameter can be tied to many places.
 Names may contain dots. What ``effect.`` names lies beyond the model
@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import mujoco
 from mujoco.mjx._src.collision_driver import geom_pairs
 
+from easi_jax.contact_pairs import pair_names
 from easi_jax.effect_quantities import EFFECT_TABLE, VECTORS
 from easi_jax.errors import UserError, nearest
 from easi_jax.quantities import TABLE as MODEL_TABLE
@@ -121,7 +122,8 @@ def places(m: mujoco.MjModel, address: str) -> tuple[tuple[str, str, int], ...]:
             raise UserError(f'address "{address}": it is of the whole model, no name')
         _may_vary(address, "the model", row.refuse(m, 0))
         return ((kind, quantity, 0),)
-    known = names(m, at)
+    # An effect on geoms is one on a pair of them.
+    known = pair_names(m) if (kind, at) == ("effect", "geom") else names(m, at)
     if name in known:
         ids, pattern = [known[name]], False
     else:
@@ -136,12 +138,13 @@ def places(m: mujoco.MjModel, address: str) -> tuple[tuple[str, str, int], ...]:
         )
     found = []
     reason = None
+    where = {i: n for n, i in known.items()}
     for i in ids:
         reason = row.refuse(m, i) or _contact_reason(m, kind, quantity, i)
         if reason is None:
             found.append((kind, quantity, i))
         elif not (pattern and isinstance(reason, Inert)):
-            _may_vary(address, f'{at} "{_name(m, at, i)}"', reason)
+            _may_vary(address, f'{at} "{where[i]}"', reason)
     if not found:
         raise UserError(f'address "{address}" has no effect at any place: {reason}')
     return tuple(found)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from easi_jax.backlash import geared
@@ -34,7 +35,7 @@ class EffectQuantity(Quantity):
     """A row of the table.
 
     Attributes:
-        on: what it sits at: joint, actuator, body or model.
+        on: what it sits at: joint, actuator, body, geom (a pair of them) or model.
         word: what people call it.
         neutral: its value without the effect.
     """
@@ -79,7 +80,15 @@ def _with_gravity(m: Any, _: int) -> str | None:
     return None if np.any(m.opt.gravity) else "the model has no gravity"
 
 
+def _stepwise(m: Any, _: int) -> str | None:
+    if m.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        return "contacts of single pairs do not go with RK4"
+    return None
+
+
 def _direct_contacts(m: Any, _: int) -> None:
+    if _stepwise(m, 0) is None:
+        return  # done in the step
     for solref in (*m.geom_solref, *m.pair_solref):
         if solref[0] > 0:
             solref[:] = -np.asarray(direct_solref(m, solref))
@@ -244,7 +253,24 @@ EFFECT_TABLE: dict[str, EffectQuantity] = {
         )
         for i, word in enumerate(("stiffness", "damping"))
     },
+    "slip": EffectQuantity(
+        *(_at("slip"), _unit("1"), 1e-3),
+        refuse=_stepwise,
+        on="geom",
+        word="friction_factor",
+        neutral=1.0,
+    ),
+    **{
+        f"give.{i}": EffectQuantity(
+            *(_at("give", i), _unit("1"), 1e-6),
+            refuse=_stepwise,
+            on="geom",
+            word=f"{word}_factor",
+            neutral=1.0,
+        )
+        for i, word in enumerate(("stiffness", "damping"))
+    },
 }
-VECTORS = ("com", "force", "tilt", "softness")
+VECTORS = ("com", "force", "tilt", "softness", "give")
 # In the readings, not in the physics.
 READINGS = ("bias", "late")

@@ -2,11 +2,13 @@
 
 An `Effects` holds one number for every effect at every place of a model; all at zero
 strength (`none`) it changes nothing. Static ones (masses, armature, gravity, force
-limits, contacts) are written into the model once by `with_effects`; the others act in
-each physics step (`in_step`) and on the way of a command to its actuator (`commands`).
+limits, contacts of the whole model) are written into the model once by `with_effects`;
+the others act in each physics step (`in_step`, `body_resistance`, `pair_contacts`) and
+on the way of a command to its actuator (`commands`).
 Names and meanings: `easi_jax.gap.table`.
 """
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import flax.struct
@@ -15,10 +17,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import mjx
+from mujoco.mjx._src.types import DisableBit, IntegratorType
 
 from easi_jax import backlash
 from easi_jax.backlash import Rotor
 from easi_jax.constants import set_const
+from easi_jax.contact_pairs import pair_ids
 from easi_jax.quantities import scalar_places
 
 _NO_LIMIT = 1e9
@@ -58,6 +62,9 @@ class Effects:
         tilt: roll and pitch of the base, ``(2,)`` [rad].
         friction: factor on every contact's sliding friction, ``()``.
         softness: factors on stiffness and damping of every contact, ``(2,)``.
+        slip: factor on the sliding friction of a pair of geoms, ``(P,)``
+            (`easi_jax.contact_pairs`).
+        give: factors on stiffness and damping of a pair's contacts, ``(P, 2)``.
         bias: reading less truth, ``(nv,)``.
         late: how late a reading is, ``(nv,)`` [s].
         width: total play between a drive and its joint, ``(nv,)``.
@@ -92,6 +99,8 @@ class Effects:
     tilt: jax.Array
     friction: jax.Array
     softness: jax.Array
+    slip: jax.Array
+    give: jax.Array
     bias: jax.Array
     late: jax.Array
     width: jax.Array
@@ -121,7 +130,7 @@ class CommandMemory:
 def none(m: mujoco.MjModel) -> Effects:
     """No effect anywhere."""
     dof, act, body = jnp.zeros(m.nv), jnp.zeros(m.nu), jnp.zeros(m.nbody)
-    ones = jnp.ones
+    ones, pairs = jnp.ones, len(pair_ids(m))
     return Effects(
         coulomb=dof,
         static=dof,
@@ -149,6 +158,8 @@ def none(m: mujoco.MjModel) -> Effects:
         tilt=jnp.zeros(2),
         friction=ones(()),
         softness=ones(2),
+        slip=ones(pairs),
+        give=ones((pairs, 2)),
         bias=dof,
         late=dof,
         width=dof,
@@ -157,10 +168,8 @@ def none(m: mujoco.MjModel) -> Effects:
     )
 
 
-_STATIC = (
-    *("mass", "spread", "com", "armature", "limit", "gain", "tilt", "friction"),
-    "softness",
-)
+_STATIC = ("mass", "spread", "com", "armature", "limit", "gain", "tilt", "friction")
+IN_CONTACTS = ("softness", "slip", "give")
 _ON_COMMANDS = ("delay", "lag", "deadband", "jump")
 
 
@@ -184,13 +193,18 @@ def resists(present: tuple[str, ...] | None) -> bool:
     return present is None or "resistance" in present
 
 
+def touches(present: Iterable[str] | None) -> bool:
+    """Whether contacts are changed in the step, where they are made."""
+    return present is None or any(name in IN_CONTACTS for name in present)
+
+
 def with_effects(
     m: mjx.Model, e: Effects, present: tuple[str, ...] | None = None
 ) -> mjx.Model:
     """The model with all static effects; pure.
 
-    The model must have been put with force limits on where ``limit`` varies, and
-    contacts in direct form where ``softness`` does.
+    The model must have been put with force limits on where ``limit`` varies, and, for
+    RK4, contacts in direct form where ``softness`` does.
 
     Args:
         present: fields that may differ from none; None: any of them.
@@ -223,7 +237,7 @@ def with_effects(
         new["geom_friction"] = m.geom_friction.at[:, 0].multiply(e.friction)
         if m.npair:
             new["pair_friction"] = m.pair_friction.at[:, :2].multiply(e.friction)
-    if on("softness"):
+    if on("softness") and m.opt.integrator == IntegratorType.RK4:
         new["geom_solref"] = _softened(m.geom_solref, e.softness)
         if m.npair:
             new["pair_solref"] = _softened(m.pair_solref, e.softness)
@@ -239,6 +253,17 @@ def _apart(e: Effects) -> jax.Array:
 def _softened(solref: jax.Array, factors: jax.Array) -> jax.Array:
     # Only the direct form (-stiffness, -damping) scales like this.
     return jnp.where(solref < 0, solref * factors, solref)
+
+
+def _direct(m: mjx.Model, solref: jax.Array) -> jax.Array:
+    """Solver references ``(n, 2)`` in direct form; as `quantities.direct_solref`."""
+    time, ratio = solref.T
+    standard = time > 0
+    if not m.opt.disableflags & DisableBit.REFSAFE:
+        time = jnp.maximum(time, 2 * m.opt.timestep)
+    time, ratio = (jnp.where(standard, x, 1.0) for x in (time, ratio))
+    direct = -jnp.stack([1 / (time * ratio) ** 2, 2 / time], 1)
+    return jnp.where(standard[:, None], direct, solref)
 
 
 def tilted(gravity: jax.Array, tilt: jax.Array) -> jax.Array:
@@ -307,6 +332,23 @@ def body_resistance(m: mjx.Model, d: mjx.Data, e: Effects) -> mjx.Data:
     speed = jnp.sqrt(jnp.sum(v * v, 1) + 1e-12)
     force = -(e.resistance * speed)[:, None] * v
     return d.replace(xfrc_applied=d.xfrc_applied.at[:, :3].add(force))
+
+
+def pair_contacts(m: mjx.Model, d: mjx.Data, e: Effects) -> mjx.Data:
+    """Data whose contacts have the softness of all and what their pair of geoms has,
+    after `collision`."""
+    if not d._impl.ncon:
+        return d
+    number = np.zeros((m.ngeom, m.ngeom), np.int32)
+    for k, (a, b) in enumerate(pair_ids(m)):
+        number[a, b] = number[b, a] = k
+    contact = d._impl.contact
+    pair = jnp.asarray(number)[contact.geom1, contact.geom2]
+    friction = contact.friction.at[:, :2].multiply(e.slip[pair][:, None])
+    factors = e.softness * e.give[pair]
+    solref = _softened(_direct(m, contact.solref), factors)
+    contact = contact.replace(friction=friction, solref=solref)
+    return d.tree_replace({"_impl.contact": contact})
 
 
 def first_memory(steps: int, nu: int) -> CommandMemory:

@@ -1,5 +1,6 @@
 """One control step of physics: the state, the substeps, and nothing else."""
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import flax.struct
@@ -8,7 +9,10 @@ import jax.numpy as jnp
 from mujoco import mjx
 from mujoco.mjx._src import forward as mjx_forward
 from mujoco.mjx._src import sensor as mjx_sensor
+from mujoco.mjx._src import smooth as mjx_smooth
 from mujoco.mjx._src import solver as mjx_solver
+from mujoco.mjx._src.collision_driver import collision
+from mujoco.mjx._src.constraint import make_constraint
 from mujoco.mjx._src.types import IntegratorType
 
 from easi_jax import effects, solver
@@ -74,25 +78,62 @@ def data_at(model: Any, state: Physics, ctrl: jax.Array) -> mjx.Data:
     )
 
 
+@dataclass(frozen=True)
+class Within:
+    """Effects that act between the parts of a physics step.
+
+    Attributes:
+        effects: their strengths.
+        resists: whether bodies may have drag, which needs their velocities.
+        touches: whether contacts are changed where they are made.
+    """
+
+    effects: Effects
+    resists: bool
+    touches: bool
+
+
+def _within(model: Any) -> Within | None:
+    resists = effects.resists(model.present)
+    touches = effects.touches(model.present)
+    if model.effects is None or not (resists or touches):
+        return None
+    return Within(model.effects, resists, touches)
+
+
+def _position(m: mjx.Model, d: mjx.Data, e: Effects) -> mjx.Data:
+    """`fwd_position`, contacts changed where their constraints are made."""
+    for part in (
+        *(mjx_smooth.kinematics, mjx_smooth.com_pos, mjx_smooth.camlight),
+        *(mjx_smooth.tendon, mjx_smooth.crb, mjx_smooth.tendon_armature),
+        *(mjx_smooth.factor_m, collision),
+    ):
+        d = part(m, d)
+    d = effects.pair_contacts(m, d, e)
+    return mjx_smooth.transmission(m, make_constraint(m, d))
+
+
 def forward(
-    m: mjx.Model, d: mjx.Data, wide: bool = False, e: Effects | None = None
+    m: mjx.Model, d: mjx.Data, wide: bool = False, within: Within | None = None
 ) -> mjx.Data:
     """`mjx.forward` with this package's constraint solver where it applies.
 
-    ``wide`` is the solver for batches of larger robots (`easi_jax.wide_solver`);
-    ``e`` holds the drag of bodies, which needs their velocities.
+    ``wide`` is the solver for batches of larger robots (`easi_jax.wide_solver`).
     """
     own = solver.supported(m)
-    if not own and e is None:
+    if not own and within is None:
         return mjx.forward(m, d)
-    d = mjx_forward.fwd_position(m, d)
+    if within is not None and within.touches:
+        d = _position(m, d, within.effects)
+    else:
+        d = mjx_forward.fwd_position(m, d)
     d = mjx_sensor.sensor_pos(m, d)
     d = mjx_forward.fwd_velocity(m, d)
     if own:
         d = with_velocity_products(m, d)
     d = mjx_sensor.sensor_vel(m, d)
-    if e is not None:
-        d = effects.body_resistance(m, d, e)
+    if within is not None and within.resists:
+        d = effects.body_resistance(m, d, within.effects)
     d = mjx_forward.fwd_actuation(m, d)
     d = mjx_forward.fwd_acceleration(m, d)
     if d._impl.efc_J.size == 0:
@@ -105,15 +146,15 @@ def forward(
 
 
 def mjx_step(
-    m: mjx.Model, d: mjx.Data, wide: bool = False, e: Effects | None = None
+    m: mjx.Model, d: mjx.Data, wide: bool = False, within: Within | None = None
 ) -> mjx.Data:
     """`mjx.step`, its constraint solve and small matrices batched well; see `forward`.
 
-    RK4 leaves the drag of bodies out.
+    RK4 leaves effects within a step out.
     """
     if m.opt.integrator == IntegratorType.RK4:
         return mjx.step(m, d)  # RK4 solves inside its stages
-    d = forward(m, d, wide, e)
+    d = forward(m, d, wide, within)
     if m.opt.integrator == IntegratorType.EULER:
         return mjx_forward.euler(m, d)
     return mjx_forward.implicit(_without_clamped(m, d), d)
@@ -157,7 +198,7 @@ def substep(model: Any, state: Physics, ctrl: jax.Array, wide: bool = False) -> 
     e, rotor = model.effects, state.rotor
     if e is not None:
         m, d, rotor = effects.in_step(m, d, e, rotor)
-    d = mjx_step(m, d, wide, e if effects.resists(model.present) else None)
+    d = mjx_step(m, d, wide, _within(model))
     qvel = jnp.clip(d.qvel, -model.speed_limit, model.speed_limit)
     sensed = model.sense(model.mjx, d) if model.sense else ()
     return Physics(d.qpos, qvel, d.act, d.qacc_warmstart, sensed, (), rotor)

@@ -25,8 +25,8 @@ _WORDS = {
     "gravity_tilt": "the base is tilted (roll {roll}, pitch {pitch})",
     "sensor_bias": 'the reading of joint "{at}" is off by {bias}',
     "sensor_delay": 'the reading of "{at}" comes {delay} late',
-    "contact_friction": "contacts have a sliding friction of {friction}",
-    "contact_softness": "contacts have a stiffness of {stiffness}",
+    "contact_friction": "contacts{pair} have a sliding friction of {friction}",
+    "contact_softness": "contacts{pair} have a stiffness of {stiffness}",
 }
 
 
@@ -35,7 +35,10 @@ def sentence(found: Any) -> str:
     shown = {k: f"{v:.3g} {u}".strip() for k, (v, _, u) in found.values.items()}
     shown = {k: v.removesuffix(" 1") for k, v in shown.items()}
     place = found.place
-    return _WORDS[place.effect].format(at=place.at, kind=place.kind, **shown)
+    names = (f'"{name}"' for name in place.at.split("/"))
+    pair = f" between {' and '.join(names)}" if place.kind == "geom" else ""
+    said = {"at": place.at, "kind": place.kind, "pair": pair}
+    return _WORDS[place.effect].format(**said, **shown)
 
 
 def parameters_text(values: Any, between: str) -> str:
@@ -249,11 +252,10 @@ def retrained_line(retrained: dict[str, Any]) -> str:
 
 def column_name(column: Any) -> str:
     """A column's name in an effects file: ``com.0`` for one entry of a vector."""
-    vector = {"com", "force"}
-    if column.field in vector:
-        return f"{column.field}.{column.index[1]}"
-    if column.field in ("tilt", "softness"):
-        return f"{column.field}.{column.index[0]}"
+    from easi_jax.effect_quantities import VECTORS
+
+    if column.field in VECTORS:
+        return f"{column.field}.{column.index[-1]}"
     return column.field
 
 

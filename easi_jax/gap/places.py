@@ -6,8 +6,12 @@ import mujoco
 import numpy as np
 
 from easi_jax import backlash
+from easi_jax.contact_pairs import contact_pairs
 from easi_jax.gap.table import Column, Place, Scales, name_of
-from easi_jax.quantities import direct_solref, linear_drive, scalar_dofs
+from easi_jax.quantities import linear_drive, scalar_dofs
+
+_SELDOM = 0.02  # of the rows: a pair of geoms that touches less says nothing
+_PAIRS = 12  # at most, that are looked at one by one
 
 
 def places(m: mujoco.MjModel, s: Scales) -> list[Place]:
@@ -36,39 +40,20 @@ def places(m: mujoco.MjModel, s: Scales) -> list[Place]:
                 ((0.0, 0.0),),
             )
         )
-    if _contacts(m):
-        slides, stiff, damped = _contact(m)
-        out.append(
-            Place(
-                "contact_friction",
-                "",
-                "model",
-                (
-                    Column(
-                        "friction", (), "friction", "1", 1.0, 0.05, 10.0, 0.05, slides
-                    ),
-                ),
-                ((0.6,), (1.6,)),
-            )
+    pairs = contact_pairs(m)
+    if pairs:
+        slides = max(float(p.friction[0]) for p in pairs)
+        stiff, damped = (
+            float(np.mean([getattr(p, name) for p in pairs]))
+            for name in ("stiffness", "damping")
         )
-        out.append(
-            Place(
-                "contact_softness",
-                "",
-                "model",
-                (
-                    Column(
-                        *("softness", (0,), "stiffness", "1/s2"),
-                        *(1.0, 1e-3, 50.0, 0.05, stiff),
-                    ),
-                    Column(
-                        *("softness", (1,), "damping", "1/s"),
-                        *(1.0, 1e-2, 50.0, 0.05, damped),
-                    ),
-                ),
-                ((0.3, 0.5), (0.1, 0.3)),
-            )
-        )
+        out += _contacts("", "model", (), slides, stiff, damped)
+    often = [k for k in np.argsort(-s.touching) if s.touching[k] > _SELDOM]
+    if len(often) > 1 and m.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
+        for k in sorted(often[:_PAIRS]):
+            p = pairs[k]
+            values = float(p.friction[0]), p.stiffness, p.damping
+            out += _contacts(p.name, "geom", (int(k),), *values)
     return out
 
 
@@ -80,22 +65,32 @@ def _moves(m: mujoco.MjModel, b: int) -> bool:
     return False
 
 
-def _contact(m: mujoco.MjModel) -> tuple[float, float, float]:
-    """Sliding friction, stiffness [1/s^2] and damping [1/s] of the model's contacts."""
-    if m.npair:
-        friction, solref = m.pair_friction[:, 0], m.pair_solref
-    else:
-        solid = (m.geom_contype > 0) | (m.geom_conaffinity > 0)
-        friction, solref = m.geom_friction[solid, 0], m.geom_solref[solid]
-    stiffness, damping = np.mean([direct_solref(m, s) for s in solref], axis=0)
-    return float(friction.max()), float(stiffness), float(damping)
-
-
-def _contacts(m: mujoco.MjModel) -> bool:
-    if m.npair:
-        return True
-    solid = (m.geom_contype > 0) | (m.geom_conaffinity > 0)
-    return int(solid.sum()) > 1
+def _contacts(
+    at: str,
+    kind: str,
+    index: tuple[int, ...],
+    friction: float,
+    stiffness: float,
+    damping: float,
+) -> list[Place]:
+    """Friction and softness of all contacts, or of those of a pair of geoms, which
+    have these values in the model as given."""
+    slip, give = ("slip", "give") if index else ("friction", "softness")
+    rubs = Column(slip, index, "friction", "1", 1.0, 0.05, 10.0, 0.05, friction)
+    soft = (
+        Column(
+            *(give, (*index, 0), "stiffness", "1/s2"),
+            *(1.0, 1e-3, 50.0, 0.05, stiffness),
+        ),
+        Column(
+            *(give, (*index, 1), "damping", "1/s"),
+            *(1.0, 1e-2, 50.0, 0.05, damping),
+        ),
+    )
+    return [
+        Place("contact_friction", at, kind, (rubs,), ((0.6,), (1.6,))),
+        Place("contact_softness", at, kind, soft, ((0.3, 0.5), (0.1, 0.3))),
+    ]
 
 
 def _at_joint(m: mujoco.MjModel, j: int, s: Scales) -> list[Place]:

@@ -21,6 +21,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from easi_jax import backlash, effects
 from easi_jax.backlash import Rotor
+from easi_jax.contact_pairs import pair_ids
 from easi_jax.distributed import started
 from easi_jax.effect_quantities import EFFECT_TABLE
 from easi_jax.effects import Effects
@@ -47,6 +48,7 @@ def opened(m: mujoco.MjModel) -> mujoco.MjModel:
     """
     out = copy.deepcopy(m)
     count = {"joint": m.njnt, "actuator": m.nu, "body": m.nbody, "model": 1}
+    count["geom"] = len(pair_ids(m))
     for row in EFFECT_TABLE.values():
         for i in range(count[row.on]):
             if row.refuse(m, i) is None:
@@ -55,8 +57,13 @@ def opened(m: mujoco.MjModel) -> mujoco.MjModel:
 
 
 _PLAY = ("width", "rotor", "felt")
-# Most predictions have no use for drives of their own.
-_RIGID = tuple(f for f in Effects.__dataclass_fields__ if f not in _PLAY)
+
+
+def _fields(layout: Layout) -> tuple[str, ...]:
+    """Of `Effects`, those that predictions reckon with."""
+    varied = {c.field for c in layout.columns}
+    unused = () if effects.touches(varied) else effects.IN_CONTACTS
+    return tuple(f for f in Effects.__dataclass_fields__ if f not in unused)
 
 
 class Predictor:
@@ -105,6 +112,7 @@ class Predictor:
         )
         self._delay_steps = math.ceil(latest / dt - 1e-9) + 1
         # The second is for the few predictions in which a drive has play.
+        self._fields = _fields(layout)
         self._programs = tuple(
             jax.jit(partial(self._sharded, play), compiler_options=options)
             for play, options in (
@@ -177,7 +185,7 @@ class Predictor:
         """The model of a vector ``(n,)``; pure. ``play``: whether drives may have."""
         e = self.layout.effects(x[self.own :])
         model = self.machine.model(x[: self.own])
-        present = None if play else _RIGID
+        present = tuple(f for f in self._fields if play or f not in _PLAY)
         return model.replace(
             mjx=effects.with_effects(model.mjx, e, present),
             effects=e,

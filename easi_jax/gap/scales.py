@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from easi_jax.contact_pairs import pair_ids, touching
 from easi_jax.drive_forces import drive_forces
 from easi_jax.gap.table import Scales
 from easi_jax.recording import Run
@@ -21,9 +22,9 @@ def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
     total = sum(len(r) for r in runs)
     stride = max(1, total // _ROWS)
     rows: dict[str, list[np.ndarray]] = {
-        k: [] for k in ("v", "a", "torque", "force", "inertia", "ctrl", "q")
+        k: [] for k in ("v", "a", "torque", "force", "inertia", "ctrl", "q", "touching")
     }
-    full = np.zeros((m.nv, m.nv))
+    full, pairs = np.zeros((m.nv, m.nv)), pair_ids(m)
     for run in runs:
         v = fitted_velocity(run.qpos, run.dt, run.configuration)
         span = max(1, round(0.02 / run.dt))
@@ -35,6 +36,7 @@ def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
             d.ctrl[:] = run.ctrl[i]
             acceleration = d.qacc.copy()
             mujoco.mj_forward(m, d)
+            rows["touching"].append(np.array(touching(pairs, d)))
             driven = d.qfrc_actuator.copy()
             force = d.actuator_force.copy()
             d.qacc[:] = acceleration
@@ -68,6 +70,7 @@ def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
         force=np.maximum(rms(got["force"]), 1e-9) if m.nu else np.zeros(0),
         peak=np.percentile(np.abs(forces), _PEAK, axis=0) if m.nu else np.zeros(0),
         span=np.maximum(np.ptp(got["q"], 0), 1e-9),
+        touching=got["touching"].mean(0),
         dt=runs[0].dt,
         longest=max(_LONGEST, 3 * runs[0].dt),
     )

@@ -104,7 +104,7 @@ class Place:
 
     Attributes:
         effect: its name.
-        at: the joint, actuator, body or geom; "" for the whole model.
+        at: the joint, actuator, body or pair of geoms; "" for the whole model.
         kind: what ``at`` is.
         columns: its numbers.
         starts: values of the columns that a fit starts from, in turn.
@@ -147,6 +147,8 @@ class Scales:
         force: RMS of an actuator's force, ``(nu,)``.
         peak: its largest, but for two rows in 1,000, ``(nu,)``.
         span: range of positions, ``(nv,)``.
+        touching: share of rows in which pairs of geoms touch, ``(P,)``
+            (`easi_jax.contact_pairs`).
         dt: control step [s].
         longest: longest delay that is looked for [s].
     """
@@ -160,6 +162,7 @@ class Scales:
     force: np.ndarray
     peak: np.ndarray
     span: np.ndarray
+    touching: np.ndarray
     dt: float
     longest: float
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from easi_jax.contact_pairs import contact_pairs, geom_name, pair_names
 from easi_jax.found_effects import EffectEntry
 from easi_jax.io.model_file import ways
 
@@ -155,7 +156,11 @@ def _add(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
             )
         )
         return True
-    return _contacts(spec, e)
+    if e.kind == "geom":
+        _pair_contacts(spec, m, e)
+    else:
+        _contacts(spec, e)
+    return True
 
 
 def _spring(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
@@ -213,23 +218,48 @@ def _body(body: mujoco.MjsBody, m: mujoco.MjModel, e: EffectEntry) -> None:
     body.inertia = m.body_inertia[b] * (1 + c.get("spread", 0.0) * extra / mass)
 
 
-def _contacts(spec: mujoco.MjSpec, e: EffectEntry) -> bool:
+def _contacts(spec: mujoco.MjSpec, e: EffectEntry) -> None:
+    """All contacts; pairs hold their own numbers, geoms those of the others."""
     c = e.columns
-    for g in spec.geoms:
+    for item in (*spec.geoms, *spec.pairs):
         if e.effect == "contact_friction":
-            friction = np.array(g.friction)
-            friction[0] *= c["friction"]
-            g.friction = friction
+            friction = np.array(item.friction)
+            friction[: 1 if len(friction) == 3 else 2] *= c["friction"]
+            item.friction = friction
         else:
             factors = np.array([c["softness.0"], c["softness.1"]])
-            solref = np.array(g.solref)
-            if (solref > 0).all():
-                # Stiffness goes with the inverse square of the time constant, damping
-                # with its inverse.
-                time, ratio = solref
-                time /= factors[1]
-                ratio *= factors[1] / np.sqrt(factors[0])
-                g.solref = np.array([time, ratio])
-            else:
-                g.solref = solref * factors
-    return not list(spec.pairs)
+            item.solref = _softer(np.array(item.solref), factors)
+
+
+def _softer(solref: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Contacts whose stiffness and damping are multiplied by ``factors (2,)``."""
+    if (solref <= 0).any():
+        return solref * factors
+    # Stiffness goes with the inverse square of the time constant, damping with its
+    # inverse.
+    time, ratio = solref
+    time /= factors[1]
+    return np.array([time, ratio * factors[1] / np.sqrt(factors[0])])
+
+
+def _pair_contacts(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> None:
+    """One pair of geoms, which becomes a ``<pair>`` where it is none."""
+    c, p = e.columns, contact_pairs(m)[pair_names(m)[e.at]]
+    names = [geom_name(m, g) for g in p.geoms]
+    for g, name in zip(p.geoms, names, strict=True):
+        spec.geoms[g].name = name
+    # Compiled pairs are in another order.
+    there = [q for q in spec.pairs if {q.geomname1, q.geomname2} == set(names)]
+    if there:
+        pair = there[-1]
+    else:
+        pair = spec.add_pair(geomname1=names[0], geomname2=names[1])
+        pair.condim, pair.margin, pair.solimp = p.dim, p.margin, p.solimp
+        pair.friction, pair.solref = p.friction, p.solref
+    if e.effect == "contact_friction":
+        friction = np.array(pair.friction)
+        friction[:2] *= c["slip"]
+        pair.friction = friction
+    else:
+        factors = np.array([c["give.0"], c["give.1"]])
+        pair.solref = _softer(np.array(pair.solref), factors)
