@@ -19,6 +19,7 @@ from benchmarks import (
     scaling_summary,
 )
 from benchmarks._common import RESULTS, markdown_table
+from benchmarks.export import GOAL
 from benchmarks.physics import GOALS
 from benchmarks.recovery import CASES
 from benchmarks.robots import STARTS
@@ -53,6 +54,7 @@ def run(config: Config) -> None:
             _transfer,
             _real,
             _fuzz,
+            _export,
             crash_summary.faults,
             crash_summary.crashes,
             crash_summary.soak,
@@ -326,6 +328,34 @@ def _fuzz(folder: Path) -> list[str]:
         "started, a file read or written elsewhere) is a failure: "
         f"{total['failed']} of them ({_met(total['failed'] == 0)}).",
         markdown_table(("reader", *columns, "slowest [ms]"), rows),
+    ]
+
+
+def _export(folder: Path) -> list[str]:
+    out, r = ["## Exported policies"], _read(folder, "export")
+    if r is None:
+        return [*out, "Not run: `python -m benchmarks.export`."]
+    rows, most = [], max(c["onnx"] for c in r["cases"])
+    for robot in dict.fromkeys(c["robot"] for c in r["cases"]):
+        mine = [c for c in r["cases"] if c["robot"] == robot]
+        trained = sum("trained" in c["policy"] for c in mine)
+        rows.append(
+            (
+                robot,
+                f"{len(mine)} ({trained} trained)",
+                f"{max(c['onnx'] for c in mine):.1e}",
+                f"{max(c['stablehlo'] for c in mine):.1e}",
+                f"{min(c['onnx_us'] for c in mine):.0f}",
+            )
+        )
+    return [
+        *out,
+        f"`{r['command']}`: largest difference of an action or a command from JAX over "
+        f"{r['observations']:,} observations; goal {GOAL:g} for ONNX: "
+        f"{_met(most <= GOAL)}.",
+        markdown_table(
+            ("robot", "policies", "ONNX", "StableHLO", "a call of ONNX [us]"), rows
+        ),
     ]
 
 

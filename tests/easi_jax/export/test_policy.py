@@ -4,64 +4,38 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
 
+from benchmarks.export import (
+    by_jax,
+    by_onnx,
+    drawn_policy,
+    observations,
+    onnx_session,
+)
 from easi_jax.env import start
 from easi_jax.export.policy import interface_of, to_onnx, to_stablehlo
-from easi_jax.rl.networks import PolicyParams, act, make_networks
 from envs import REGISTRY, load, make
 
 ROOT = Path(__file__).parents[3]
-COUNT = 10_000
-
-
-def policy_of(env: Any, hidden: tuple[int, ...] = (256, 256)) -> PolicyParams:
-    networks = make_networks(env.obs_size, env.action_size, hidden)
-    k_net, k_mean, k_std = jax.random.split(jax.random.key(0), 3)
-    return PolicyParams(
-        mean=jax.random.normal(k_mean, (env.obs_size,)),
-        std=jnp.exp(jax.random.normal(k_std, (env.obs_size,))),
-        network=networks.policy_network.init(k_net),
-    )
-
-
-def observations(env: Any, policy: PolicyParams) -> np.ndarray:
-    """As a trained policy sees them, and some far beyond."""
-    rng = np.random.default_rng(1)
-    size = np.exp(rng.normal(0.0, 0.5, (COUNT, 1)))
-    z = size * rng.normal(size=(COUNT, env.obs_size))
-    return np.asarray(policy.mean + policy.std * z, np.float32)
 
 
 def ran(content: bytes, obs: np.ndarray) -> dict[str, np.ndarray]:
-    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    names = [o.name for o in session.get_outputs()]
-    values = session.run(names, {"observation": obs})
-    return {n: np.asarray(v) for n, v in zip(names, values, strict=True)}
-
-
-def wanted(env: Any, policy: PolicyParams, obs: np.ndarray) -> dict[str, np.ndarray]:
-    action = act(policy, jnp.asarray(obs), deterministic=True)
-    return {
-        "action": np.asarray(action),
-        "ctrl": np.asarray(env.action_map(jnp.asarray(obs), action)),
-    }
+    return by_onnx(onnx_session(content), obs)
 
 
 @pytest.mark.parametrize("name", REGISTRY)
 def test_onnx_is_the_policy(name: str) -> None:
     env = make(name)
-    policy = policy_of(env)
+    policy = drawn_policy(env)
     obs = observations(env, policy)
     got = ran(to_onnx(policy, interface_of(env), env.action_map), obs)
-    want = wanted(env, policy, obs)
+    want = by_jax(env, policy, obs)
     assert got.keys() == want.keys()
     for key, value in want.items():
         np.testing.assert_allclose(got[key], value, atol=1e-5, err_msg=key)
@@ -70,14 +44,14 @@ def test_onnx_is_the_policy(name: str) -> None:
 
 def test_stablehlo_is_the_policy() -> None:
     env = make("cartpole")
-    policy = policy_of(env, (32,))
+    policy = drawn_policy(env, hidden=(32,))
     obs = observations(env, policy)
     program, text = to_stablehlo(policy, interface_of(env), env.action_map)
     exported = jax.export.deserialize(bytearray(program))
     assert {"cpu", "cuda", "tpu"} <= set(exported.platforms)
     assert "stablehlo" in text
     for part in (obs[:1], obs):
-        got, want = exported.call(part), wanted(env, policy, part)
+        got, want = exported.call(part), by_jax(env, policy, part)
         for key, value in want.items():
             np.testing.assert_allclose(got[key], value, atol=1e-5, err_msg=key)
 
@@ -121,7 +95,7 @@ def test_named_joints_are_those_observed() -> None:
 
 def test_a_robot_without_an_action_map_exports_its_action() -> None:
     env = make("cartpole")
-    policy = policy_of(env, (8,))
+    policy = drawn_policy(env, hidden=(8,))
     got = ran(to_onnx(policy, interface_of(env)), observations(env, policy))
     assert list(got) == ["action"]
 
@@ -129,7 +103,7 @@ def test_a_robot_without_an_action_map_exports_its_action() -> None:
 def test_the_example_loop_drives_a_robot(tmp_path: Path) -> None:
     """In a process that has neither jax nor this package."""
     env = make("cartpole")
-    policy = policy_of(env, (16,))
+    policy = drawn_policy(env, hidden=(16,))
     model = to_onnx(policy, interface_of(env), env.action_map)
     (tmp_path / "policy.onnx").write_bytes(model)
     onnx.checker.check_model(str(tmp_path / "policy.onnx"))
@@ -151,7 +125,7 @@ def test_the_example_loop_drives_a_robot(tmp_path: Path) -> None:
     )
     rows = [json.loads(x) for x in (tmp_path / "sent.jsonl").read_text().splitlines()]
     obs = np.array([[0.1, -0.2, 0.3, 0.4]], np.float32)
-    want = wanted(env, policy, obs)["ctrl"][0]
+    want = by_jax(env, policy, obs)["ctrl"][0]
     assert len(rows) == 6
     for _, commands in rows:
         assert list(commands) == ["cart"]
