@@ -32,6 +32,10 @@ class Config:
     """Mechanisms of one or two joints; without it those of three and six, and a leg."""
     coarse: bool = False
     """Models whose own physics step is seen in the gap; give --out gap_coarse.jsonl."""
+    effect: str = ""
+    """The hidden effect, drawn where not given; give --out gap_contacts.jsonl or so."""
+    mechanism: str = ""
+    """The machine, drawn where not given."""
     out: Path = RESULTS / "gap_cases.jsonl"
     """Where a line for each case is added."""
 
@@ -53,13 +57,14 @@ def run(config: Config) -> None:
         with tempfile.TemporaryDirectory() as folder:
             data = Path(folder) / "case"
             try:
-                mechanism = "" if config.cheap else LARGE[seed % len(LARGE)]
+                large = "" if config.cheap else LARGE[seed % len(LARGE)]
                 draw_case(
                     seed,
                     config.kind,
                     data,
                     cheap=config.cheap,
-                    mechanism=mechanism,
+                    effect=config.effect,
+                    mechanism=config.mechanism or large,
                     coarse=config.coarse,
                 )
             except CaseError as error:

@@ -92,7 +92,29 @@ def generated(folder: Path) -> list[str]:
         "![What each true effect was named](gap_confusion.svg)",
         "The counts are in `gap_confusion.json`.",
     ]
-    return out + coarse(folder)
+    return out + contacts(folder) + coarse(folder)
+
+
+def contacts(folder: Path) -> list[str]:
+    """Cases whose hidden effect is one of contacts, on a machine that hops along."""
+    rows = read_cases(folder / "gap_contacts.jsonl")
+    if not rows:
+        return []
+    lines = [
+        (
+            r["mechanism"],
+            ", ".join(r["truth"]),
+            ", ".join(r["named"]) or "none",
+            *(f"{r['gap'][k] / r['gap']['floor']:.2f}" for k in ("refit", "after")),
+        )
+        for r in rows
+    ]
+    return [
+        "Contacts are drawn seldom, and only legs have them; these are drawn on "
+        "purpose (`python -m benchmarks.gap --effect contact_friction --mechanism "
+        "hopper --out benchmarks/results/gap_contacts.jsonl`, and so on):",
+        markdown_table(("machine", "hidden", "named", "gap in floors", "after"), lines),
+    ]
 
 
 def coarse(folder: Path) -> list[str]:

@@ -87,7 +87,7 @@ def draw_case(
         raise ValueError(f"unknown kind {kind!r}; choose from {CASE_KINDS}")
     mechanisms = (mechanism,) if mechanism else CHEAP if cheap else MECHANISMS
     if effect.startswith("contact_") and not mechanism:
-        mechanisms = ("leg",)
+        mechanisms = ("leg", "hopper")
     rng = np.random.default_rng([seed, CASE_KINDS.index(kind)])
     reason = ""
     for _ in range(TRIES):

@@ -63,6 +63,11 @@ class Mechanism:
         """Joint of each actuator, in the order of the actuators."""
         return tuple(i for i, joint in enumerate(self.joints) if joint.actuator)
 
+    @property
+    def on_ground(self) -> bool:
+        """Whether it stands on a foot."""
+        return self.name in ("leg", "hopper")
+
     def xml(self) -> str:
         """The MJCF text; joints stand in it as `{name}` of `bodies`."""
         joints = {joint.name: _joint_xml(joint) for joint in self.joints}

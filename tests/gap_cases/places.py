@@ -49,7 +49,7 @@ def places(mechanism: Mechanism, effect: str) -> list[str]:
     """Names of the places where the effect changes what is measured."""
     driven = [mechanism.joints[i] for i in mechanism.driven]
     if effect in ("contact_friction", "contact_softness"):
-        return [""] if mechanism.name == "leg" else []
+        return [""] if mechanism.on_ground else []
     if effect == "gravity_tilt":
         return [""]
     if effect in ("gain_drift", "dropped_commands") or KINDS.get(effect) == "actuator":

@@ -188,6 +188,17 @@ def _leg(draw: Draw) -> Parts:
     )
 
 
+def _hopper(draw: Draw) -> Parts:
+    """A leg whose trunk slides along as well: it moves where its foot holds."""
+    joints, bodies = _leg(draw)
+    rails = replace(joints[0], name="along", amplitude=0.1)
+    held = '      <joint {height} axis="0 0 1"/>\n'
+    assert held in bodies
+    return [rails, *joints], bodies.replace(
+        held, '      <joint {along} axis="1 0 0"/>\n' + held
+    )
+
+
 _BUILDERS: dict[str, Callable[[Draw], Parts]] = {
     "slide": _slide,
     "pendulum": _pendulum,
@@ -196,6 +207,7 @@ _BUILDERS: dict[str, Callable[[Draw], Parts]] = {
     "arm3": _arm3,
     "arm6": _arm6,
     "leg": _leg,
+    "hopper": _hopper,
 }
 
 
@@ -216,7 +228,8 @@ def build(name: str, rng: np.random.Generator, stated: Stated) -> Mechanism:
         bodies=bodies,
         timestep=float(rng.choice(steps)),
         control_step=control_step,
-        speed=float(rng.uniform(0.8, 1.6)) * (0.6 if name == "leg" else 1.0),
+        speed=float(rng.uniform(0.8, 1.6))
+        * (0.6 if name in ("leg", "hopper") else 1.0),
         open_loop=name == "pendulum"
         and joints[0].drive == "motor"
         and damped

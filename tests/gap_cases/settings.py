@@ -39,7 +39,7 @@ def owner_model(mechanism: Mechanism) -> mujoco.MjModel:
 
 def _scale(mechanism: Mechanism) -> np.ndarray:
     # A contact turns small errors of the height into large forces.
-    slide = SLIDE_SCALE / 3 if mechanism.name == "leg" else SLIDE_SCALE
+    slide = SLIDE_SCALE / 3 if mechanism.on_ground else SLIDE_SCALE
     return np.array([1.0 if j.kind == "hinge" else slide for j in mechanism.joints])
 
 
@@ -60,9 +60,11 @@ def _context(mechanism: Mechanism, log: Log, fine: float) -> Context:
     model = owner_model(mechanism)
     inertia = felt_inertia(model, home(mechanism))
     torque = inertia * np.sqrt(np.mean(log.qacc**2, axis=0))
-    if mechanism.name == "leg":
+    if mechanism.on_ground:
         # What matters to the trunk is its weight.
-        torque[0] = max(float(torque[0]), 0.2 * float(inertia[0]) * GRAVITY)
+        rails = [i for i, j in enumerate(mechanism.joints) if j.body == "trunk"]
+        weight = 0.2 * inertia[rails] * GRAVITY
+        torque[rails] = np.maximum(torque[rails], weight)
     for column, joint in enumerate(mechanism.driven):
         drive = mechanism.joints[joint].gear * log.force[:, column]
         torque[joint] = max(torque[joint], float(np.sqrt(np.mean(drive**2))))
