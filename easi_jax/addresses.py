@@ -122,8 +122,10 @@ def places(m: mujoco.MjModel, address: str) -> tuple[tuple[str, str, int], ...]:
             raise UserError(f'address "{address}": it is of the whole model, no name')
         _may_vary(address, "the model", row.refuse(m, 0))
         return ((kind, quantity, 0),)
-    # An effect on geoms is one on a pair of them.
-    known = pair_names(m) if (kind, at) == ("effect", "geom") else names(m, at)
+    if (kind, at) == ("effect", "geom"):  # one on geoms is on a pair of them
+        known, at = pair_names(m), "pair of geoms"
+    else:
+        known = names(m, at)
     if name in known:
         ids, pattern = [known[name]], False
     else:

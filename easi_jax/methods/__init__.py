@@ -1,7 +1,9 @@
 """Methods that EASI is compared with, and EASI itself, behind one interface.
 
-Each is a frozen dataclass of its settings with ``fit(task, demonstrations, budget,
-key)``; the published settings and their source are in its docstring.
+Each is a frozen dataclass of its settings; the published ones and their source are in
+its docstring. A `Method` finds a distribution over parameters: ``fit(task,
+demonstrations, budget, key)``. A `PolicyMethod` (Oracle, FineTune, GARAT) learns a
+policy: ``fit(practice, demonstrations, key)``; its settings are its budget.
 """
 
 from easi_jax.methods.dropo import Dropo

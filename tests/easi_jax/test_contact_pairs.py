@@ -128,7 +128,7 @@ def test_names_that_are_none(model: mujoco.MjModel) -> None:
     assert list(pair_names(model)) == [
         *("floor/third", "floor/foot", "floor/geom2", "foot/geom2")
     ]
-    with pytest.raises(UserError, match=r"names no geom.*floor/foot"):
+    with pytest.raises(UserError, match=r"names no pair of geoms.*floor/foot"):
         Machine(model, ParameterSpace(()), DT, fixed={"effect.slip.floor/fot": 0.4})
     rk4 = mujoco.MjModel.from_xml_string(XML.replace("implicitfast", "RK4"))
     with pytest.raises(UserError, match="RK4"):
