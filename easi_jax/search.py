@@ -25,6 +25,7 @@ from easi_jax.search_config import SearchConfig
 from easi_jax.segments import Segments
 from easi_jax.strategies import make_strategy
 
+_USUAL_UPDATES = 20  # of the discriminator in a generation
 _CLIP = 4.0  # innovations beyond this many spreads say no more than "far"
 
 
@@ -134,7 +135,7 @@ class Search:
             loss=config.loss,
             regularizer=config.regularizer,
             clip_after_update=config.clip_after_update,
-            learning_rate=config.learning_rate,
+            learning_rate=config.learning_rate * _pace(config),
         )
 
     # -- state ---------------------------------------------------------------
@@ -461,6 +462,13 @@ class Search:
         known = replay.features(self.machine, data.segments)
         mid, std = _moments(known, data.segments.weight)
         return lambda seg: (replay.features(self.machine, seg) - mid) / std
+
+
+def _pace(config: SearchConfig) -> float:
+    """Factor on the learning rate by which few steps move as far as many."""
+    if not (config.steady_learning and config.discriminator_updates):
+        return 1.0
+    return _USUAL_UPDATES / config.discriminator_updates
 
 
 def _pick(key: jax.Array, weight: jax.Array, count: int) -> jax.Array:

@@ -38,7 +38,7 @@ class SearchConfig:
     regularizer: str = "clip"
     """clip (weights to +-0.01), gradient_penalty, or none."""
     learning_rate: float = 3e-4
-    """RMSprop step of the discriminator."""
+    """RMSprop step of the discriminator (see steady_learning)."""
     policy_updates_per_generation: int = 0
     """Policy training steps under the current distribution in each generation."""
 
@@ -49,6 +49,9 @@ class SearchConfig:
     """Show s' - s instead of s' (where innovation_inputs is off)."""
     standardize_inputs: bool = True
     """Standardize the discriminator's inputs by the measured data."""
+    steady_learning: bool = True
+    """With other than 20 discriminator_updates, scale the learning rate such that a
+    generation moves the discriminator as far as with 20."""
     clip_after_update: bool = True
     """Clip discriminator weights after each step (Algorithm 1), not before."""
     uniform_first_generation: bool = True
@@ -114,6 +117,7 @@ PAPER = SearchConfig(
     innovation_inputs=False,
     delta_inputs=False,
     standardize_inputs=False,
+    steady_learning=False,
     clip_after_update=False,
     uniform_first_generation=False,
     last_evaluation=False,

@@ -152,6 +152,7 @@ SWITCHES: tuple[tuple[SearchConfig, dict[str, Any]], ...] = (
     (BASE, {"innovation_inputs": False}),
     (PLAIN, {"delta_inputs": False}),
     (PLAIN, {"standardize_inputs": False}),
+    (BASE, {"steady_learning": False}),
     (BASE, {"clip_after_update": False}),
     (BASE, {"uniform_first_generation": False}),
     (BASE, {"last_evaluation": False}),
