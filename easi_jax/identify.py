@@ -175,10 +175,17 @@ def _near_zero(
     mean, log_mean, log_std = _of_logarithm(raised, width, value, error)
     moved = jnp.where(weak, (mean - value) / width, 0.0)
     # All of them together: those near zero may be known by their sum only.
-    among = jnp.where(weak[:, None] & weak, cov, jnp.eye(space.size))
-    follow = cov @ jnp.where(weak, jnp.linalg.solve(among, moved), 0.0)
+    follow = cov @ _solved(jnp.where(weak[:, None] & weak, cov, 0.0), std, moved)
     scale = jnp.where(weak, log_std / std, 1.0)
     return jnp.where(weak, log_mean, unit + follow), scale[:, None] * scale * cov
+
+
+def _solved(cov: jax.Array, std: jax.Array, x: jax.Array) -> jax.Array:
+    """``cov^-1 x`` in the directions that single precision tells from none: what the
+    data know by its sum alone may be one direction short."""
+    values, vectors = jnp.linalg.eigh(cov / std[:, None] / std)
+    inverse = jnp.where(values > _RESOLVED, 1.0 / values, 0.0)
+    return vectors @ (inverse * (vectors.T @ (x / std))) / std
 
 
 def _of_logarithm(
