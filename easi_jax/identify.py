@@ -107,11 +107,11 @@ def estimate(
         eq = paired.normal(mean, zero, weight)
         center, hessian = mean, eq.hessian
         cost, delta = jnp.zeros(0), eq.start_step
-    open_cov, seen = _posterior(hessian)
+    open_cov, seen, _ = _posterior(hessian)
     own = jnp.zeros((n, n)) if refined else seen @ cov @ seen.T
     if refined:
-        raised_cov, _ = _posterior(fit.raised_hessian)
-        center, open_cov = _near_zero(space, center, fit.raised, raised_cov)
+        raised_cov, _, shown = _posterior(fit.raised_hessian)
+        center, open_cov = _near_zero(space, center, fit.raised, raised_cov, shown)
     return Estimate(
         distribution=gaussian(space, center, open_cov + own if informed else cov),
         search_mean=mean,
@@ -123,8 +123,9 @@ def estimate(
     )
 
 
-def _posterior(hessian: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """``(F + prior)^-1``, and the filter of directions that the data show.
+def _posterior(hessian: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """``(F + prior)^-1``, the filter of directions that the data show, and the
+    variance of each parameter along those alone, ``(n,)``.
 
     F spans ten decades, and single precision leaves noise where it should be zero that
     a plain inverse would take for knowledge. So F is scaled to a unit diagonal, what is
@@ -139,8 +140,10 @@ def _posterior(hessian: jax.Array) -> tuple[jax.Array, jax.Array]:
     total = total + jnp.diag(jnp.where(seen, values, 0.0))
     root = jnp.sqrt(jnp.diag(total))
     back = vectors / size[:, None] / root
-    cov = back @ jnp.linalg.inv(total / root[:, None] / root) @ back.T
-    return cov, jnp.eye(hessian.shape[0]) - cov / _INITIAL_VARIANCE
+    inverse = jnp.linalg.inv(total / root[:, None] / root)
+    cov = back @ inverse @ back.T
+    shown = jnp.sum((back * seen) @ inverse * (back * seen), 1)
+    return cov, jnp.eye(hessian.shape[0]) - cov / _INITIAL_VARIANCE, shown
 
 
 def _draws(mean: jax.Array, cov: jax.Array, count: int) -> jax.Array:
@@ -151,7 +154,11 @@ def _draws(mean: jax.Array, cov: jax.Array, count: int) -> jax.Array:
 
 
 def _near_zero(
-    space: ParameterSpace, unit: jax.Array, raised: jax.Array, cov: jax.Array
+    space: ParameterSpace,
+    unit: jax.Array,
+    raised: jax.Array,
+    cov: jax.Array,
+    shown: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """Mean and covariance where a logarithmic parameter may be as good as zero.
 
@@ -160,12 +167,13 @@ def _near_zero(
     are those under that likelihood and the initial range as prior. The others follow
     the mean along the covariance, ``cov`` at ``raised``: ``unit`` with what lies below
     its initial range raised to the low end, for further down the logarithm has no slope
-    and its spread would mean nothing.
+    and its spread would mean nothing. ``shown (n,)`` are variances along what the data
+    show: a direction that they do not show makes nothing as good as zero.
     """
     width = jnp.asarray(space.log_width)
     std = jnp.sqrt(jnp.diag(cov))
     # What the data and the priors of the other parameters say of each.
-    precision = 1.0 / std**2 - 1.0 / _INITIAL_VARIANCE
+    precision = 1.0 / jnp.maximum(shown, 1e-12) - 1.0 / _INITIAL_VARIANCE
     alone = 1.0 / jnp.sqrt(jnp.maximum(precision, 1e-3))
     value = jnp.exp(width * (unit - raised))  # in the SI value at `raised`
     error = width * alone

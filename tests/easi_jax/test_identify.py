@@ -24,25 +24,31 @@ def test_what_no_data_determine_keeps_the_initial_spread() -> None:
     for seed in range(5):
         j, null = rows(np.random.default_rng(seed))
         single = j.astype(np.float32)
-        cov, seen = map(np.asarray, jax.jit(_posterior)(jnp.asarray(single.T @ single)))
+        info = jnp.asarray(single.T @ single)
+        cov, seen, shown = map(np.asarray, jax.jit(_posterior)(info))
         np.testing.assert_allclose(null.T @ cov @ null, np.eye(2) / 12, atol=2e-3)
         assert np.abs(seen @ null).max() < 0.05
         # Nowhere surer than the exact inverse of the exact information.
         exact = np.sqrt(np.diag(np.linalg.inv(j.T @ j + PRIOR)))
         assert (np.sqrt(np.diag(cov)) > 0.97 * exact).all()
+        # Those two directions are not in what is shown; the last parameter is.
+        assert shown.max() < 1e-2 * (np.diag(null @ null.T) / 12).max()
+        np.testing.assert_allclose(shown[10], exact[10] ** 2, rtol=0.02)
         assert np.linalg.eigvalsh(cov).min() > -1e-7
 
 
 def test_what_the_data_determine_is_the_inverse() -> None:
     j = np.random.default_rng(0).normal(size=(400, 11)) * 100
     info = (j.T @ j).astype(np.float32)
-    cov, seen = map(np.asarray, _posterior(jnp.asarray(info)))
+    cov, seen, shown = map(np.asarray, _posterior(jnp.asarray(info)))
+    np.testing.assert_allclose(shown, np.diag(cov), rtol=1e-5)
     np.testing.assert_allclose(cov, np.linalg.inv(info + PRIOR), rtol=1e-3, atol=1e-11)
     np.testing.assert_allclose(seen, np.eye(11), atol=1e-4)
 
 
 def test_no_data_leave_the_initial_spread() -> None:
-    cov, seen = _posterior(jnp.zeros((3, 3)))
+    cov, seen, shown = _posterior(jnp.zeros((3, 3)))
+    assert not shown.any()
     np.testing.assert_allclose(cov, np.eye(3) / 12, rtol=1e-6)
     np.testing.assert_allclose(seen, np.zeros((3, 3)), atol=1e-6)
 
@@ -75,7 +81,8 @@ def test_regions_cover_values_that_may_be_as_good_as_zero() -> None:
         return slope[:, None] * slope * jnp.asarray(information, jnp.float32)
 
     def state(u: jax.Array, r: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return _near_zero(space, u, r, _posterior(seen(r))[0])
+        cov, _, shown = _posterior(seen(r))
+        return _near_zero(space, u, r, cov, shown)
 
     mean, cov = map(np.asarray, jax.jit(jax.vmap(state))(unit, raised))
     off = mean - draws
