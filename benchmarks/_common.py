@@ -76,16 +76,24 @@ def write_result(
 ) -> Path:
     """Writes ``FOLDER/NAME.json`` with config, versions and device.
 
-    ``config`` is a dataclass, or a dict of what decides the figures.
+    ``config`` is a dataclass, or a dict of what decides the figures; its paths are
+    written as seen from the repository's root.
     """
     from easi_jax.io.files import atomic_write, to_json
     from easi_jax.io.versions import versions
 
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.json"
+    root = Path(__file__).parents[1]
+    settings = config if isinstance(config, dict) else dataclasses.asdict(config)
     body = {
         "command": command,
-        "config": config if isinstance(config, dict) else dataclasses.asdict(config),
+        "config": {
+            k: v.relative_to(root)
+            if isinstance(v, Path) and v.is_relative_to(root)
+            else v
+            for k, v in settings.items()
+        },
         "versions": versions(),
         "finished": time.strftime("%Y-%m-%d"),
         **figures,
