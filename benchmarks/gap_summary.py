@@ -1,5 +1,6 @@
 """Pages of results on the gap workflow."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 
@@ -104,7 +105,7 @@ def contacts(folder: Path) -> list[str]:
         (
             r["mechanism"],
             ", ".join(r["truth"]),
-            ", ".join(r["named"]) or "none",
+            _sure(r["named"], r["confidence"]),
             *(f"{r['gap'][k] / r['gap']['floor']:.2f}" for k in ("refit", "after")),
         )
         for r in rows
@@ -113,8 +114,16 @@ def contacts(folder: Path) -> list[str]:
         "Contacts are drawn seldom, and only legs have them; these are drawn on "
         "purpose (`python -m benchmarks.gap --effect contact_friction --mechanism "
         "hopper --out benchmarks/results/gap_contacts.jsonl`, and so on):",
-        markdown_table(("machine", "hidden", "named", "gap in floors", "after"), lines),
+        markdown_table(
+            ("machine", "hidden", "named (confidence)", "gap in floors", "after"), lines
+        ),
     ]
+
+
+def _sure(names: Sequence[str], confidence: Sequence[float]) -> str:
+    """Names with the confidence stated in each."""
+    told = (f"{n} ({c:.2f})" for n, c in zip(names, confidence, strict=True))
+    return ", ".join(told) or "none"
 
 
 def coarse(folder: Path) -> list[str]:
@@ -225,8 +234,9 @@ def real(folder: Path) -> list[str]:
         if not path.is_file():
             continue
         r = read_json(path)
-        named = ", ".join(
-            f"{e['effect']}@{e['at']} ({e['confidence']:.2f})" for e in r["effects"]
+        named = _sure(
+            [f"{e['effect']}@{e['at']}" for e in r["effects"]],
+            [e["confidence"] for e in r["effects"]],
         )
         alike = {n for e in r["effects"] for n in e["indistinguishable"]}
         missing = [
@@ -243,7 +253,7 @@ def real(folder: Path) -> list[str]:
         lines.append(
             (
                 name,
-                named or "none",
+                named,
                 ", ".join(missing) or "none",
                 ", ".join(r["wrongly_named"]) or "none",
                 f"{gap['before']:.3g}, {gap['refit']:.3g}, {gap['after']:.3g}",

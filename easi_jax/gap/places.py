@@ -7,6 +7,7 @@ import numpy as np
 
 from easi_jax import backlash
 from easi_jax.contact_pairs import contact_pairs
+from easi_jax.effect_quantities import EFFECT_TABLE
 from easi_jax.gap.table import Column, Place, Scales, name_of
 from easi_jax.quantities import linear_drive, scalar_dofs
 
@@ -49,7 +50,7 @@ def places(m: mujoco.MjModel, s: Scales) -> list[Place]:
         )
         out += _contacts("", "model", (), slides, stiff, damped)
     often = [k for k in np.argsort(-s.touching) if s.touching[k] > _SELDOM]
-    if len(often) > 1 and m.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4:
+    if len(often) > 1 and EFFECT_TABLE["slip"].refuse(m, 0) is None:
         for k in sorted(often[:_PAIRS]):
             p = pairs[k]
             values = float(p.friction[0]), p.stiffness, p.damping

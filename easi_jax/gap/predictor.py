@@ -111,8 +111,8 @@ class Predictor:
             for name in ("delay", "late")
         )
         self._delay_steps = math.ceil(latest / dt - 1e-9) + 1
-        # The second is for the few predictions in which a drive has play.
         self._fields = _fields(layout)
+        # The second is for the few predictions in which a drive has play.
         self._programs = tuple(
             jax.jit(partial(self._sharded, play), compiler_options=options)
             for play, options in (

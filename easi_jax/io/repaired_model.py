@@ -156,10 +156,7 @@ def _add(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
             )
         )
         return True
-    if e.kind == "geom":
-        _pair_contacts(spec, m, e)
-    else:
-        _contacts(spec, e)
+    _contacts(spec, m, e)
     return True
 
 
@@ -218,16 +215,20 @@ def _body(body: mujoco.MjsBody, m: mujoco.MjModel, e: EffectEntry) -> None:
     body.inertia = m.body_inertia[b] * (1 + c.get("spread", 0.0) * extra / mass)
 
 
-def _contacts(spec: mujoco.MjSpec, e: EffectEntry) -> None:
-    """All contacts; pairs hold their own numbers, geoms those of the others."""
-    c = e.columns
-    for item in (*spec.geoms, *spec.pairs):
+def _contacts(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> None:
+    """Contacts of one pair of geoms, or all: pairs hold their own numbers, geoms those
+    of the others."""
+    one, c = e.kind == "geom", e.columns
+    items = [_pair(spec, m, e.at)] if one else [*spec.geoms, *spec.pairs]
+    slip, give = ("slip", "give") if one else ("friction", "softness")
+    for item in items:
         if e.effect == "contact_friction":
             friction = np.array(item.friction)
-            friction[: 1 if len(friction) == 3 else 2] *= c["friction"]
+            # A geom has one sliding friction, a pair two.
+            friction[: 1 if len(friction) == 3 else 2] *= c[slip]
             item.friction = friction
         else:
-            factors = np.array([c["softness.0"], c["softness.1"]])
+            factors = np.array([c[f"{give}.0"], c[f"{give}.1"]])
             item.solref = _softer(np.array(item.solref), factors)
 
 
@@ -242,24 +243,17 @@ def _softer(solref: np.ndarray, factors: np.ndarray) -> np.ndarray:
     return np.array([time, ratio * factors[1] / np.sqrt(factors[0])])
 
 
-def _pair_contacts(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> None:
-    """One pair of geoms, which becomes a ``<pair>`` where it is none."""
-    c, p = e.columns, contact_pairs(m)[pair_names(m)[e.at]]
+def _pair(spec: mujoco.MjSpec, m: mujoco.MjModel, at: str) -> mujoco.MjsPair:
+    """The ``<pair>`` of two geoms, made from their numbers where there is none."""
+    p = contact_pairs(m)[pair_names(m)[at]]
     names = [geom_name(m, g) for g in p.geoms]
     for g, name in zip(p.geoms, names, strict=True):
         spec.geoms[g].name = name
     # Compiled pairs are in another order.
     there = [q for q in spec.pairs if {q.geomname1, q.geomname2} == set(names)]
     if there:
-        pair = there[-1]
-    else:
-        pair = spec.add_pair(geomname1=names[0], geomname2=names[1])
-        pair.condim, pair.margin, pair.solimp = p.dim, p.margin, p.solimp
-        pair.friction, pair.solref = p.friction, p.solref
-    if e.effect == "contact_friction":
-        friction = np.array(pair.friction)
-        friction[:2] *= c["slip"]
-        pair.friction = friction
-    else:
-        factors = np.array([c["give.0"], c["give.1"]])
-        pair.solref = _softer(np.array(pair.solref), factors)
+        return there[-1]
+    pair = spec.add_pair(geomname1=names[0], geomname2=names[1])
+    pair.condim, pair.margin, pair.solimp = p.dim, p.margin, p.solimp
+    pair.friction, pair.solref = p.friction, p.solref
+    return pair

@@ -60,12 +60,8 @@ def arm() -> mujoco.MjModel:
 @pytest.fixture(scope="module")
 def machine(arm: mujoco.MjModel) -> Machine:
     """Every effect of the arm is a parameter."""
-    left = (
-        "spread",
-        "jump",
-        "friction",
-        *IN_CONTACTS,
-    )  # shapes, and it touches nothing
+    # Shapes, and contacts, which the arm does not have.
+    left = ("spread", "jump", "friction", *IN_CONTACTS)
     found = [entry(c, 0.1) for c in EFFECT_TABLE if c.split(".")[0] not in left]
     found.append(entry("lag", 0.02, at="m"))
     base = Machine(arm, ParameterSpace(()), DT)

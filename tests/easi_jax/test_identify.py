@@ -20,6 +20,15 @@ def rows(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     return rows - rows @ null @ null.T, null
 
 
+def along_what_is_shown(j: np.ndarray) -> np.ndarray:
+    """Variances with all other directions held, in double precision."""
+    info = j.T @ j
+    size = np.sqrt(np.maximum(np.diag(info), 12.0))
+    values, vectors = np.linalg.eigh(info / size[:, None] / size)
+    basis = vectors[:, values > 1e-5] / size[:, None]
+    return np.diag(basis @ np.linalg.inv(basis.T @ (info + PRIOR) @ basis) @ basis.T)
+
+
 def test_what_no_data_determine_keeps_the_initial_spread() -> None:
     for seed in range(5):
         j, null = rows(np.random.default_rng(seed))
@@ -33,6 +42,7 @@ def test_what_no_data_determine_keeps_the_initial_spread() -> None:
         assert (np.sqrt(np.diag(cov)) > 0.97 * exact).all()
         # Those two directions are not in what is shown; the last parameter is.
         assert shown.max() < 0.1 * (np.diag(null @ null.T) / 12).max()
+        np.testing.assert_allclose(shown, along_what_is_shown(j), rtol=0.05)
         np.testing.assert_allclose(shown[10], exact[10] ** 2, rtol=0.02)
         assert np.linalg.eigvalsh(cov).min() > -1e-7
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from tests.gap_cases.cases import Case, build_machine, make_case
 from tests.gap_cases.effects import KINDS, OUTSIDE, CaseError, Effect
-from tests.gap_cases.mechanisms import Mechanism, Stated
+from tests.gap_cases.mechanisms import ON_GROUND, Mechanism, Stated
 from tests.gap_cases.places import places, twins
 from tests.gap_cases.robots import MECHANISMS
 
@@ -87,7 +87,7 @@ def draw_case(
         raise ValueError(f"unknown kind {kind!r}; choose from {CASE_KINDS}")
     mechanisms = (mechanism,) if mechanism else CHEAP if cheap else MECHANISMS
     if effect.startswith("contact_") and not mechanism:
-        mechanisms = ("leg", "hopper")
+        mechanisms = ON_GROUND
     rng = np.random.default_rng([seed, CASE_KINDS.index(kind)])
     reason = ""
     for _ in range(TRIES):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 GRAVITY = 9.81
+ON_GROUND = ("leg", "hopper")
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class Mechanism:
     @property
     def on_ground(self) -> bool:
         """Whether it stands on a foot."""
-        return self.name in ("leg", "hopper")
+        return self.name in ON_GROUND
 
     def xml(self) -> str:
         """The MJCF text; joints stand in it as `{name}` of `bodies`."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tests.gap_cases.mechanisms import Draw, Joint, Mechanism, Stated
+from tests.gap_cases.mechanisms import ON_GROUND, Draw, Joint, Mechanism, Stated
 
 FOOT_RADIUS = 0.03
 Parts = tuple[list[Joint], str]
@@ -228,8 +228,7 @@ def build(name: str, rng: np.random.Generator, stated: Stated) -> Mechanism:
         bodies=bodies,
         timestep=float(rng.choice(steps)),
         control_step=control_step,
-        speed=float(rng.uniform(0.8, 1.6))
-        * (0.6 if name in ("leg", "hopper") else 1.0),
+        speed=float(rng.uniform(0.8, 1.6)) * (0.6 if name in ON_GROUND else 1.0),
         open_loop=name == "pendulum"
         and joints[0].drive == "motor"
         and damped
