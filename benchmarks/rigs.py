@@ -1,7 +1,9 @@
 """Machines that rivals identify, and how they are recorded.
 
 ``cartpole``: the built-in robot without its speed limit, for which MuJoCo C has no
-word; a rough stabilizer moves it. ``arm6``: an arm with six joints (assets/arm6.xml).
+word; its masses and the pole's length were weighed and measured, for logs tell them
+from the pole's armature in no way that logarithms make straight; a rough stabilizer
+moves it. ``arm6``: an arm with six joints (assets/arm6.xml).
 ``go2``: the built-in robot hung by its base, the floor taken away: without contact the
 data determine the drives and the masses of the legs, and it is what an owner can
 record on a stand; a body that floats without gravity is not. The last two follow
@@ -20,6 +22,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from benchmarks.recovery import WEIGHED
 from easi_jax.machine import Machine
 from easi_jax.methods import Task
 from easi_jax.rollout import collect, measured, policy_rollout
@@ -173,9 +176,10 @@ def controller(std: Any, obs: jax.Array, key: jax.Array) -> jax.Array:
 
 
 def cartpole() -> Rig:
-    """Ten parameters."""
+    """Seven parameters."""
     env = make("cartpole")
-    names = [n for n in env.space.names if n != "cart_speed_limit"]
+    known = {*WEIGHED, "cart_speed_limit"}
+    names = [n for n in env.space.names if n not in known]
     machine = Machine(env.mj_model, env.space.select(names), env.dt)
     noise = np.array([5e-4, 2e-3, 1e-2, 2e-2])
     return Rig("cartpole", machine, noise, np.zeros(1), np.zeros(1), env)

@@ -9,7 +9,7 @@ METHODS = (
     *("random search", "mujoco.sysid", "NPE"),
 )
 ROBOTS = ("cartpole", "arm6", "go2")
-SETTINGS = ("paired", "unpaired", "stochastic", "effect")
+SETTINGS = ("clean", "paired", "unpaired", "stochastic", "effect")
 
 _SPREAD = 1.5  # factor, at most, between a truth and the nominal values
 _LATE = 0.01  # s that commands are late where the target has an effect
@@ -84,8 +84,9 @@ def solve(cell: Cell) -> dict[str, Any]:
 
     Returns:
         ``error``: RMS of the log ratio to the truth along the ``rank`` directions that
-        the data determine (`easi_jax.information`), None without any; ``start_error``:
-        that of the middle of where searches start; ``covered``: whether the truth is in
+        the data determine (`easi_jax.information`), None without any; ``bound``: that
+        of Cramer and Rao; ``start_error``: that of the middle of where searches start;
+        ``covered``: whether the truth is in
         the found 90 % region of these directions; ``log_ratio`` and unit-coordinate
         ``std`` of each parameter; ``seconds``; control steps ``simulated`` and, of the
         real machine beyond the recording, ``measured``.
@@ -99,6 +100,8 @@ def solve(cell: Cell) -> dict[str, Any]:
     from easi_jax.methods import Budget
 
     rig = RIGS[cell.robot]()
+    if cell.setting == "clean":
+        rig = dataclasses.replace(rig, noise=np.zeros_like(rig.noise))
     space = rig.machine.space
     k_truth, k_record, k_noise, k_order, k_fit = jax.random.split(
         jax.random.key(cell.seed), 5
@@ -189,7 +192,7 @@ def fisher(task: Any, demos: Any, truth: Any) -> Any:
 def score(
     space: Any, information: Any, mean: Any, cov: Any, truth: Any
 ) -> dict[str, Any]:
-    """``error``, ``covered`` and ``rank``, along what the data determine.
+    """``error``, ``bound``, ``covered`` and ``rank``, along what the data determine.
 
     Args:
         mean, cov, truth: unit coordinates, ``(n,)``, ``(n, n)``, ``(n,)``.
@@ -201,7 +204,7 @@ def score(
 
     known = identifiability(space, information)
     if not known.rank:
-        return {"error": None, "covered": None, "rank": 0}
+        return {"error": None, "bound": None, "covered": None, "rank": 0}
     hidden = known.null.shape[1]
     # The rest of an orthonormal basis that begins with what is undetermined.
     whole = np.linalg.qr(np.hstack([known.null, np.eye(space.size)]))[0]
@@ -209,8 +212,10 @@ def score(
     off = seen @ (np.asarray(mean, float) - truth)
     values, vectors = np.linalg.eigh(seen @ np.asarray(cov, float) @ seen.T)
     far = (vectors.T @ off) ** 2 / np.maximum(values, 1e-14)
+    least = np.trace(seen @ known.covariance @ seen.T)
     return {
         "error": float(np.sqrt(np.mean(off**2))),
+        "bound": float(np.sqrt(least / known.rank)),
         "covered": bool(far.sum() <= chi2.ppf(_REGION, known.rank)),
         "rank": known.rank,
     }

@@ -7,9 +7,10 @@
 
 A cell is one robot, setting, method and seed. Each seed draws its own machine, every
 parameter within 1.5 times its nominal value either way; searches start within 3 times.
-All methods get the same recording, with sensor noise, and the same budget of simulated
+All methods get the same recording, and the same budget of simulated
 control steps (EASI's least-squares finish comes on top, and is in its seconds).
-``paired``: logged commands, deterministic ones. ``stochastic``: with exploration noise.
+``clean``: logged commands, deterministic ones, no noise. ``paired``: with sensor noise,
+as all that follow. ``stochastic``: with exploration noise.
 ``unpaired``: single transitions in any order, of an unknown controller. ``effect``:
 commands reach the target's drives 10 ms late, which no model has. Lines go to
 ``results/rivals.jsonl``; a cell that has one is not run again. mujoco.sysid and NPE
@@ -34,7 +35,7 @@ class Config:
     robots: tuple[str, ...] = ROBOTS
     """cartpole, arm6, go2 (hung by its base)."""
     settings: tuple[str, ...] = SETTINGS
-    """paired, unpaired, stochastic, effect."""
+    """clean, paired, unpaired, stochastic, effect."""
     methods: tuple[str, ...] = METHODS
     """Methods; SimOpt runs where it has an environment and the controller."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)

@@ -33,7 +33,12 @@ def scored(off: list[float], std: float) -> dict:
 
 def test_errors_count_along_what_the_data_determine() -> None:
     got = scored([0.3, -0.3, 0.0], 0.01)
-    assert got == {"error": pytest.approx(0.0, abs=1e-9), "covered": True, "rank": 2}
+    assert got == {
+        "error": pytest.approx(0.0, abs=1e-9),
+        "bound": pytest.approx(0.01, rel=1e-6),
+        "covered": True,
+        "rank": 2,
+    }
     got = scored([0.0, 0.0, 0.2], 0.01)
     assert got["error"] == pytest.approx(0.2 / np.sqrt(2))
     assert not got["covered"]
@@ -44,14 +49,14 @@ def test_errors_count_along_what_the_data_determine() -> None:
 
 def test_nothing_determined_is_said() -> None:
     nothing = score(SPACE, np.zeros((3, 3)), np.ones(3), np.eye(3), np.zeros(3))
-    assert nothing == {"error": None, "covered": None, "rank": 0}
+    assert nothing == {"error": None, "bound": None, "covered": None, "rank": 0}
 
 
 def test_simopt_runs_where_it_can() -> None:
     every = rivals.cells(rivals.Config(methods=("SimOpt", "EASI"), seeds=(0,)))
     simopt = {(c.robot, c.setting) for c in every if c.method == "SimOpt"}
-    assert simopt == {("cartpole", s) for s in ("paired", "stochastic", "effect")}
-    assert len(every) == 3 * 4 + 3 and len({c.key for c in every}) == len(every)
+    assert simopt == {("cartpole", s) for s in rivals.SETTINGS if s != "unpaired"}
+    assert len(every) == 3 * 5 + 4 and len({c.key for c in every}) == len(every)
     with pytest.raises(UserError, match="did you mean"):
         rivals.cells(rivals.Config(settings=("pairde",)))
 
