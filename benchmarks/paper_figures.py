@@ -89,3 +89,50 @@ def returns_by_factor(
     axis.set_ylabel("return in the target")
     legend_above(figure, handles)
     return svg(figure)
+
+
+@styled
+def motion_and_speed(
+    frequency: Sequence[float],
+    density: Mapping[str, Mapping[str, Sequence[float]]],
+    commands: Sequence[float],
+    speed: Mapping[str, Sequence[Sequence[float | None]]],
+) -> str:
+    """Spectra of joint motion, and speed by command, as the paper's Fig. 7.
+
+    Args:
+        frequency: [Hz].
+        density: by kind of joint and what moved [rad / sqrt(Hz)]; the first is what was
+            measured.
+        commands: [m/s].
+        speed: by method, for each seed the mean speed at each command [m/s]; None where
+            every episode fell.
+    """
+    figure, axes = grid(len(density) + 1, 2, height=2.2)
+    handles = {}
+    names = list(dict.fromkeys(name for found in density.values() for name in found))
+    measured, simulated = names[0], names[1:]
+    for axis, (joint, found) in zip(axes, density.items(), strict=False):
+        for name, values in found.items():
+            first = name == measured
+            i = 0 if first else simulated.index(name)
+            color = FAINT if first else SERIES[i % len(SERIES)]
+            style = "-" if first else dash(i)
+            axis.plot(frequency, values, color=color, lw=1.4, ls=style)
+            handles[name] = Line2D([], [], color=color, lw=1.6, ls=style, label=name)
+        axis.set_yscale("log")
+        axis.set_title(f"{joint} [rad / √Hz]")
+        axis.set_xlabel("frequency [Hz]")
+    axis = axes[len(density)]
+    axis.plot(commands, commands, **DASHED)
+    for i, (method, seeds) in enumerate(speed.items()):
+        color, style = SERIES[i % len(SERIES)], dash(i)
+        for values in seeds:
+            seen = [np.nan if v is None else v for v in values]
+            axis.plot(commands, seen, color=color, lw=1.2, ls=style)
+        shown = Line2D([], [], color=color, lw=1.6, ls=style, label=method)
+        handles.setdefault(method, shown)
+    axis.set_title("speed [m/s]")
+    axis.set_xlabel("command [m/s]")
+    legend_above(figure, [*handles.values(), Line2D([], [], **DASHED, label="as told")])
+    return svg(figure)

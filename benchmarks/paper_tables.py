@@ -5,16 +5,18 @@ preset (``--env-steps``) are left out.
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from statistics import mean, median, stdev
 from typing import Any
 
 from benchmarks._cells import read_rows
 from benchmarks._common import markdown_table
-from benchmarks.paper import CHANGED, MUST, SEARCHES, STARTS
+from benchmarks.paper import CHANGED, MUST, ON_HARDWARE, SEARCHES, STARTS
 from benchmarks.paper_cells import METHODS
 from benchmarks.paper_runtime import WAYS
+from benchmarks.paper_twin import TWIN
+from benchmarks.twin_measures import COMMANDS, EPISODES, TRACKED
 
 FLAT = 3.0  # times the best setting's error: no setting of the default is worse
 GOAL = 0.9  # share of the way from UDR to Oracle
@@ -26,6 +28,10 @@ SHOWN = {
     "go2": ("thigh_kp", "base_mass"),
 }
 _NOT_RUN = "not run"
+_NO_HARDWARE = (
+    "**A twin, not hardware**: MuJoCo C at 0.5 ms with effects that the model lacks "
+    "(`benchmarks.twin`) stands for the paper's real"
+)
 
 Row = dict[str, Any]
 
@@ -38,7 +44,7 @@ def sections(folder: Path) -> list[str]:
         return [*out, "Not run: `python -m benchmarks.paper table1`."]
     commits = sorted({r["versions"]["commit"][:7] for r in rows})
     out.append(f"`python -m benchmarks.paper NAME`, commits {', '.join(commits)}.")
-    for part in (_table1, _table3, _table4, _table5, _fig6, _runtime):
+    for part in (_table1, _table2, _table3, _table4, _table5, _fig6, _fig7, _runtime):
         out += part(rows)
     pictures = figures(folder)
     for name in sorted(pictures):
@@ -59,6 +65,9 @@ def figures(folder: Path) -> dict[str, str]:
             text = draw([r for r in rows if r["robot"] == robot and not r["options"]])
             if text:
                 out[f"paper_{name}_{robot}.svg"] = text
+    text = _drawn_fig7(rows)
+    if text:
+        out["paper_fig7_go2.svg"] = text
     text = _drawn_appendix_a([r for r in rows if r["options"]])
     if text:
         out["paper_appendix_a.svg"] = text
@@ -76,6 +85,8 @@ def _title(name: str) -> str:
         "fig4": "Parameters by generation, as ratios to the truth (Fig. 4)",
         "fig5": "Return in the target by training step (Fig. 5)",
         "fig6": "Return by what the target's parameter is multiplied with (Fig. 6)",
+        "fig7": "Joint motion at 1.4 m/s, and speed by command, in a twin and not on "
+        "hardware (Fig. 7)",
         "appendix": "25 parameters of Go2 (Appendix A)",
     }[words[0]] + (f": {words[-1]}" if words[0] != "appendix" else "")
 
@@ -139,6 +150,95 @@ def _table1(rows: Sequence[Row]) -> list[str]:
             markdown_table(head, lines),
         ]
     return out
+
+
+def _table2(rows: Sequence[Row]) -> list[str]:
+    out = ["### Table 2: balancing in a twin"]
+    mine = _in_twin(rows, "cartpole")
+    if not mine:
+        return [*out, "Not run: `python -m benchmarks.paper table2`."]
+    lines = [
+        (
+            method,
+            *(told([r[key] for r in found], 2) for key in ("angle_error", "speed")),
+            told([r["return"] for r in found]),
+            f"{sum(r['fallen'] for r in found)} of {EPISODES * len(found)}",
+        )
+        for method, found in mine.items()
+    ]
+    head = ("method", "pole angle [0.01 rad]", "cart speed [0.1 m/s]", "return", "fell")
+    return [
+        *out,
+        f"{_NO_HARDWARE} cart-pole; 50 logged episodes. Mean sizes until a fall; mean "
+        "± standard deviation (every seed).",
+        markdown_table(head, lines),
+    ]
+
+
+def _in_twin(rows: Sequence[Row], robot: str) -> dict[str, list[Row]]:
+    """Rows by method, in the order of seeds."""
+    mine = [r for r in rows if (r["robot"], r["target"]) == (robot, TWIN)]
+    mine.sort(key=lambda r: r["seed"])
+    found = {m: [r for r in mine if r["method"] == m] for m in ON_HARDWARE}
+    return {m: f for m, f in found.items() if f}
+
+
+def _fig7(rows: Sequence[Row]) -> list[str]:
+    out = ["### Fig. 7: walking in a twin"]
+    mine = _in_twin(rows, "go2")
+    if not mine:
+        return [*out, "Not run: `python -m benchmarks.paper fig7`."]
+
+    def some(found: Sequence[Row], of: Callable[[Row], Any], digits: int) -> str:
+        values = [of(r) for r in found]
+        return told([v for v in values if v is not None], digits)
+
+    lines = [
+        (
+            method,
+            some(found, lambda r: r["spectrum"]["distance_db"], 2),
+            some(found, lambda r: r["tracking_error"], 3),
+            some(found, lambda r: r["return"], 1),
+            f"{sum(map(sum, (r['fallen'] for r in found)))} of "
+            f"{len(found) * len(COMMANDS) * TRACKED[0]}",
+        )
+        for method, found in mine.items()
+    ]
+    head = (
+        *("method", "joint motion, simulated from logged [dB]"),
+        *("speed from command [m/s]", "return", "fell"),
+    )
+    return [
+        *out,
+        f"{_NO_HARDWARE} Go2; one log of 40 s at 1.4 m/s. The UDR policy's joint "
+        "motion in the simulation as given (UDR) or as identified (EASI), against that "
+        "in the twin, RMS over 0.25 to 10 Hz; speeds are of each method's own policy.",
+        markdown_table(head, lines),
+    ]
+
+
+def _drawn_fig7(rows: Sequence[Row]) -> str:
+    from benchmarks.paper_figures import motion_and_speed
+
+    mine = _in_twin(rows, "go2")
+    first = {m: found[0] for m, found in mine.items()}
+    if "UDR" not in first or first["UDR"]["spectrum"]["twin"] is None:
+        return ""
+    before = first["UDR"]["spectrum"]
+    shown = {m: "UDR, simulation as given" if m == "UDR" else m for m in mine}
+    density = {
+        joint: {
+            "twin": before["twin"][joint],
+            **{
+                shown[m]: r["spectrum"]["simulation"][joint]
+                for m, r in first.items()
+                if r["spectrum"]["simulation"] is not None
+            },
+        }
+        for joint in before["twin"]
+    }
+    speed = {shown[m]: [r["speed"] for r in found] for m, found in mine.items()}
+    return motion_and_speed(before["frequency"], density, COMMANDS, speed)
 
 
 def _table3(rows: Sequence[Row]) -> list[str]:

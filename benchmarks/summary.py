@@ -16,6 +16,7 @@ from benchmarks import (
     crash_summary,
     gap_summary,
     paper_tables,
+    rivals_summary,
     scaling_summary,
 )
 from benchmarks._common import RESULTS, markdown_table
@@ -60,7 +61,7 @@ def run(config: Config) -> None:
             crash_summary.soak,
         ),
         *(gap_summary.generated, gap_summary.real, gap_summary.times, gap_summary.loop),
-        paper_tables.sections,
+        *(paper_tables.sections, rivals_summary.section),
         scaling_summary.growth,
     ):
         parts += section(config.results)

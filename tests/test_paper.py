@@ -142,6 +142,30 @@ def test_pictures_come_from_the_rows_alone(tmp_path: Path) -> None:
         assert f"]({name})" in text
 
 
+def test_twins_are_never_called_hardware(tmp_path: Path) -> None:
+    rows = [
+        row("EASI default", "twin", s, angle_error=1.5 + s, speed=2.0, fallen=3)
+        | {"return": 180.0}
+        for s in (0, 1)
+    ]
+    kinds = {j: [0.1, 0.3] for j in ("hip", "thigh", "calf")}
+    spectrum = {"frequency": [1.0, 2.0], "twin": kinds, "simulation": kinds}
+    walked = {"fallen": [0] * 6 + [4], "speed": [0.5] * 6 + [None], "return": 90.0}
+    for method, seed, off in (("UDR", 0, 6.0), ("UDR", 1, None), ("EASI paper", 0, 2)):
+        walk = row(method, "twin", seed, tracking_error=0.2, **walked)
+        spectra = {"spectrum": {**spectrum, "distance_db": off}}
+        rows.append(walk | spectra | {"robot": "go2"})
+    text = page(tmp_path, *rows)
+    balanced = "2.00 ± 0.71 (1.50, 2.50) | 2.00 ± 0.00 (2.00, 2.00)"
+    assert f"| EASI default | {balanced} |" in text and "| 6 of 200 |" in text
+    assert "| UDR | 6.00 | 0.200 ± 0.000 (0.200, 0.200) |" in text
+    assert "| 8 of 56 |" in text
+    assert text.count("**A twin, not hardware**") == 2
+    caption = next(x for x in text.splitlines() if "](paper_fig7_go2.svg)" in x)
+    assert "not on hardware" in caption
+    assert list(paper_tables.figures(tmp_path)) == ["paper_fig7_go2.svg"]
+
+
 def test_nothing_run_is_said(tmp_path: Path) -> None:
     assert "Not run" in paper_tables.sections(tmp_path)[-1]
     assert paper_tables.figures(tmp_path) == {}

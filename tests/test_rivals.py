@@ -10,6 +10,7 @@ import pytest
 from benchmarks import rivals
 from benchmarks._cells import Share, read_rows, run_cells
 from benchmarks.rival_cells import score
+from benchmarks.rivals_summary import best_rival, section, verdict
 from easi_jax.errors import UserError
 from easi_jax.parameters import Parameter, ParameterSpace
 
@@ -88,3 +89,40 @@ def test_a_cell_is_run_once_and_shared(tmp_path: Path) -> None:
         go(only="e")
     with pytest.raises(UserError, match="2/4"):
         go("3/2")
+
+
+def line(method: str, seed: int, error: float, setting: str = "paired") -> dict:
+    return {
+        "robot": "cartpole",
+        "setting": setting,
+        "method": method,
+        "seed": seed,
+        "error": error,
+        "bound": 0.05,
+        "covered": error < 0.1,
+        "rank": 6,
+        "start_error": 0.3,
+        "seconds": 4.0,
+        "simulated": 3_000_000,
+        "measured": 6000 if method == "SimOpt" else 0,
+        "versions": {"commit": "0123456789"},
+    }
+
+
+def test_the_page_says_who_is_ahead(tmp_path: Path) -> None:
+    rows = [line("EASI", s, 0.05 + 0.01 * s) for s in range(3)]
+    rows += [line("CMA-ES", s, 0.12) for s in range(3)]
+    # Better, but of one seed only.
+    rows += [line("NPE", 0, 0.01), line("SimOpt", 0, 0.2)]
+    assert best_rival(rows, "paired") == ("CMA-ES", 0.12, pytest.approx(0.06))
+    assert best_rival(rows, "clean") is None
+    out = tmp_path / "rivals.jsonl"
+    out.write_text("".join(json.dumps(r) + "\n" for r in rows))
+    text = "\n".join(section(tmp_path))
+    assert "| EASI | not run | 0.06 (0.05, 0.06, 0.07); in 3 of 3 | not run |" in text
+    assert "| CMA-ES | not run | 0.12 (0.12, 0.12, 0.12); in 0 of 3 |" in text
+    assert "paired: EASI ahead, 0.06 against 0.12 of CMA-ES" in text
+    assert "| SimOpt | 4 | 3.00 | 6,000 |" in text
+    assert "Not run: `python -m benchmarks.rivals --robots go2`." in text
+    assert "**NPE ahead**: EASI 0.05 against 0.01" in verdict("NPE", 0.01, 0.05)
+    assert "both exact" in verdict("NPE", 1e-5, 1e-4)

@@ -4,6 +4,7 @@ Run by `easi_jax.methods.npe` as a file, so that nothing here imports jax.
 """
 
 import sys
+from typing import Any
 
 import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
@@ -23,9 +24,8 @@ def main(source: str, target: str) -> None:
     prior = torch.distributions.MultivariateNormal(
         tensor("prior_mean"), torch.diag(tensor("prior_std") ** 2)
     )
-    trainer = NPE(
-        prior, density_estimator=str(given["density"]), show_progress_bars=False
-    )
+    density: Any = str(given["density"])  # sbi says which names there are
+    trainer = NPE(prior, density_estimator=density, show_progress_bars=False)
     trainer.append_simulations(tensor("units"), tensor("summaries")).train()
     posterior = trainer.build_posterior()
     drawn = posterior.sample(

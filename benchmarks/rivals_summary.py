@@ -1,0 +1,139 @@
+"""Section of the results page on identification beside rivals and today's tools."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from benchmarks._cells import read_rows
+from benchmarks._common import commits_of, markdown_table
+from benchmarks.rival_cells import METHODS, ROBOTS, SETTINGS
+
+OURS = METHODS[0]
+_EXACT = 1e-3  # errors below it are the same: a tenth of a percent
+
+Row = dict[str, Any]
+
+
+def section(folder: Path) -> list[str]:
+    """Errors, regions and costs of every method, robot by robot."""
+    rows = read_rows(folder / "rivals.jsonl")
+    out = ["## Identification beside rivals and today's tools"]
+    if not rows:
+        return [*out, "Not run: `python -m benchmarks.rivals`."]
+    out.append(
+        f"`python -m benchmarks.rivals`, commits {commits_of(rows)}: equal data and "
+        "budget, each seed a machine of its own. RMS of the log ratio to the truth "
+        "along the directions that the data determine, median over seeds (every seed); "
+        "in how many the truth lies in the stated 90 % region of these directions. "
+        "`clean`: no noise; the others have sensor noise. `unpaired`: single "
+        "transitions of an unknown controller. `stochastic`: a controller with "
+        "exploration noise. `effect`: commands arrive 10 ms late, which no model has."
+    )
+    for robot in ROBOTS:
+        mine = [r for r in rows if r["robot"] == robot]
+        if not mine:
+            out.append(f"Not run: `python -m benchmarks.rivals --robots {robot}`.")
+            continue
+        out += [f"### {robot}", _errors(mine), *_verdicts(mine), _costs(mine)]
+    return out
+
+
+def best_rival(rows: Sequence[Row], setting: str) -> tuple[str, float, float] | None:
+    """The rival with the least median error, that error and `OURS`, over the seeds
+    that both have; None where nothing can be compared."""
+    found = []
+    own = _by_seed(rows, setting, OURS)
+    for method in METHODS:
+        seeds = own.keys() & _by_seed(rows, setting, method).keys()
+        if method == OURS or not seeds:
+            continue
+        its = _by_seed(rows, setting, method)
+        found.append((median(its[s] for s in seeds), method, seeds))
+    if not found:
+        return None
+    error, method, seeds = min(found, key=lambda f: (-len(f[2]), f[0]))
+    return method, error, median(own[s] for s in seeds)
+
+
+def _by_seed(rows: Sequence[Row], setting: str, method: str) -> dict[int, float]:
+    return {
+        r["seed"]: r["error"]
+        for r in rows
+        if (r["setting"], r["method"]) == (setting, method) and r["error"] is not None
+    }
+
+
+def _errors(rows: Sequence[Row]) -> str:
+    lines = []
+    for name, key in (("start", "start_error"), ("Cramer-Rao bound", "bound")):
+        cells = []
+        for setting in SETTINGS:
+            some = [r for r in rows if r["setting"] == setting]
+            values = {r["seed"]: r[key] for r in some if r[key] is not None}
+            # Without noise nothing bounds the error.
+            known = values and (key != "bound" or setting != "clean")
+            cells.append(_told(median(values.values())) if known else "")
+        lines.append((name, *cells))
+    for method in METHODS:
+        cells = [_cell(rows, setting, method) for setting in SETTINGS]
+        lines.append((method, *cells))
+    return markdown_table(("method", *SETTINGS), lines)
+
+
+def _cell(rows: Sequence[Row], setting: str, method: str) -> str:
+    mine = sorted(
+        (r for r in rows if (r["setting"], r["method"]) == (setting, method)),
+        key=lambda r: r["seed"],
+    )
+    good = [r for r in mine if r["error"] is not None]
+    if not good:
+        return "not run" if not mine else "nothing determined"
+    errors = [r["error"] for r in good]
+    inside = sum(r["covered"] for r in good)
+    each = ", ".join(_told(e) for e in errors)
+    return f"{_told(median(errors))} ({each}); in {inside} of {len(good)}"
+
+
+def _told(error: float) -> str:
+    return f"{error:.2g}" if error >= _EXACT else f"{error:.0e}"
+
+
+def _verdicts(rows: Sequence[Row]) -> list[str]:
+    said = []
+    for setting in SETTINGS:
+        found = best_rival(rows, setting)
+        if found is None:
+            continue
+        method, error, own = found
+        said.append(f"- {setting}: {verdict(method, error, own)}")
+    return ["\n".join(said)] if said else []
+
+
+def verdict(method: str, error: float, own: float) -> str:
+    """Who is ahead, in a few words."""
+    if max(error, own) < _EXACT:
+        return f"{OURS} and {method} both exact to a tenth of a percent"
+    pair = f"{_told(own)} against {_told(error)} of {method}, the best rival"
+    if own <= error:
+        return f"{OURS} ahead, {pair} ({error / own:.1f} times)"
+    return f"**{method} ahead**: {OURS} {pair} ({own / error:.1f} times)"
+
+
+def _costs(rows: Sequence[Row]) -> str:
+    lines = []
+    for method in METHODS:
+        mine = [r for r in rows if r["method"] == method]
+        if not mine:
+            continue
+        real = max(r["measured"] for r in mine)
+        lines.append(
+            (
+                method,
+                f"{median(r['seconds'] for r in mine):.0f}",
+                f"{median(r['simulated'] for r in mine) / 1e6:.2f}",
+                f"{real:,}" if real else "none",
+            )
+        )
+    head = ("method", "seconds, one core", "million steps simulated")
+    return markdown_table((*head, "further steps of the real machine"), lines)
