@@ -120,7 +120,8 @@ def motion_and_speed(
             style = "-" if first else dash(i)
             axis.plot(frequency, values, color=color, lw=1.4, ls=style)
             handles[name] = Line2D([], [], color=color, lw=1.6, ls=style, label=name)
-        axis.set_yscale("log")
+        every = np.concatenate([np.asarray(v, float) for v in found.values()])
+        fit(axis, every, log=True)
         axis.set_title(f"{joint} [rad / √Hz]")
         axis.set_xlabel("frequency [Hz]")
     axis = axes[len(density)]
