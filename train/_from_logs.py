@@ -18,6 +18,8 @@ def run(config: Any) -> None:
     """Reads, searches, finishes and reports; ``config`` is that of ``train.easi``."""
     problem = read_problem(config)
     seeds = config.seeds or (0,)
+    import jax
+
     from easi_jax.io.runs import RunFolder
     from easi_jax.search import Search
 
@@ -32,6 +34,7 @@ def run(config: Any) -> None:
     ) as folder:
         from easi_jax.distributed import started
         from train._log_results import ready_errors, write
+        from train._stages import found_check
 
         finish = started(
             lambda: _ready_finish(problem, search, config.refine, config.restarts or 0)
@@ -39,6 +42,9 @@ def run(config: Any) -> None:
         states = _search(folder, config, search, problem, seeds)
         errors = started(lambda: ready_errors(problem, search.space))
         estimates, outliers = finish()(states)
+        for seed, found in zip(seeds, estimates, strict=True):
+            one = jax.tree.map(lambda x: x[None], found.distribution)
+            found_check([seed], search.space.names, one)
         problem.notes.extend(outliers)
         columns, rows, errors = write(
             folder, problem, search, estimates, seeds, errors()

@@ -13,6 +13,7 @@ from train._robots import (
     training_chunk,
 )
 from train._stages import (
+    found_check,
     jit_chunks,
     run_stage,
     search_check,
@@ -33,7 +34,6 @@ def run(config: "Config") -> None:
 
     from easi_jax import distributed
     from easi_jax.errors import UserError
-    from easi_jax.io import checkpoints
     from easi_jax.io.runs import RunFolder
     from easi_jax.pipeline import (
         Pipeline,
@@ -121,7 +121,7 @@ def run(config: "Config") -> None:
             folder,
             "estimate",
             lambda: jax.jit(pipe.estimate)(found, demos),
-            checkpoints,
+            lambda made: found_check(seeds, env.space.names, made.distribution),
             config.refine,
         )
 
@@ -217,11 +217,12 @@ def steps_of(horizon: float | None, dt: float, noisy: bool) -> int:
     return max(1, round(horizon / dt))
 
 
-def _saved(folder: Any, name: str, make: Any, checkpoints: Any, refined: bool) -> Any:
-    """A result that is costly to make again, kept as a checkpoint."""
+def _saved(folder: Any, name: str, make: Any, check: Any, refined: bool) -> Any:
+    """A result that is costly to make again, kept as a checkpoint once checked."""
     import jax
 
     from easi_jax import distributed
+    from easi_jax.io import checkpoints
 
     place = folder.checkpoints / name
     found = checkpoints.restore(
@@ -231,6 +232,7 @@ def _saved(folder: Any, name: str, make: Any, checkpoints: Any, refined: bool) -
         return found.state
     say("least squares on the paired data ..." if refined else "Fisher information ...")
     result = distributed.local(make())
+    check(result)
     checkpoints.save(place, 1, result, config_hash=folder.config_hash)
     return result
 

@@ -198,6 +198,29 @@ def search_check(
     return check
 
 
+def found_check(seeds: Sequence[int], names: Sequence[str], found: Any) -> None:
+    """Stops where the `Distribution` that a search found is no number: a policy trained
+    under it would be worth nothing, and nothing would tell. ``found`` has one a seed.
+
+    Raises:
+        UserError: names the seed and the parameters.
+    """
+    import numpy as np
+
+    from easi_jax.errors import UserError
+
+    bad = ~np.isfinite(np.asarray(found.mean))
+    bad |= ~np.isfinite(np.asarray(found.factor)).all(-1)
+    for seed, some in zip(seeds, bad, strict=True):
+        if some.any():
+            named = ", ".join(names[int(i)] for i in np.flatnonzero(some))
+            raise UserError(
+                f"seed {seed}: the search's result is not finite for {named}; another "
+                "seed or --no-refine may do, but please report it: the fault is in "
+                "easi_jax"
+            )
+
+
 def jit_chunks(
     fun: Callable[..., Any], options: dict[str, Any] | None = None
 ) -> Callable[..., Any]:

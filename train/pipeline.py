@@ -107,7 +107,7 @@ def run(config: Config) -> None:
     from envs import open_env
     from train._pseudo_real import held_out_errors
     from train._results import write_pseudo_real
-    from train._stages import search_rows, training_rows
+    from train._stages import found_check, search_rows, training_rows
 
     given = read_given(config)
     env, real = robots(open_env(config.robot, config.env, config.option), given)
@@ -191,6 +191,7 @@ def run(config: Config) -> None:
                 "a generation had no finite simulation: run train.udr and train.easi, "
                 "which stop there and name the parameters"
             )
+        found_check(config.seeds, env.space.names, out["estimate"].distribution)
         for method in ("UDR", "EASI"):
             save_policies(folder, method, out[method.lower()])
         returns = {

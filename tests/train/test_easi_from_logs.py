@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import pytest
 
+from easi_jax import identify
 from train import _command, easi
 
 ROOT = Path(__file__).parents[2]
@@ -308,6 +309,21 @@ def test_non_finite_simulations_stop_the_search(files, capsys):
     edit(files["log"], ",1.0000\n", ",900000.0\n")
     edit(files["model"], 'joint="hinge"/>', 'joint="hinge" gear="1000"/>')
     refuse(capsys, arguments(files), "non-finite", "damping", "generation 1")
+
+
+@pytest.mark.fault("simulations that explode, parameters at absurd corners")
+def test_a_result_that_is_no_number_is_an_error(files, capsys, monkeypatch):
+    """Whatever makes it; once it was a singular system, and training went on."""
+    made = identify.gaussian
+    monkeypatch.setattr(
+        identify, "gaussian", lambda space, mean, cov: made(space, mean + np.nan, cov)
+    )
+    with pytest.raises(SystemExit) as stop:
+        call(*arguments(files))
+    assert stop.value.code == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("error: seed 0") and "not finite for damping" in said
+    assert not (files["out"] / "distribution.json").exists()
 
 
 def test_degrees_are_noticed_and_earlier_results_kept(files, capsys):

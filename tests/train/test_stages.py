@@ -1,14 +1,17 @@
 """A stage that was stopped keeps what it had told, and tells the rest once."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
+from easi_jax.errors import UserError
 from easi_jax.io.metrics import read_metrics
 from easi_jax.io.runs import RunFolder
-from train._stages import run_stage
+from train._stages import found_check, run_stage
 
 
 @pytest.mark.parametrize("per_step", [1, 100])
@@ -50,3 +53,15 @@ def test_metrics_of_a_stage_that_goes_on(
     stage(resume=True, stop=False)
     told = read_metrics(tmp_path / "run" / "metrics.jsonl", "train")
     assert [row["step"] for row in told] == [k * per_step for k in range(1, 7)]
+
+
+def test_a_result_that_is_no_number_is_named() -> None:
+    def found(mean: float, factor: float) -> SimpleNamespace:
+        means, factors = np.zeros((2, 2)), np.stack([np.eye(2)] * 2)
+        means[1, 0], factors[1, 1, 0] = mean, factor
+        return SimpleNamespace(mean=jnp.array(means), factor=jnp.array(factors))
+
+    found_check((3, 7), ("mass", "kp"), found(0.5, 0.1))
+    for odd, name in ((found(np.nan, 0.1), "mass"), (found(0.5, np.inf), "kp")):
+        with pytest.raises(UserError, match=f"seed 7: .* not finite for {name};"):
+            found_check((3, 7), ("mass", "kp"), odd)
