@@ -46,7 +46,7 @@ def run_cells(
         every = [c for c in every if c.key == share.only]
         if not every:
             raise UserError(f'no cell "{share.only}": see --list')
-    part, parts = _shard(share.shard)
+    part, parts = shard(share.shard)
     done = {row["key"] for row in read_rows(share.out)}
     if share.list:
         for c in every:
@@ -60,7 +60,12 @@ def run_cells(
         say(f"{c.key}: {told(row)}")
 
 
-def _shard(text: str) -> tuple[int, int]:
+def shard(text: str) -> tuple[int, int]:
+    """Which part, of how many.
+
+    Raises:
+        UserError: not written as PART/PARTS.
+    """
     from easi_jax.errors import UserError
 
     part, _, parts = text.partition("/")

@@ -7,14 +7,15 @@ sensor noise under a rough controller; the search (`default`) and its least-squa
 finish say where the parameters are, and how sure they are. Counted is how often the
 truth lies inside the 50 % and the 90 % regions along the directions that the data
 determine, and how large the error is beside the Cramer-Rao bound of the same data. One
-line a target is added to ``coverage.jsonl``; a run that was stopped goes on.
+line a target is added to ``coverage.jsonl``; a run that was stopped goes on, and
+several share the work by ``--shard`` (the second of four is 2/4).
 """
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
+from benchmarks._cells import add_row, read_rows, shard
 from benchmarks._common import RESULTS
 from benchmarks.recovery import NOISE, WEIGHED, controller
 from train._command import main, progress, say
@@ -32,6 +33,8 @@ class Config:
     """Demonstration trajectories of each: 200 s."""
     generations: int = 50
     """Generations of each search."""
+    shard: str = "1/1"
+    """Which part of the targets this process runs."""
     out: Path = RESULTS / "coverage.jsonl"
     """Where a line for each target is added."""
 
@@ -41,21 +44,19 @@ def run(config: Config) -> None:
     from benchmarks._common import command_of
     from easi_jax.io.versions import versions
 
-    done = set()
-    if config.out.exists():
-        rows = [json.loads(line) for line in config.out.read_text().splitlines()]
-        done = {row["seed"] for row in rows}
-    seeds = [s for s in range(config.targets) if s not in done]
+    part, parts = shard(config.shard)
+    mine = list(range(config.targets))[part - 1 :: parts]
+    done = {row["seed"] for row in read_rows(config.out)}
+    seeds = [s for s in mine if s not in done]
     if not seeds:
-        return say(f"all {config.targets} targets are in {config.out}")
+        return say(f"all {len(mine)} targets are in {config.out}")
     solve = _solver(config)
     given = {"command": command_of("benchmarks.coverage", config)}
     given |= {"versions": versions()}
-    with progress("coverage", config.targets, len(done)) as shown:
+    with progress("coverage", len(mine), len(mine) - len(seeds)) as shown:
         for seed in seeds:
             row = {"seed": seed, **solve(seed), **given}
-            with config.out.open("a") as file:
-                file.write(json.dumps(row) + "\n")
+            add_row(config.out, row)
             shown.advance(1, refined=row["refined"]["distance"] / max(row["rank"], 1))
     say(f"written: {config.out}")
 

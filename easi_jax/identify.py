@@ -165,10 +165,10 @@ def _near_zero(
     The likelihood is a Gaussian in the SI value, not in its logarithm. Where its
     standard deviation is no small part of the value, mean and variance of the logarithm
     are those under that likelihood and the initial range as prior. The others follow
-    the mean along the covariance, ``cov`` at ``raised``: ``unit`` with what lies below
-    its initial range raised to the low end, for further down the logarithm has no slope
-    and its spread would mean nothing. ``shown (n,)`` are variances along what the data
-    show: a direction that they do not show makes nothing as good as zero.
+    the SI value along the covariance, ``cov`` at ``raised``: ``unit`` with what lies
+    below its initial range raised to the low end, for further down the logarithm has no
+    slope and its spread would mean nothing. ``shown (n,)`` are variances along what the
+    data show: a direction that they do not show makes nothing as good as zero.
     """
     width = jnp.asarray(space.log_width)
     std = jnp.sqrt(jnp.diag(cov))
@@ -180,26 +180,34 @@ def _near_zero(
     top = jnp.exp(width * (1.0 - raised))  # of the initial range
     known = error < _KNOWN * top
     weak = space.log & known & (error > _SHARP * value)
-    mean, log_mean, log_std = _of_logarithm(raised, width, value, error)
+    mean, x_std, log_mean, log_std = _of_logarithm(raised, width, value, error)
     moved = jnp.where(weak, (mean - value) / width, 0.0)
-    # All of them together: those near zero may be known by their sum only.
-    follow = cov @ _solved(jnp.where(weak[:, None] & weak, cov, 0.0), std, moved)
-    scale = jnp.where(weak, log_std / std, 1.0)
-    return jnp.where(weak, log_mean, unit + follow), scale[:, None] * scale * cov
+    # The others follow the weak ones all together (these may be known by their sum
+    # only): what moves with them, and what is left once they are known.
+    among = jnp.where(weak[:, None] & weak, cov, 0.0)
+    follow = jnp.where(weak[:, None], 0.0, cov @ _inverse(among, std))
+    rest = jnp.where(weak[:, None] | weak, 0.0, cov - follow @ among @ follow.T)
+    # The weak ones' own spread is that of the logarithm, but the others follow the SI
+    # value; among themselves they keep their correlations.
+    wide = follow * (x_std / width / std) + jnp.diag(jnp.where(weak, log_std / std, 0))
+    return (
+        jnp.where(weak, log_mean, unit + follow @ moved),
+        rest + wide @ among @ wide.T,
+    )
 
 
-def _solved(cov: jax.Array, std: jax.Array, x: jax.Array) -> jax.Array:
-    """``cov^-1 x`` in the directions that single precision tells from none: what the
+def _inverse(cov: jax.Array, std: jax.Array) -> jax.Array:
+    """``cov^-1`` in the directions that single precision tells from none: what the
     data know by its sum alone may be one direction short."""
     values, vectors = jnp.linalg.eigh(cov / std[:, None] / std)
     inverse = jnp.where(values > _RESOLVED, 1.0 / values, 0.0)
-    return vectors @ (inverse * (vectors.T @ (x / std))) / std
+    return (vectors * inverse) @ vectors.T / std[:, None] / std
 
 
 def _of_logarithm(
     at: jax.Array, width: jax.Array, value: jax.Array, error: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Mean of x, and mean and standard deviation of u, all ``(n,)``.
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Mean and standard deviation of x, then of u, all ``(n,)``.
 
     x = exp(width (u - at)) is a Gaussian of mean ``value`` and standard deviation
     ``error``, and u was one about 0.5 before.
@@ -208,6 +216,9 @@ def _of_logarithm(
     x = jnp.exp(width[:, None] * (u - at[:, None]))
     score = -0.5 * ((x - value[:, None]) / error[:, None]) ** 2
     p = jax.nn.softmax(score - 0.5 * (u - 0.5) ** 2 / _INITIAL_VARIANCE, axis=1)
-    mean = p @ u
-    variance = (p * (u - mean[:, None]) ** 2).sum(1)
-    return (p * x).sum(1), mean, jnp.sqrt(variance)
+
+    def moments(v: jax.Array) -> tuple[jax.Array, jax.Array]:
+        mean = (p * v).sum(1)
+        return mean, jnp.sqrt((p * (v - mean[:, None]) ** 2).sum(1))
+
+    return *moments(x), *moments(jnp.broadcast_to(u, x.shape))

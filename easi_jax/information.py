@@ -18,7 +18,7 @@ from jax.sharding import Mesh
 
 from easi_jax import replay
 from easi_jax.machine import Machine
-from easi_jax.mesh import make_mesh, sharded_map
+from easi_jax.mesh import make_mesh, replicated, sharded_map
 from easi_jax.parameters import ParameterSpace
 from easi_jax.segments import Segments
 
@@ -218,7 +218,9 @@ class PairedFit:
             return jax.lax.map(one, block, batch_size=batch)
 
         given = (self.segments, *items)
-        return sharded_map(local, mesh, given, multiple=batch)
+        out = sharded_map(local, mesh, given, multiple=batch)
+        # Whole before anybody sums it: in the same order whoever holds the devices.
+        return replicated(out, mesh)
 
     def _pushed(
         self, unit: jax.Array, d: jax.Array, s: Segments

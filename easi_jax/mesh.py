@@ -66,5 +66,12 @@ def sharded_map(
     )
     out = mapped(jax.tree.map(padded, sharded), *shared)
     if distributed.count() > 1:
-        out = jax.lax.with_sharding_constraint(out, NamedSharding(mesh, whole))
+        out = replicated(out, mesh)
     return jax.tree.map(lambda x: x[:n], out) if pad else out
+
+
+def replicated(tree: Any, mesh: Mesh) -> Any:
+    """Inside a compiled function: arrays as wholes on every device of the mesh."""
+    if mesh.size == 1:
+        return tree
+    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))

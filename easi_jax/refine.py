@@ -28,7 +28,7 @@ from easi_jax.segments import Segments
 
 _DAMPING = 10.0 ** np.arange(-2, 4)  # tried together, relative to the last one
 _SHARES = 0.0, 0.3, 1.0  # of the step of its start, of which each piece takes the best
-_TINY = 1e-12
+_TINY = 1e-24  # below what a parameter that is nearly zero has of information
 _SHORT = 0.02  # s of each piece that the first stage fits
 _PATIENCE = 3, 6  # rounds without progress that end each stage
 _TOLD_APART = 0.05  # of the cost, which is minus a logarithm of likelihood
@@ -392,8 +392,11 @@ def _moved(space: ParameterSpace, unit: jax.Array, du: jax.Array) -> jax.Array:
 
     On a logarithmic scale a parameter near zero has no slope, and a step that
     overshoots towards zero would never come back: it moves by a factor of ten at most.
+    From below its initial range it may return by more, for steps of all others count
+    on it: to ten times the low end.
     """
-    ratio = jnp.clip(1.0 + space.log_width * du, 0.1, 10.0)
+    most = 10.0 * jnp.exp(-space.log_width * jnp.minimum(unit, 0.0))
+    ratio = jnp.clip(1.0 + space.log_width * du, 0.1, most)
     return unit + jnp.where(space.log, jnp.log(ratio) / space.log_width, du)
 
 
