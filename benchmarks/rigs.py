@@ -13,7 +13,6 @@ sines, two for each drive.
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from easi_jax.methods import Task
 from easi_jax.rollout import collect, measured, policy_rollout
 from easi_jax.segments import Segments
 from envs import make
-from envs.robot import parameter_space
+from envs.robot import model_file, parameter_space
 
 STEPS = 200  # control steps of a trajectory
 _DT = 0.02  # s
@@ -49,6 +48,7 @@ class Rig:
         noise: of the sensors, standard deviations ``(2 nv,)``.
         home: what the drives are sent on average, ``(nu,)``; also where joints start.
         reach: amplitude of commands, ``(nu,)``.
+        xml: the model, MJCF.
         env: the machine as an environment, where there is one.
     """
 
@@ -57,6 +57,7 @@ class Rig:
     noise: np.ndarray
     home: np.ndarray
     reach: np.ndarray
+    xml: str
     env: Any = None
 
     def with_machine(self, machine: Machine) -> Any:
@@ -182,44 +183,44 @@ def cartpole() -> Rig:
     names = [n for n in env.space.names if n not in known]
     machine = Machine(env.mj_model, env.space.select(names), env.dt)
     noise = np.array([5e-4, 2e-3, 1e-2, 2e-2])
-    return Rig("cartpole", machine, noise, np.zeros(1), np.zeros(1), env)
+    xml = model_file("cartpole").read_text()
+    return Rig("cartpole", machine, noise, np.zeros(1), np.zeros(1), xml, env)
 
 
 def arm6() -> Rig:
     """15 parameters: stiffness and damping of each drive, three masses."""
-    path = Path(__file__).parent / "assets" / "arm6.xml"
-    m = mujoco.MjModel.from_xml_path(str(path))
+    xml = (Path(__file__).parent / "assets" / "arm6.xml").read_text()
     gains = {f"{j}_{g}": f"actuator.{j}.{g}" for g in ("kp", "kv") for j in _ARM}
     masses = {f"{b}_mass": f"body.{b}.mass" for b in ("upper", "fore", "flange")}
     home = np.array([0.0, -0.6, 0.9, 0.0, 0.4, 0.0])
-    return _rig("arm6", m, {**gains, **masses}, home, 0.6)
+    return _rig("arm6", xml, {**gains, **masses}, home, 0.6)
 
 
 def go2() -> Rig:
     """11 parameters, by kind of joint: stiffness, damping, armature, masses."""
-    path = resources.files("envs") / "assets" / "go2.xml"
-    spec = mujoco.MjSpec.from_string(path.read_text())
+    spec = mujoco.MjSpec.from_string(model_file("go2").read_text())
     home = np.array(spec.keys[0].qpos)[7:]
     for part in (spec.joint("root"), spec.geom("floor"), *spec.keys):
         spec.delete(part)
-    m = spec.compile()
+    spec.compile()
     gains = {f"{j}_{g}": f"actuator.*_{j}.{g}" for g in ("kp", "kv") for j in _LEG}
     rotors = {f"{j}_armature": f"joint.*_{j}.armature" for j in _LEG}
     masses = {f"{j}_mass": f"body.*_{j}.mass" for j in _LEG[1:]}
-    return _rig("go2", m, {**gains, **rotors, **masses}, home, 0.4)
+    return _rig("go2", spec.to_xml(), {**gains, **rotors, **masses}, home, 0.4)
 
 
 def _rig(
     name: str,
-    m: mujoco.MjModel,
+    xml: str,
     addresses: dict[str, str],
     home: np.ndarray,
     reach: float,
 ) -> Rig:
     """A rig of joints that all have encoders: 0.5 mrad, 5 mrad/s."""
+    m = mujoco.MjModel.from_xml_string(xml)
     machine = Machine(m, parameter_space(m, addresses, _K), _DT)
     noise = np.repeat([5e-4, 5e-3], m.nv)
-    return Rig(name, machine, noise, home, np.full(m.nu, reach))
+    return Rig(name, machine, noise, home, np.full(m.nu, reach), xml)
 
 
 RIGS: dict[str, Callable[[], Rig]] = {"cartpole": cartpole, "arm6": arm6, "go2": go2}

@@ -7,14 +7,19 @@
 
 A cell is one robot, setting, method and seed. Each seed draws its own machine, every
 parameter within 1.5 times its nominal value either way; searches start within 3 times.
-All methods get the same recording, and the same budget of simulated
-control steps (EASI's least-squares finish comes on top, and is in its seconds).
-``clean``: logged commands, deterministic ones, no noise. ``paired``: with sensor noise,
-as all that follow. ``stochastic``: with exploration noise.
-``unpaired``: single transitions in any order, of an unknown controller. ``effect``:
-commands reach the target's drives 10 ms late, which no model has. Lines go to
-``results/rivals.jsonl``; a cell that has one is not run again. mujoco.sysid and NPE
-need ``pip install -e '.[peers]'``.
+All methods get the same recording, and the same budget of simulated control steps
+(EASI's least-squares finish and what train.gap simulates come on top, and are in the
+seconds). Settings:
+
+    clean       logged commands, deterministic ones, no noise
+    paired      the same with sensor noise, as in all that follow
+    unpaired    single transitions in any order, of an unknown controller
+    stochastic  a controller with exploration noise
+    effect      the same, and commands reach the target's drives 30 ms late, which no
+                model has; there, EASI is tried after train.gap as well
+
+Lines go to ``results/rivals.jsonl``; a cell that has one is not run again. mujoco.sysid
+and NPE need ``pip install -e '.[peers]'``.
 """
 
 import dataclasses
@@ -37,7 +42,8 @@ class Config:
     settings: tuple[str, ...] = SETTINGS
     """clean, paired, unpaired, stochastic, effect."""
     methods: tuple[str, ...] = METHODS
-    """Methods; SimOpt runs where it has an environment and the controller."""
+    """Methods; SimOpt runs where it has an environment and the controller, and
+    train.gap before EASI where the target has an effect."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds, paired over methods."""
     trajectories: int = 40

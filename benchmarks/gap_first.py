@@ -1,0 +1,114 @@
+"""What an owner does whose model may lack something: ``train.gap``, then EASI."""
+
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from easi_jax.configuration import Configuration
+from easi_jax.distribution import covariance, gaussian
+from easi_jax.found_effects import FoundEffects, machine_with
+from easi_jax.io.effects_file import read_effects
+from easi_jax.io.logs import write_log
+from easi_jax.io.parameter_file import write_parameter_file
+from easi_jax.machine import Machine
+from easi_jax.methods import Budget, Easi, Identified, Task
+from easi_jax.parameters import ParameterSpace
+from easi_jax.recording import Run
+from easi_jax.segments import Segments
+
+_ROOT = Path(__file__).parents[1]
+
+
+@dataclass(frozen=True)
+class GapFirst:
+    """``train.gap`` names what the model lacks, and EASI searches with it.
+
+    The command itself, on the recording as logs, with the parameters that are searched
+    as those it may refit.
+    """
+
+    xml: str
+    """The model, MJCF."""
+    time_limit: float = 3600.0
+    """Of train.gap [s]."""
+
+    def fit(
+        self, task: Task, demonstrations: Segments, budget: Budget, key: jax.Array
+    ) -> Identified:
+        """EASI's result, in the coordinates of the task's own parameters."""
+        effects = self.named(task, demonstrations)
+        machine = machine_with(task.machine, effects)
+        found = Easi(refine=True).fit(
+            replace(task, machine=machine), demonstrations, budget, key
+        )
+        return own(found, task.space)
+
+    def named(self, task: Task, demonstrations: Segments) -> FoundEffects:
+        """What ``train.gap`` found."""
+        with tempfile.TemporaryDirectory() as folder:
+            place = Path(folder)
+            model, log = place / "model.xml", place / "log.csv"
+            parameters, out = place / "parameters.yaml", place / "gap"
+            model.write_text(self.xml)
+            write_parameter_file(parameters, task.space)
+            write_log(log, task.machine.mj_model, runs(task.machine, demonstrations))
+            words = ["--model", model, "--data", log, "--parameters", parameters]
+            done = subprocess.run(
+                [sys.executable, "-m", "train.gap", *map(str, words), "--out", out],
+                cwd=_ROOT,
+                timeout=self.time_limit,
+                capture_output=True,
+                text=True,
+            )
+            if done.returncode:
+                last = done.stderr.strip().splitlines()[-1:] or ["no message"]
+                raise RuntimeError(f"train.gap failed: {last[0]}")
+            entries, own_values = read_effects(out / "effects.yaml")
+            return FoundEffects(tuple(entries), own_values)
+
+
+def runs(machine: Machine, demonstrations: Segments) -> list[Run]:
+    """Trajectories ``(B, T, 1, ...)`` as runs of a log."""
+    d = jax.tree.map(lambda x: np.asarray(x, float), demonstrations)
+    shape = Configuration.of(machine.mj_model)
+    found = []
+    for i in range(d.weight.shape[0]):
+        steps = int(d.weight[i].sum())
+        last = slice(steps - 1, steps)
+        ctrl = d.ctrl[i, :steps, 0]
+        found.append(
+            Run(
+                name=f"{i:03d}",
+                source="recording",
+                dt=machine.dt,
+                time=machine.dt * np.arange(steps + 1),
+                qpos=np.concatenate([d.qpos[i, :steps], d.next_qpos[i, last, 0]]),
+                qvel=np.concatenate([d.qvel[i, :steps], d.next_qvel[i, last, 0]]),
+                qvel_measured=True,
+                ctrl=np.concatenate([ctrl, ctrl[-1:]]),  # of the last row: held
+                configuration=shape,
+            )
+        )
+    return found
+
+
+def own(found: Identified, space: ParameterSpace) -> Identified:
+    """The part of a result that is about the parameters of ``space``, which come first
+    in its own, in the unit coordinates of ``space``."""
+    n = space.size
+    mean = jnp.asarray(found.distribution.mean)
+
+    def unit(u: jax.Array) -> jax.Array:
+        return space.to_unit(found.space.to_si(u)[:n])
+
+    slope = np.asarray(jax.jacfwd(unit)(mean))[:, : found.space.size]
+    cov = slope @ covariance(found.distribution) @ slope.T
+    return Identified(
+        gaussian(space, unit(mean), cov), space, found.simulated, found.measured
+    )
