@@ -1,17 +1,24 @@
 """How rivals are scored, and that cells are run once."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from benchmarks import rivals
 from benchmarks._cells import Share, read_rows, run_cells
+from benchmarks.gap_first import own, runs
+from benchmarks.rigs import RIGS
 from benchmarks.rival_cells import score
 from benchmarks.rivals_summary import best_rival, section, verdict
+from easi_jax.distribution import covariance, gaussian
 from easi_jax.errors import UserError
+from easi_jax.io.logs import read_logs, write_log
+from easi_jax.methods import Identified
 from easi_jax.parameters import Parameter, ParameterSpace
 
 # Two whose product alone is seen, one by itself; a unit is a factor of 9.
@@ -121,8 +128,47 @@ def test_the_page_says_who_is_ahead(tmp_path: Path) -> None:
     text = "\n".join(section(tmp_path))
     assert "| EASI | not run | 0.06 (0.05, 0.06, 0.07); in 3 of 3 | not run |" in text
     assert "| CMA-ES | not run | 0.12 (0.12, 0.12, 0.12); in 0 of 3 |" in text
+    # Where there is nothing to be found it is not tried.
+    assert "| EASI after train.gap |  |  |  |  | not run |" in text
     assert "paired: EASI ahead, 0.06 against 0.12 of CMA-ES" in text
     assert "| SimOpt | 4 | 3.00 | 6,000 |" in text
     assert "Not run: `python -m benchmarks.rivals --robots go2`." in text
     assert "**NPE ahead**: EASI 0.05 against 0.01" in verdict("NPE", 0.01, 0.05)
     assert "both exact" in verdict("NPE", 1e-5, 1e-4)
+
+
+def test_a_result_is_told_in_the_coordinates_that_were_asked_for() -> None:
+    """What was refitted starts about its new value, and effects come after it."""
+    a, b, c = SPACE.parameters
+    moved = replace(b, nominal=2.0, initial=(1.8, 2.2))
+    wider = ParameterSpace((a, moved, c, replace(a, name="delay")))
+    std = np.array([0.1, 0.05, 0.2, 0.3])
+    mean = jnp.array([0.7, 0.5, 0.1, 0.9])
+    result = Identified(gaussian(wider, mean, np.diag(std**2)), wider, 5)
+    got = own(result, SPACE)
+    assert got.space is SPACE and got.simulated == 5
+    np.testing.assert_allclose(
+        SPACE.to_si(got.distribution.mean), wider.to_si(mean)[:3], rtol=1e-5
+    )
+    in_logs = np.sqrt(np.diag(covariance(got.distribution))) * SPACE.log_width
+    np.testing.assert_allclose(in_logs, std[:3] * wider.log_width[:3], rtol=1e-4)
+
+
+def test_recordings_become_logs(tmp_path: Path) -> None:
+    rig = RIGS["cartpole"]()
+    theta = jnp.asarray(rig.machine.space.nominal, jnp.float32)
+    demos = jax.jit(lambda k: rig.record(rig.machine, theta, k, 2, 1.0))(
+        jax.random.key(0)
+    )
+    path = tmp_path / "log.csv"
+    write_log(path, rig.machine.mj_model, runs(rig.machine, demos))
+    read = read_logs(path, rig.machine.mj_model).runs
+    assert len(read) == 2
+    for i, run in enumerate(read):
+        steps = int(demos.weight[i].sum())
+        assert len(run) == steps + 1
+        np.testing.assert_allclose(run.qpos[:-1], demos.qpos[i, :steps], atol=1e-6)
+        np.testing.assert_allclose(
+            run.qvel[1:], demos.next_qvel[i, :steps, 0], atol=1e-5
+        )
+        np.testing.assert_allclose(run.ctrl[:-1], demos.ctrl[i, :steps, 0], atol=1e-6)
