@@ -87,12 +87,16 @@ def join(parts: list[Segments]) -> Segments:
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
-def windows(trajectories: Segments, horizon: int, every: int) -> Segments:
+def windows(
+    trajectories: Segments, horizon: int, every: int, past: int = 0
+) -> Segments:
     """Pieces of ``horizon`` steps from trajectories of single steps; jit-friendly.
 
     Args:
         trajectories: leaves ``(B, T, 1, ...)``, weights ``(B, T)``, as from
             `rollout.collect`.
+        past: how many commands before each start the pieces hold, where the
+            trajectories hold none before each step.
 
     Returns:
         Segments with leaves ``(B * starts, ...)``; a piece counts where all its
@@ -106,6 +110,10 @@ def windows(trajectories: Segments, horizon: int, every: int) -> Segments:
     def flat(x: jax.Array) -> jax.Array:
         return x.reshape(-1, *x.shape[2:])
 
+    before = jax.tree.map(lambda x: x[:, starts], t.past)
+    if past and not jax.tree.leaves(before):
+        earlier = np.maximum(starts[:, None] + np.arange(-past, 0), 0)
+        before = t.ctrl[:, earlier, 0]
     return Segments(
         qpos=flat(t.qpos[:, starts]),
         qvel=flat(t.qvel[:, starts]),
@@ -113,7 +121,7 @@ def windows(trajectories: Segments, horizon: int, every: int) -> Segments:
         next_qpos=flat(t.next_qpos[:, rows, 0]),
         next_qvel=flat(t.next_qvel[:, rows, 0]),
         weight=flat(t.weight[:, rows].min(-1)),
-        past=jax.tree.map(lambda x: flat(x[:, starts]), t.past),
+        past=jax.tree.map(flat, before),
     )
 
 

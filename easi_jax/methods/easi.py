@@ -36,7 +36,8 @@ class Easi:
         c = self.search
         replays = c.source == "replay"
         horizon = c.horizon if replays else 1
-        pieces = windows(demonstrations, horizon, max(1, horizon // 2))
+        past = task.machine.past_steps
+        pieces = windows(demonstrations, horizon, max(1, horizon // 2), past)
         steps = min(c.segments, pieces.count) * horizon if replays else c.rollout_steps
         rounds = min(c.generations, budget.rounds(c.population * steps))
         search = Search(
@@ -57,7 +58,7 @@ class Easi:
             key, task.policy
         )
         steps_of = min(self.refine_horizon, demonstrations.weight.shape[1])
-        longer = windows(demonstrations, steps_of, steps_of + 1)
+        longer = windows(demonstrations, steps_of, steps_of + 1, past)
 
         restarts = self.restarts
         if restarts is None:

@@ -73,3 +73,26 @@ def test_windows_of_trajectories_count_only_where_all_their_steps_do() -> None:
     np.testing.assert_array_equal(w.ctrl[1, :, 0], [-2, -3, -4])
     np.testing.assert_array_equal(w.next_qvel[4, :, 0], [13, 14, 15])
     np.testing.assert_array_equal(w.weight, [1, 1, 1, 1, 0, 0])
+
+
+def test_pieces_of_trajectories_know_what_was_sent_before() -> None:
+    """As pieces of logs do; before the first command it was that command."""
+    rng = np.random.default_rng(0)
+    qpos, ctrl = rng.normal(size=(2, 9, 2)), rng.normal(size=(2, 8, 1))
+    trajectories = segments.Segments(
+        qpos=qpos[:, :-1],
+        qvel=qpos[:, :-1],
+        ctrl=ctrl[:, :, None],
+        next_qpos=qpos[:, 1:, None],
+        next_qvel=qpos[:, 1:, None],
+        weight=np.ones((2, 8)),
+    )
+    logs = [
+        segments.cut(q, q, np.concatenate([c, c[-1:]]), 3, 2, past=2)
+        for q, c in zip(qpos, ctrl, strict=True)
+    ]
+    expected = segments.join([x for x in logs if x is not None])
+    got = segments.windows(trajectories, 3, 2, past=2)
+    for name in ("qpos", "ctrl", "next_qpos", "past", "weight"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(expected, name))
+    assert segments.windows(trajectories, 3, 2).past == ()
