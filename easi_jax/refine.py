@@ -5,7 +5,9 @@ every segment are fitted together by Levenberg-Marquardt (derivatives:
 `easi_jax.information`). Each round tries several dampings, and jumps of single
 parameters: a speed limit that no simulation reaches has no slope, yet the data may show
 that it is lower. The common scale of all masses and forces jumps as well. In the first
-rounds pieces that fit far worse than most count less. A first stage fits only the
+rounds pieces that fit far worse than most count less. Noise digs a dip into the edge of
+such a plateau: what fits hardly better there is put back onto the plateau, where
+nothing is known of it. A first stage fits only the
 beginning of each piece: over few milliseconds errors are nearly linear in the
 parameters, while over contacts and stick-slip they have many minima. Starting at the
 found mean, it is the natural last step where commands and states were logged together;
@@ -31,12 +33,16 @@ _SHARES = 0.0, 0.3, 1.0  # of the step of its start, of which each piece takes t
 _TINY = 1e-24  # below what a parameter that is nearly zero has of information
 _SHORT = 0.02  # s of each piece that the first stage fits
 _PATIENCE = 3, 6  # rounds without progress that end each stage
+_UNSEEN = 1.0  # information of a unit coordinate: nothing
 _TOLD_APART = 0.05  # of the cost, which is minus a logarithm of likelihood
 _ROUNDING = 3e-6  # of the cost, which the best of many trials takes for progress
 _ROUGH = 1e-3  # of the cost: less progress than that is not to be had by differences
 _NEAR_ENOUGH = 1e-2  # of the cost, for the first stage
 _MOVING, _LOOKING, _FINISHED = range(3)
 _FARTHEST = 0.8, 2.5  # jump that is tried, in initial ranges, in log ratios
+_EDGE = 4.0  # of the cost, that a place beyond a plateau's edge has to be better by
+_SHALLOW = 0.1  # of what its curvature foretells, that the cost rises beyond a dip
+_INSIDE = 0.25  # initial ranges beyond the edge, where a plateau is entered
 _OUTLYING = 9.0  # times the median cost: such a piece counts half
 
 
@@ -130,7 +136,7 @@ def refine(
         again: jax.Array,
         begun: jax.Array,
     ) -> Any:
-        u, shift, damp, unchanged, raised, pieces, _ = carry
+        u, shift, damp, unchanged, raised, pieces, *_ = carry
         unchanged, raised = (
             jnp.where(again, x, y)
             for x, y in zip(fresh, (unchanged, raised), strict=True)
@@ -152,6 +158,9 @@ def refine(
         units, shifts, each = best_starts(units, shifts, each)
         data = _data(each, trust)
         costs = data + prior(units)
+        flat = jnp.diag(eq.hessian) < _UNSEEN
+        entering = jnp.tile(_EDGE * jnp.append(flat, False)[: len(ways)], 2)
+        costs = costs.at[jumps].add(jnp.where(moving, entering, 0.0))
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
         home = len(costs) - 1
         best = jnp.where(first & (costs[home] < costs[0]), home, 0)
@@ -160,12 +169,19 @@ def refine(
         damp = damp * jnp.asarray(_DAMPING)[jnp.argmin(damped)]
         damp = jnp.where(damped.min() < costs[0], damp, 100.0 * damp)
         level = data[jumps].reshape(2, -1)
-        flat, worse = level == here, ~(level <= here)
+        same, worse = level == here, ~(level <= here)
         chosen = (jnp.arange(level.size) == best - jumps.start).reshape(level.shape)
         unchanged = jnp.where(
-            moving & flat, reach, jnp.where(chosen.any(0), 0.0, unchanged)
+            moving & same, reach, jnp.where(chosen.any(0), 0.0, unchanged)
         )
         raised = jnp.where(moving & (worse | chosen), reach, raised)
+        # Over a jump upwards the cost hardly rises, though its curvature foretells it.
+        up = jnp.diagonal(hops[0])
+        foretold = 0.5 * jnp.diag(eq.hessian) * (up - u) ** 2
+        rise = level[0, :n] - here
+        dip = (foretold > 2 * _EDGE / _SHALLOW) & (rise < _SHALLOW * foretold)
+        middle = jnp.minimum(up, jnp.maximum(0.5, u + _INSIDE))
+        freed = jnp.where(dip, middle, u)
         new = (
             units[best],
             shifts[best],
@@ -174,6 +190,7 @@ def refine(
             raised,
             each[best],
             eq.hessian,
+            freed,
         )
         told = jnp.where(first, home, 0)
         return new, each[told].sum() + prior(units[told])
@@ -249,15 +266,17 @@ def refine(
 
     def stage(found: Any, item: Any) -> Any:
         """From parameters and shifts ``found``, or ``item.begun``, to a best fit."""
-        (u, shift), best = found
+        (u, shift), best, freed = found
         u = jnp.where(item.restart, item.begun, u)
         shift = jnp.where(item.restart, unmoved, shift)
-        u = jnp.where(item.raised, jnp.where(space.log, best[0].clip(0.0), best[0]), u)
-        shift = jnp.where(item.raised, best[1], shift)
+        u = jnp.where(item.look, best[0], jnp.where(item.freed, freed, u))
+        u = jnp.where(item.raised & space.log, u.clip(0.0), u)
+        shift = jnp.where(item.look | item.freed, best[1], shift)
+        phase = jnp.where(item.freed & (freed == best[0]).all(), _FINISHED, item.phase)
         used = jnp.where(item.short, weight * begin[:, None], weight)
         init = (
             *(u, shift, jnp.asarray(1e-3), *fresh),
-            *(jnp.ones(count), jnp.zeros((n, n))),
+            *(jnp.ones(count), jnp.zeros((n, n)), u),
         )
 
         def going(state: Any) -> jax.Array:
@@ -283,29 +302,33 @@ def refine(
             phase = jnp.where(fitting, jnp.where(over, _LOOKING, _MOVING), _FINISHED)
             return phase, k + 1, costs, carry
 
-        start = (item.phase, jnp.asarray(0), jnp.zeros(iterations + 2), init)
+        start = (phase, jnp.asarray(0), jnp.zeros(iterations + 2), init)
         _, _, costs, carry = jax.lax.while_loop(going, round_, start)
-        u, shift, *_, hessian = carry
-        better = item.whole & (item.first | (costs[-1] < best[2][-1]))
+        u, shift, *_, hessian, up = carry
+        # A plateau is wide, and likelier than a dip that noise may have dug.
+        flat = ((freed == best[0]) | (jnp.diag(hessian) < _UNSEEN)).all()
+        least = best[2][-1] + jnp.where(item.freed & flat, _EDGE, 0.0)
+        better = item.whole & (item.first | (costs[-1] < least))
+        better &= ~item.freed | (phase != _FINISHED)
         best = jax.tree.map(
             lambda new, old: jnp.where(better, new, old),
             (u, shift, costs, hessian),
             best,
         )
-        return ((u, shift), best), (u, hessian)
+        return ((u, shift), best, jnp.where(item.look, up, freed)), (u, hessian)
 
     starts = unit[None] if others is None else jnp.concatenate([unit[None], others])
     # As a scan, so that a stage is compiled once.
     none = unit, unmoved, jnp.zeros(iterations + 2), jnp.zeros((n, n))
     stages = _stages(starts, near, robust, rounding)
-    found, looked = jax.lax.scan(stage, ((unit, unmoved), none), stages)
+    found, looked = jax.lax.scan(stage, ((unit, unmoved), none, unit), stages)
     u, shift, costs, hessian = found[1]
     return RefineResult(u, hessian, costs, shift, looked[0][-1], looked[1][-1])
 
 
 @flax.struct.dataclass
 class _Stage:
-    """One stage of the fit, or a look at the raised result; see `_stages`."""
+    """One stage of the fit, or a look at the result; see `_stages`."""
 
     begun: jax.Array  # where this fit began
     phase: jax.Array
@@ -313,6 +336,8 @@ class _Stage:
     short: jax.Array
     whole: jax.Array
     first: jax.Array
+    look: jax.Array
+    freed: jax.Array
     raised: jax.Array
     robust: jax.Array
     patience: jax.Array
@@ -321,19 +346,24 @@ class _Stage:
 
 def _stages(starts: jax.Array, near: Any, robust: Any, rounding: float) -> _Stage:
     """The beginnings of the pieces, then all of them, from each start ``(K, n)``; then
-    the look at the result."""
-    count = 2 * len(starts) + 1
-    at = jnp.arange(count)
-    look, short = at == count - 1, at % 2 == 0
-    wanted = jnp.where(near, at == 1, True)
+    a look at the result, a fit of what may not be at a plateau's edge, and a look at
+    what is raised."""
+    fits = 2 * len(starts)
+    at = jnp.arange(fits + 3)
+    look, freed = (at == fits) | (at == fits + 2), at == fits + 1
+    short = (at < fits) & (at % 2 == 0)
+    wanted = jnp.where(near, at == 1, True) | freed
+    near |= freed
     return _Stage(
         begun=starts[jnp.minimum(at // 2, len(starts) - 1)],
         phase=jnp.where(look, _LOOKING, jnp.where(wanted, _MOVING, _FINISHED)),
-        restart=short & ~look,
-        short=short & ~look,
-        whole=~short & wanted,
+        restart=short,
+        short=short,
+        whole=~short & ~look & wanted,
         first=at == 1,
-        raised=look,
+        look=look,
+        freed=freed,
+        raised=at == fits + 2,
         robust=jnp.where(short, 0, robust),
         patience=jnp.where(short | near, *_PATIENCE),
         rough=jnp.where(short, _NEAR_ENOUGH, rounding),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.recovery import controller
+from benchmarks.rigs import RIGS
 from easi_jax import rollout
 from easi_jax.information import identifiability
 from easi_jax.machine import Machine
@@ -124,6 +125,37 @@ def test_a_value_lost_near_zero_comes_back(
     np.testing.assert_allclose(found.cost[-1], good.cost[-1], atol=0.5)
     off = np.asarray(found.unit - good.unit) * space.log_width
     assert abs(off[i]) < 0.3, dict(zip(space.names, off.round(3), strict=True))
+
+
+@pytest.mark.parametrize("met", [True, False])
+def test_a_limit_that_was_not_met_is_not_known(met: bool) -> None:
+    """Noise digs a dip into the edge of the plateau, where a fit from below stops."""
+    rig = RIGS["cartpole"]()
+    space = rig.machine.space
+    i = space.names.index("cart_force_limit")
+    theta = jnp.asarray(space.nominal, jnp.float32)
+    theta = theta.at[i].mul(0.25 if met else 1.0)
+    clean = jax.jit(lambda k: rig.record(rig.machine, theta, k, 16, 1.0))(
+        jax.random.key(0)
+    )
+    seen = rollout.measured(clean, jnp.asarray(rig.noise), jax.random.key(9))
+    pieces = windows(seen, 25, 26)
+    start = space.to_unit(theta).at[i].add(-0.5)
+    run = jax.jit(
+        lambda u: refine(
+            *(rig.machine, space, u, pieces, jnp.asarray(rig.noise)),
+            robust=0,
+            iterations=15,
+        )
+    )
+    out = run(start)
+    off = float(out.unit[i] - space.to_unit(theta)[i]) * float(space.log_width[i])
+    if met:
+        assert abs(off) < 0.01
+        assert out.hessian[i, i] > 1e4
+    else:
+        assert abs(off) < 0.5
+        assert out.hessian[i, i] < 1.0
 
 
 def test_a_limit_that_nothing_meets_is_found_from_a_narrow_start(
