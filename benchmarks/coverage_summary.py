@@ -33,8 +33,9 @@ def section(folder: Path) -> list[str]:
             low, high = wilson(int(hit.sum()), len(hit))
             cells.append(f"{hit.mean():.0%} [{low:.0%}, {high:.0%}]")
         if way == WAYS[-1]:
-            good = REGION[0] <= inside[0.9].mean() <= REGION[1] and len(rows) >= TARGETS
-            cells[1] += ", met" if good else ", **missed**"
+            good = REGION[0] <= inside[0.9].mean() <= REGION[1]
+            few = f" by {len(rows)} of {TARGETS} targets" if len(rows) < TARGETS else ""
+            cells[1] += f", met{few}" if good else f", **missed**{few}"
         met = "met" if ratio <= BOUND else "**missed**"
         told = f"{ratio:.2f}" + (f", {met}" if way == WAYS[-1] else "")
         lines.append((way, *cells, told))

@@ -109,7 +109,16 @@ def _verdicts(rows: Sequence[Row]) -> list[str]:
         if found is None:
             continue
         method, error, own = found
-        said.append(f"- {setting}: {verdict(method, error, own)}")
+        line = f"- {setting}: {verdict(method, error, own)}"
+        start = median(
+            r["start_error"] for r in rows if r["setting"] == setting and r["rank"]
+        )
+        if start < min(error, own):
+            line += f"; where searches start is nearer ({_told(start)})"
+        mended = _by_seed(rows, setting, METHODS[-1])
+        if mended:
+            line += f"; {METHODS[-1]} {_told(median(mended.values()))}"
+        said.append(line)
     return ["\n".join(said)] if said else []
 
 

@@ -130,6 +130,13 @@ def test_the_page_says_who_is_ahead(tmp_path: Path) -> None:
     assert "| CMA-ES | not run | 0.12 (0.12, 0.12, 0.12); in 0 of 3 |" in text
     # Where there is nothing to be found it is not tried.
     assert "| EASI after train.gap |  |  |  |  | not run |" in text
+    assert "where searches start" not in text
+    late = [line(m, 0, e, "effect") for m, e in (("EASI", 0.9), ("NPE", 0.5))]
+    late.append(line("EASI after train.gap", 0, 0.08, "effect"))
+    out.write_text("".join(json.dumps(r) + "\n" for r in late))
+    told = next(x for x in "\n".join(section(tmp_path)).splitlines() if "- effect" in x)
+    assert "**NPE ahead**" in told and "start is nearer (0.3)" in told
+    assert told.endswith("; EASI after train.gap 0.08")
     assert "paired: EASI ahead, 0.06 against 0.12 of CMA-ES" in text
     assert "| SimOpt | 4 | 3.00 | 6,000 |" in text
     assert "Not run: `python -m benchmarks.rivals --robots go2`." in text
