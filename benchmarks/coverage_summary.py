@@ -1,12 +1,12 @@
 """Section of the results page on the spread that a search returns."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks._common import markdown_table
+from benchmarks._cells import read_rows
+from benchmarks._common import commits_of, markdown_table
 from benchmarks.coverage import WAYS
 from benchmarks.gap_score import wilson
 
@@ -18,10 +18,7 @@ TARGETS = 100
 def section(folder: Path) -> list[str]:
     """Coverage of the regions, and errors beside the Cramer-Rao bound."""
     out = ["## What the stated spread is worth"]
-    path = folder / "coverage.jsonl"
-    rows = []
-    if path.is_file():
-        rows = [json.loads(line) for line in path.read_text().splitlines()]
+    rows = read_rows(folder / "coverage.jsonl")
     if not rows:
         return [*out, "Not run: `python -m benchmarks.coverage`."]
     lines = []
@@ -39,11 +36,10 @@ def section(folder: Path) -> list[str]:
         met = "met" if ratio <= BOUND else "**missed**"
         told = f"{ratio:.2f}" + (f", {met}" if way == WAYS[-1] else "")
         lines.append((way, *cells, told))
-    commits = sorted({r["versions"]["commit"][:7] for r in rows})
     return [
         *out,
         f"`python -m benchmarks.coverage`, {len(rows)} Cartpoles with parameters drawn "
-        f"from UDR's range, sensor noise, commits {', '.join(commits)}. Share of "
+        f"from UDR's range, sensor noise, commits {commits_of(rows)}. Share of "
         "truths inside the stated regions along the directions that the data "
         f"determine (95 % interval); goal {REGION[0]:.0%} to {REGION[1]:.0%} in the "
         "90 % region. Error as a multiple of the Cramer-Rao bound, median; goal at "

@@ -13,9 +13,10 @@ import numpy as np
 from easi_jax.configuration import Configuration
 from easi_jax.distribution import covariance, gaussian
 from easi_jax.found_effects import FoundEffects, machine_with
-from easi_jax.io.effects_file import read_effects
+from easi_jax.io.effects_file import parsed_effects
 from easi_jax.io.logs import write_log
 from easi_jax.io.parameter_file import write_parameter_file
+from easi_jax.io.strict_yaml import read_yaml
 from easi_jax.machine import Machine
 from easi_jax.methods import Budget, Easi, Identified, Task
 from easi_jax.parameters import ParameterSpace
@@ -69,8 +70,8 @@ class GapFirst:
             if done.returncode:
                 last = done.stderr.strip().splitlines()[-1:] or ["no message"]
                 raise RuntimeError(f"train.gap failed: {last[0]}")
-            entries, own_values = read_effects(out / "effects.yaml")
-            return FoundEffects(tuple(entries), own_values)
+            found = out / "effects.yaml"
+            return parsed_effects(read_yaml(found), str(found))
 
 
 def runs(machine: Machine, demonstrations: Segments) -> list[Run]:
@@ -101,13 +102,12 @@ def runs(machine: Machine, demonstrations: Segments) -> list[Run]:
 def own(found: Identified, space: ParameterSpace) -> Identified:
     """The part of a result that is about the parameters of ``space``, which come first
     in its own, in the unit coordinates of ``space``."""
-    n = space.size
     mean = jnp.asarray(found.distribution.mean)
 
     def unit(u: jax.Array) -> jax.Array:
-        return space.to_unit(found.space.to_si(u)[:n])
+        return space.to_unit(found.space.to_si(u)[: space.size])
 
-    slope = np.asarray(jax.jacfwd(unit)(mean))[:, : found.space.size]
+    slope = np.asarray(jax.jacfwd(unit)(mean))
     cov = slope @ covariance(found.distribution) @ slope.T
     return Identified(
         gaussian(space, unit(mean), cov), space, found.simulated, found.measured

@@ -4,10 +4,11 @@ import dataclasses
 import time
 from typing import Any
 
+AFTER_GAP = "EASI after train.gap"
 METHODS = (
     *("EASI", "CMA-ES", "DROPO", "SimOpt"),
     *("random search", "mujoco.sysid", "NPE"),
-    "EASI after train.gap",
+    AFTER_GAP,
 )
 ROBOTS = ("cartpole", "arm6", "go2")
 SETTINGS = ("clean", "paired", "unpaired", "stochastic", "effect")
@@ -48,7 +49,7 @@ class Cell:
     @property
     def possible(self) -> bool:
         """SimOpt needs an environment and the controller, train.gap a reason."""
-        if self.method == METHODS[-1]:
+        if self.method == AFTER_GAP:
             return self.setting == "effect"
         return self.method != "SimOpt" or (
             self.robot == "cartpole" and self.setting != "unpaired"
@@ -79,7 +80,7 @@ def method_of(cell: Cell, xml: str) -> Any:
         "random search": lambda: RandomSearch(**cut),
         "mujoco.sysid": lambda: MujocoSysid(**cut),
         "NPE": lambda: NeuralPosterior(**cut),
-        METHODS[-1]: lambda: GapFirst(xml),
+        AFTER_GAP: lambda: GapFirst(xml),
     }
     return known[cell.method]()
 
@@ -91,10 +92,10 @@ def solve(cell: Cell) -> dict[str, Any]:
         ``error``: RMS of the log ratio to the truth along the ``rank`` directions that
         the data determine (`easi_jax.information`), None without any; ``bound``: that
         of Cramer and Rao; ``start_error``: that of the middle of where searches start;
-        ``covered``: whether the truth is in
-        the found 90 % region of these directions; ``log_ratio`` and unit-coordinate
-        ``std`` of each parameter; ``seconds``; control steps ``simulated`` and, of the
-        real machine beyond the recording, ``measured``.
+        ``covered``: whether the truth is in the found 90 % region of these directions;
+        ``log_ratio`` and unit-coordinate ``std`` of each parameter; ``seconds``;
+        control steps ``simulated`` and, of the real machine beyond the recording,
+        ``measured``.
     """
     import jax
     import jax.numpy as jnp

@@ -4,14 +4,14 @@ Maximum likelihood under independent measurement noise: parameters and the true 
 every segment are fitted together by Levenberg-Marquardt (derivatives:
 `easi_jax.information`). Each round tries several dampings, and jumps of single
 parameters: a speed limit that no simulation reaches has no slope, yet the data may show
-that it is lower. The common scale of all masses and forces jumps as well. In the first
-rounds pieces that fit far worse than most count less. Noise digs a dip into the edge of
-such a plateau: what fits hardly better there is put back onto the plateau, where
-nothing is known of it. A first stage fits only the
-beginning of each piece: over few milliseconds errors are nearly linear in the
-parameters, while over contacts and stick-slip they have many minima. Starting at the
-found mean, it is the natural last step where commands and states were logged together;
-it says nothing about unpaired data or about distributions.
+that it is lower. Noise digs a dip into the edge of such a plateau: what fits hardly
+better there is put back onto the plateau, where nothing is known of it. The common
+scale of all masses and forces jumps as well. In the first rounds pieces that fit far
+worse than most count less. A first stage fits only the beginning of each piece: over
+few milliseconds errors are nearly linear in the parameters, while over contacts and
+stick-slip they have many minima. Starting at the found mean, it is the natural last
+step where commands and states were logged together; it says nothing about unpaired data
+or about distributions.
 """
 
 import functools

@@ -64,8 +64,10 @@ def test_no_data_leave_the_initial_spread() -> None:
     np.testing.assert_allclose(seen, np.zeros((3, 3)), atol=1e-6)
 
 
-@pytest.mark.parametrize("shared", [0.6, 0.99])
-def test_regions_cover_values_that_may_be_as_good_as_zero(shared: float) -> None:
+@pytest.mark.parametrize(("shared", "most"), [(0.6, 0.94), (0.99, 0.95)])
+def test_regions_cover_values_that_may_be_as_good_as_zero(
+    shared: float, most: float
+) -> None:
     """Two values known by noisy linear readings: one about as large as its standard
     deviation, which the best fit puts at zero in a sixth of the cases. The other is
     known the better the more is known of the first."""
@@ -102,7 +104,7 @@ def test_regions_cover_values_that_may_be_as_good_as_zero(shared: float) -> None
     off = mean - draws
     assert 0.1 < (short > 0).mean() < 0.3
     inside = np.abs(off) < 1.645 * np.sqrt(cov[:, [0, 1], [0, 1]])
-    assert ((inside.mean(0) > 0.87) & (inside.mean(0) < 0.95)).all()
+    assert ((inside.mean(0) > 0.87) & (inside.mean(0) < most)).all()
     # Where it is put at zero the other one has to allow for what it may be.
     apart = np.einsum("ki,kij,kj->k", off, np.linalg.inv(cov.astype(float)), off)
     assert 0.9 < (apart[short > 0] < 4.605).mean() < 0.97
