@@ -107,6 +107,7 @@ def _solver(config: Config) -> Any:
             estimate(
                 *(machine, search.space, mean, cov, pieces, noise, *how),
                 restarts=RESTARTS,
+                adjusted=True,
             ).distribution
             for how in ((False, False), (False, True), (True, True))
         ]

@@ -1,15 +1,19 @@
 """From the end of a search to an honest distribution over parameters."""
 
+from dataclasses import replace
+from typing import Any
+
 import flax.struct
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
+from easi_jax.adjusted import adjust
 from easi_jax.distribution import Distribution, gaussian
 from easi_jax.information import PairedFit
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
-from easi_jax.refine import refine, step_weights
+from easi_jax.refine import RefineResult, refine, step_weights
 from easi_jax.replay import motion
 from easi_jax.segments import Segments
 
@@ -69,6 +73,7 @@ def estimate(
     free_starts: bool = True,
     near: bool | jax.Array = False,
     restarts: int = 0,
+    adjusted: bool = False,
 ) -> Estimate:
     """The result of a search at ``mean``, ``cov`` (unit coordinates); pure.
 
@@ -79,8 +84,9 @@ def estimate(
     own covariance alone. ``misfit (2 nv,)`` is what the model itself errs by in every
     step, on top of the noise; it, ``robust``, ``free_starts`` and ``near`` go to
     `easi_jax.refine.refine`, which starts from so many draws of the search's spread as
-    well as ``restarts`` says. What may be as good as zero
-    is stated as `_near_zero` says.
+    well as ``restarts`` says. With ``adjusted``, what the fitted starts add to the
+    score is taken off (`easi_jax.adjusted`); not where starts are exact, nor for larger
+    machines. What may be as good as zero is stated as `_near_zero` says.
     """
     assumed = effective_noise(machine, pieces, noise)
     n = space.size
@@ -98,6 +104,8 @@ def estimate(
             near=near,
             others=_draws(mean, cov, restarts) if restarts else None,
         )
+        if adjusted and free_starts and not machine.wide:
+            fit = _adjusted(fit, machine, space, pieces, assumed, mesh, misfit)
         center, hessian = fit.unit, fit.hessian
         cost, delta = fit.cost, fit.delta
     else:
@@ -121,6 +129,22 @@ def estimate(
         cost=cost,
         delta=delta,
     )
+
+
+def _adjusted(fit: RefineResult, *given: Any) -> RefineResult:
+    """The fit with its score adjusted, where the simulation gets that far."""
+    machine, space, pieces, noise, mesh, misfit = given
+    new = adjust(machine, space, fit.unit, pieces, noise, mesh, misfit)
+    found = replace(
+        fit,
+        unit=new.unit,
+        hessian=new.hessian,
+        delta=new.delta,
+        raised=new.raised,
+        raised_hessian=new.raised_hessian,
+    )
+    fine = jnp.isfinite(new.left[1])
+    return jax.tree.map(lambda x, y: jnp.where(fine, x, y), found, fit)
 
 
 def _posterior(hessian: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -282,6 +282,7 @@ class Pipeline:
                 self.mesh,
                 free_starts=noisy,
                 restarts=restarts,
+                adjusted=True,
             )
 
         return jax.lax.map(one, (states.result_mean, states.result_cov, demos))

@@ -210,7 +210,7 @@ def refine(
         def trial(damp: jax.Array) -> tuple[jax.Array, jax.Array]:
             lifted = scaled + damp * jnp.eye(n)
             du = -scale * jnp.linalg.solve(lifted, scale * grad)
-            new = jnp.clip(_moved(space, u, du), low, high)
+            new = jnp.clip(moved(space, u, du), low, high)
             return new, jnp.einsum("mdn,n->md", eq.start_gain, new - u)
 
         newton, followed = jax.vmap(trial)(damp * _DAMPING)
@@ -417,7 +417,7 @@ def _distance(space: ParameterSpace, anchor: jax.Array, unit: jax.Array) -> jax.
     return scale(unit) - scale(anchor)
 
 
-def _moved(space: ParameterSpace, unit: jax.Array, du: jax.Array) -> jax.Array:
+def moved(space: ParameterSpace, unit: jax.Array, du: jax.Array) -> jax.Array:
     """``unit`` moved by ``du`` along the SI values themselves.
 
     On a logarithmic scale a parameter near zero has no slope, and a step that

@@ -77,6 +77,7 @@ class Easi:
                 task.mesh,
                 free_starts=noisy,
                 restarts=restarts,
+                adjusted=True,
             ).distribution
 
         distribution = jax.jit(result)(mean, cov)

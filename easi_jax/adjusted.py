@@ -1,0 +1,276 @@
+"""Parameters whose score is zero on average: starts that are fitted, paid for.
+
+`easi_jax.refine` fits the start of every piece with the parameters. Each start takes
+its share of the noise, and where motion is no straight line within the noise, the
+parameters pay: at low speed a fitted start chooses the sign of a speed, and friction
+comes out too high and too sure, however many pieces there are (the incidental
+parameters of Neyman and Scott, 1948). The cure is the adjusted profile score of
+McCullagh and Tibshirani (1990): at each parameter vector, what the score would be on
+average if the model with the fitted starts were the truth is simulated, and taken off.
+What is left is zero at the result. The noise of the simulated average is small, since
+the same draws also give the score at their true starts, whose average is zero.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from easi_jax.information import PairedFit, shift_start
+from easi_jax.machine import Machine
+from easi_jax.parameters import ParameterSpace
+from easi_jax.refine import moved, step_weights
+from easi_jax.segments import Segments
+
+_DRAWS = 2  # of the noise, for every piece
+_ROUNDS = 16  # at most
+_TURNS = 4  # looks at each start, a Gauss-Newton step between each two
+_FARTHEST = 4.0  # standard deviations that a start may be off
+_PULL = 12.0  # information of a uniform initial range, unit coordinates
+_LONGEST = 4.0  # times the Newton step: the average changes with the parameters, too
+_SHORTEST = 0.02
+_SETTLED = 1e-2  # half the squared score that is left, in its standard deviations
+_NOISE, _FIRST, _MOVING, _RAISED, _DONE = range(5)
+
+
+@flax.struct.dataclass
+class Score:
+    """The profile score of all pieces.
+
+    Attributes:
+        hessian: information, ``(n, n)``.
+        gradient: of the cost with fitted starts, ``(n,)``.
+        bias: what it is on average, ``(n,)``.
+        cost, expected: half the weighted squared error, and its average, ``()``.
+        delta: fitted shifts of the starts, ``(M, 2 nv)``.
+    """
+
+    hessian: jax.Array
+    gradient: jax.Array
+    bias: jax.Array
+    cost: jax.Array
+    expected: jax.Array
+    delta: jax.Array
+
+
+@flax.struct.dataclass
+class Adjusted:
+    """Result of `adjust`.
+
+    Attributes:
+        unit: parameters, unit coordinates, ``(n,)``.
+        hessian: information at them, ``(n, n)``.
+        delta: shifts of the starts, ``(M, 2 nv)``.
+        raised: ``unit``, logarithmic parameters raised to the low end of their range.
+        raised_hessian: information there.
+        left: half the squared score that is left, in its standard deviations, ``()``,
+            at the start and at the result, ``(2,)``.
+    """
+
+    unit: jax.Array
+    hessian: jax.Array
+    delta: jax.Array
+    raised: jax.Array
+    raised_hessian: jax.Array
+    left: jax.Array
+
+
+@flax.struct.dataclass
+class _Carry:
+    """Of the rounds of `adjust`; ``here``: the best so far, its information, starts,
+    Newton step and what is left."""
+
+    phase: jax.Array  # what is looked at: the noise, the start, steps, what is raised
+    k: jax.Array
+    at: jax.Array
+    spread: jax.Array
+    here: Any
+    length: jax.Array
+    begun: jax.Array
+    seen: jax.Array  # information at the place looked at last
+
+
+class ProfileFit(PairedFit):
+    """`PairedFit` with each start at its best, and what that does to the score."""
+
+    def score(
+        self,
+        unit: jax.Array,
+        weight: jax.Array,
+        draws: jax.Array,
+        spread: jax.Array,
+    ) -> Score:
+        """The score at ``unit (n,)``.
+
+        Args:
+            weight: of each measured number, ``(M, H, 2 nv)``.
+            draws: standard normal, ``(M, K, H + 1, 2 nv)``: of each start, then of
+                what is measured after each step.
+            spread: standard deviations of the noise of starts, then of what comes
+                after, ``(2, 2 nv)``.
+        """
+
+        def one(item: Any) -> Any:
+            s, w, e = item
+            at = jax.tree.map(lambda x: x[None], s)
+
+            def fitted(s: Segments) -> Any:
+                def turn(d: jax.Array, _: Any) -> Any:
+                    r, jac = self._pushed(unit, d, s)
+                    parts = self._equations(r, jac, d, w)
+                    ahead = jnp.clip(d + parts[3], -most, most)
+                    return ahead, (d, r, jac, parts)
+
+                _, turns = jax.lax.scan(turn, 0.0 * most, None, length=_TURNS)
+                return jax.tree.map(lambda x: x[-1], turns)
+
+            def draw(real: Any, item: Any) -> Any:
+                """The measured piece, then those that ``e`` would have made of it."""
+                k, e = item
+                d, r, jac = real
+                first, later = e[0] * spread[0], e[1:] * spread[1]
+                new = shift_start(self.machine, at, (d + first)[None])
+                new = self._measured(jax.tree.map(lambda x: x[0], new), r + later)
+                new = jax.tree.map(lambda x, y: jnp.where(k, x, y), new, s)
+                *found, parts = fitted(new)
+                # The truth of what is made is known: its score is zero on average.
+                known = self._equations(-later, jac, -first, w)[1]
+                fine = jnp.isfinite(parts[2]) & (parts[2] > 0)
+                over = jnp.where(fine, parts[1] - known, 0.0)
+                real = jax.tree.map(lambda x, y: jnp.where(k, x, y), real, tuple(found))
+                return real, (*parts[:3], over)
+
+            none = jax.eval_shape(lambda: fitted(s)[:3])
+            none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), none)
+            drawn = jnp.arange(1 + len(e)) > 0
+            e = jnp.concatenate([0.0 * e[:1], e])
+            real, (hess, grad, cost, over) = jax.lax.scan(draw, none, (drawn, e))
+            bias, expected = over[1:].mean(0), cost[1:].mean()
+            return hess[0], grad[0], bias, cost[0], expected, real[0]
+
+        most = _FARTHEST * self.noise
+        hess, grad, bias, cost, expected, delta = self._each(
+            one, 1 + self._directions, weight, draws
+        )
+        return Score(
+            hessian=hess.sum(0),
+            gradient=grad.sum(0),
+            bias=bias.sum(0),
+            cost=cost.sum(),
+            expected=expected.sum(),
+            delta=delta,
+        )
+
+    def _measured(self, s: Segments, error: jax.Array) -> Segments:
+        """One piece with what was measured moved by tangents ``error (H, 2 nv)``."""
+        nv = self.machine.mj_model.nv
+        move = jax.vmap(self.machine.move)
+        return replace(
+            s,
+            next_qpos=move(s.next_qpos, error[:, :nv]),
+            next_qvel=s.next_qvel + error[:, nv:],
+        )
+
+
+def adjust(
+    machine: Machine,
+    space: ParameterSpace,
+    unit: jax.Array,
+    segments: Segments,
+    noise: jax.Array,
+    mesh: Mesh | None = None,
+    misfit: jax.Array | None = None,
+) -> Adjusted:
+    """From a best fit ``unit (n,)`` to where its score less the average is zero; pure.
+
+    Noise that was assumed too high is taken as high as the fit's cost shows.
+
+    Args:
+        noise: standard deviations of the measurement, ``(2 nv,)``, above zero.
+        misfit: what the model itself errs by in every step, as in
+            `easi_jax.refine.refine`.
+    """
+    fit = ProfileFit(machine, space, segments, noise, mesh)
+    weight = step_weights(segments, noise, misfit)
+    shape = (segments.count, _DRAWS, segments.horizon + 1, len(noise))
+    draws = jax.random.normal(jax.random.key(0), shape)
+    off = jnp.zeros_like(noise) if misfit is None else misfit
+    later = jnp.where(jnp.isfinite(off), jnp.hypot(noise, off), 0.0)
+    spread = jnp.stack([noise, later])
+    low, high = space.unit_bounds
+
+    def scored(u: jax.Array, spread: jax.Array) -> tuple[Score, jax.Array, jax.Array]:
+        """Score, Newton step and what is left."""
+        s = fit.score(u, weight, draws, spread)
+        a = s.gradient - s.bias
+        free = ~((u <= low) & (a > 0) | (u >= high) & (a < 0))
+        a = jnp.where(free, a, 0.0)
+        lifted = s.hessian + _PULL * jnp.eye(space.size)
+        scale = 1.0 / jnp.sqrt(jnp.diag(lifted))
+        step = -scale * jnp.linalg.solve(lifted * scale[:, None] * scale, scale * a)
+        step = jnp.where(free, step, 0.0)
+        left = -0.5 * a @ step
+        return s, step, jnp.where(jnp.isfinite(left), left, jnp.inf)
+
+    def raised(u: jax.Array) -> jax.Array:
+        return jnp.where(space.log, jnp.maximum(u, 0.0), u)
+
+    def over(left: jax.Array, k: jax.Array, length: jax.Array) -> jax.Array:
+        return (left < _SETTLED) | (k > _ROUNDS) | (length < _SHORTEST)
+
+    def round_(carry: _Carry) -> _Carry:
+        c = carry
+        s, step, left = scored(c.at, c.spread)
+        new = c.at, s.hessian, s.delta, step, left
+        share = s.cost / jnp.maximum(s.expected, 1e-30)
+        quiet = c.spread * jnp.sqrt(jnp.clip(share, 0.0, 1.0))
+        better = (c.phase == _FIRST) | (c.phase == _MOVING) & (left < c.here[-1])
+        here = jax.tree.map(lambda x, y: jnp.where(better, x, y), new, c.here)
+        # A step that gains little may have been too short.
+        longer = jnp.where(left < 0.25 * c.here[-1], 1.0, 2.0)
+        length = c.length * jnp.where(better, longer, 1.0 / 3.0)
+        length = jnp.where(c.phase == _MOVING, jnp.minimum(length, _LONGEST), 1.0)
+        ended = (c.phase >= _FIRST) & over(here[-1], c.k, length)
+        phase = jnp.where(c.phase < _MOVING, c.phase + 1, c.phase)
+        phase = jnp.where(ended, _RAISED, phase)
+        phase = jnp.where(c.phase == _RAISED, _DONE, phase)
+        u = here[0]
+        ahead = jnp.clip(moved(space, u, length * here[3]), low, high)
+        return _Carry(
+            phase=phase,
+            k=c.k + 1,
+            at=jnp.where(
+                phase == _MOVING, ahead, jnp.where(phase == _RAISED, raised(u), c.at)
+            ),
+            spread=jnp.where(c.phase == _NOISE, quiet, c.spread),
+            here=here,
+            length=length,
+            begun=jnp.where(c.phase == _FIRST, left, c.begun),
+            seen=s.hessian,
+        )
+
+    n, nv2 = space.size, len(noise)
+    square, infinite = jnp.zeros((n, n)), jnp.asarray(jnp.inf)
+    # Below its initial range a logarithm has no slope, and no way back.
+    begin = raised(unit)
+    start = _Carry(
+        phase=jnp.asarray(_NOISE),
+        k=jnp.asarray(0),
+        at=begin,
+        spread=spread,
+        here=(
+            *(begin, square, jnp.zeros((segments.count, nv2))),
+            *(jnp.zeros(n), infinite),
+        ),
+        length=jnp.asarray(1.0),
+        begun=infinite,
+        seen=square,
+    )
+    end = jax.lax.while_loop(lambda c: c.phase < _DONE, round_, start)
+    u, hessian, delta, _, left = end.here
+    return Adjusted(
+        u, hessian, delta, raised(u), end.seen, jnp.stack([end.begun, left])
+    )

@@ -1,0 +1,115 @@
+"""Fitted starts are paid for: friction from single noisy steps at low speed."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from easi_jax.adjusted import Adjusted, adjust
+from easi_jax.machine import Machine
+from easi_jax.parameters import ParameterSpace, declare
+from easi_jax.refine import RefineResult, refine
+from easi_jax.segments import Segments
+
+_SLIDER = """
+<mujoco>
+  <option timestep="0.01" integrator="implicitfast"/>
+  <worldbody>
+    <body>
+      <joint name="a" type="slide" damping="2" frictionloss="{friction}"/>
+      <geom type="box" size=".1 .1 .1" mass="1"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="a"/></actuator>
+</mujoco>
+"""
+_NOISE = jnp.array([1e-3, 0.03])
+_SPEED = 0.12  # m/s, standard deviation: noise often decides its sign
+_COUNT, _SEEDS = 8000, 5
+
+
+def rig(friction: float) -> tuple[Machine, ParameterSpace]:
+    m = mujoco.MjModel.from_xml_string(_SLIDER.format(friction=friction or 1e-9))
+    kinds = ("damping", "frictionloss") if friction else ("damping",)
+    space = ParameterSpace(tuple(declare(m, k, f"joint.a.{k}") for k in kinds))
+    return Machine(m, space, 0.02), space
+
+
+def recorded(machine: Machine, space: ParameterSpace, key: jax.Array) -> Segments:
+    """Single steps from random speeds, start and end read with noise."""
+    k_speed, k_push, *k_noise = jax.random.split(key, 4)
+    speed = _SPEED * jax.random.normal(k_speed, (_COUNT, 1))
+    push = jax.random.normal(k_push, (_COUNT, 1))
+    model = machine.model(jnp.asarray(space.nominal))
+
+    def one(speed: jax.Array, push: jax.Array) -> Any:
+        first = machine.start(jnp.zeros(1), speed, model)
+        last = machine.step(model, first, push)
+        return last.qpos, last.qvel
+
+    clean = jnp.concatenate(jax.vmap(one)(speed, push), 1)
+    start, end = (_NOISE * jax.random.normal(k, (_COUNT, 2)) for k in k_noise)
+    end = clean + end
+    return Segments(
+        qpos=start[:, :1],
+        qvel=speed + start[:, 1:],
+        ctrl=push[:, None],
+        next_qpos=end[:, None, :1],
+        next_qvel=end[:, None, 1:],
+        weight=jnp.ones(_COUNT),
+    )
+
+
+def finish(friction: float) -> Any:
+    """Takes how much too high the noise is assumed.
+
+    Returns ``(seeds, n)`` errors of the fit, then adjusted, in standard deviations of
+    the noise as it is, and what is left of the score.
+    """
+    machine, space = rig(friction)
+    truth = space.to_unit(jnp.asarray(space.nominal))
+
+    def one(key: jax.Array, assumed: jax.Array) -> tuple[RefineResult, Adjusted]:
+        pieces = recorded(machine, space, key)
+        given = machine, space, pieces, assumed * _NOISE
+        fit = refine(*given[:2], truth, *given[2:], iterations=8)
+        return fit, adjust(*given[:2], fit.unit, *given[2:])
+
+    keys = jax.random.split(jax.random.key(3), _SEEDS)
+    run = jax.jit(lambda x: jax.lax.map(lambda k: one(k, x), keys))
+
+    def fits(assumed: float) -> Any:
+        fit, adjusted = jax.device_get(run(assumed))
+        std = np.sqrt([np.diag(np.linalg.inv(x)) for x in adjusted.hessian]) / assumed
+        return *((x.unit - truth) / std for x in (fit, adjusted)), adjusted.left
+
+    return fits
+
+
+@pytest.fixture(scope="module")
+def rubbing() -> Any:
+    return finish(friction=0.5)
+
+
+def test_friction_is_neither_too_high_nor_too_sure(rubbing: Any) -> None:
+    fit, adjusted, left = rubbing(1.0)
+    friction = 1
+    # The mean of so many seeds has a standard deviation of 0.45.
+    assert np.mean(fit[:, friction]) > 2.0
+    assert np.abs(np.mean(adjusted, 0)).max() < 1.0
+    assert np.sqrt(np.mean(adjusted**2)) < 1.6
+    assert (left[:, 0] > 1.0).all()
+    assert (left[:, 1] < 0.1).all()
+
+
+def test_noise_assumed_too_high_is_seen_in_the_cost(rubbing: Any) -> None:
+    adjusted, other = rubbing(1.0)[1], rubbing(1.5)[1]
+    assert np.abs(other - adjusted).max() < 0.5
+
+
+def test_what_is_linear_stays_as_it_is() -> None:
+    fit, adjusted, _ = finish(friction=0.0)(1.0)
+    assert np.abs(fit - adjusted).max() < 0.05
