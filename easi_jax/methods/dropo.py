@@ -45,7 +45,7 @@ class Dropo:
     ) -> Identified:
         """The Gaussian that CMA-ES ends at."""
         n = task.space.size
-        pieces = some_pieces(demonstrations, self.horizon, self.transitions)
+        pieces = some_pieces(task, demonstrations, self.horizon, self.transitions)
         each = self.population * self.samples * pieces.count * pieces.horizon
         rounds = budget.rounds(each)
         k_draw, k_run = jax.random.split(key)

@@ -63,7 +63,7 @@ class NeuralPosterior:
         """
         if find_spec("sbi") is None:
             raise UserError("sbi is missing: pip install easi-jax[peers]")
-        pieces = some_pieces(demonstrations, self.horizon, self.pieces)
+        pieces = some_pieces(task, demonstrations, self.horizon, self.pieces)
         each = pieces.count * pieces.horizon
         count = _LEAST * budget.rounds(_LEAST * each)
         k_draw, k_noise, k_train = jax.random.split(key, 3)

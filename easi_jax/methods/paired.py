@@ -42,7 +42,7 @@ class PairedCmaEs:
         self, task: Task, demonstrations: Segments, budget: Budget, key: jax.Array
     ) -> Identified:
         """The last mean and covariance of the strategy."""
-        pieces = some_pieces(demonstrations, self.horizon, self.pieces)
+        pieces = some_pieces(task, demonstrations, self.horizon, self.pieces)
         each = self.population * pieces.count * pieces.horizon
         rounds = budget.rounds(each)
         cost = paired_cost(task, pieces)
@@ -66,7 +66,7 @@ class RandomSearch:
         self, task: Task, demonstrations: Segments, budget: Budget, key: jax.Array
     ) -> Identified:
         """The best individual, with the spread of the best percent."""
-        pieces = some_pieces(demonstrations, self.horizon, self.pieces)
+        pieces = some_pieces(task, demonstrations, self.horizon, self.pieces)
         each = pieces.count * pieces.horizon
         count = budget.rounds(each)
         drawn = jax.random.uniform(key, (count, task.space.size))
@@ -76,10 +76,12 @@ class RandomSearch:
         return Identified(gaussian(task.space, best[0], cov), task.space, count * each)
 
 
-def some_pieces(demonstrations: Segments, horizon: int, count: int) -> Segments:
+def some_pieces(
+    task: Task, demonstrations: Segments, horizon: int, count: int
+) -> Segments:
     """At most ``count`` pieces at even distances, of at most a trajectory's length."""
     steps = min(horizon, demonstrations.weight.shape[1])
-    found = windows(demonstrations, steps, steps)
+    found = windows(demonstrations, steps, steps, task.machine.past_steps)
     return found.spread(count) if count < found.count else found
 
 

@@ -55,7 +55,7 @@ class MujocoSysid:
         """
         del key  # nothing is random
         sysid = toolbox()
-        pieces = some_pieces(demonstrations, self.horizon, self.pieces)
+        pieces = some_pieces(task, demonstrations, self.horizon, self.pieces)
         each = pieces.count * pieces.horizon
         rounds = budget.rounds(each * (task.space.size + _TRIALS))
         write = InMujoco(task.machine)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.rigs import RIGS
 from easi_jax.distribution import covariance
 from easi_jax.errors import UserError
 from easi_jax.methods import (
@@ -19,6 +20,7 @@ from easi_jax.methods import (
     SimOpt,
     Task,
 )
+from easi_jax.methods.paired import paired_cost, some_pieces
 from easi_jax.methods.simopt import reps_weights
 from easi_jax.rollout import measured
 from easi_jax.search_config import preset
@@ -72,6 +74,19 @@ def test_a_budget_that_buys_no_round_is_refused(
             method.fit(task, demonstrations, Budget(100), jax.random.key(0))
     with pytest.raises(UserError, match="buys nothing"):
         Budget(0)
+
+
+def test_pieces_know_what_was_sent_before_them() -> None:
+    """A drive that obeys late still follows it when a piece begins."""
+    rig = RIGS["cartpole"]()
+    late = rig.late(0.03)
+    theta = jnp.asarray(late.space.nominal, jnp.float32)
+    demos = jax.jit(lambda k: rig.record(late, theta, k, 4, 1.0))(jax.random.key(0))
+    task = Task(late, jnp.zeros(4))
+    pieces = some_pieces(task, demos, 10, 16)
+    costs = jax.jit(lambda u: paired_cost(task, pieces)(u))
+    right, wrong = costs(jnp.stack([late.space.to_unit(theta), jnp.full(7, 0.4)]))
+    assert right < 1e-7 < 1e-4 < wrong
 
 
 def test_reps_keeps_to_its_bound() -> None:

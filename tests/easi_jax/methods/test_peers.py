@@ -103,7 +103,7 @@ def test_npe_learns_the_posterior(task: Task, demonstrations: Segments) -> None:
 def test_summary_is_of_all_steps_that_count(
     task: Task, demonstrations: Segments
 ) -> None:
-    pieces = some_pieces(demonstrations, 10, 4)
+    pieces = some_pieces(task, demonstrations, 10, 4)
     pieces = pieces.replace(weight=pieces.weight.at[0].set(0.0))
     noise = jnp.zeros((4, 10, 4))
     got = summary(task.machine, pieces, pieces.next_qpos, pieces.next_qvel, noise)
