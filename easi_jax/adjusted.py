@@ -32,6 +32,7 @@ _FARTHEST = 4.0  # standard deviations that a start may be off
 _PULL = 12.0  # information of a uniform initial range, unit coordinates
 _LONGEST = 4.0  # times the Newton step: the average changes with the parameters, too
 _SHORTEST = 0.02
+_LOST = 0.2  # of what was known of a parameter: less must not be left by a step
 _SETTLED = 1e-2  # half the squared score that is left, in its standard deviations
 _NOISE, _FIRST, _MOVING, _RAISED, _DONE = range(5)
 
@@ -80,16 +81,16 @@ class Adjusted:
 
 @flax.struct.dataclass
 class _Carry:
-    """Of the rounds of `adjust`; ``here``: the best so far, its information, starts,
-    Newton step and what is left."""
+    """Of the rounds of `adjust`."""
 
     phase: jax.Array  # what is looked at: the noise, the start, steps, what is raised
     k: jax.Array
-    at: jax.Array
+    at: jax.Array  # where the score is looked at next
     spread: jax.Array
-    here: Any
+    here: Any  # the best so far, and its score
+    held: jax.Array  # what stays as it is
     length: jax.Array
-    begun: jax.Array
+    left: jax.Array
     seen: jax.Array  # information at the place looked at last
 
 
@@ -202,18 +203,23 @@ def adjust(
     spread = jnp.stack([noise, later])
     low, high = space.unit_bounds
 
-    def scored(u: jax.Array, spread: jax.Array) -> tuple[Score, jax.Array, jax.Array]:
-        """Score, Newton step and what is left."""
-        s = fit.score(u, weight, draws, spread)
+    def newton(u: jax.Array, s: Score, held: jax.Array) -> tuple[Any, Any]:
+        """The step, and what is left."""
         a = s.gradient - s.bias
-        free = ~((u <= low) & (a > 0) | (u >= high) & (a < 0))
+        free = ~((u <= low) & (a > 0) | (u >= high) & (a < 0) | held)
         a = jnp.where(free, a, 0.0)
         lifted = s.hessian + _PULL * jnp.eye(space.size)
         scale = 1.0 / jnp.sqrt(jnp.diag(lifted))
-        step = -scale * jnp.linalg.solve(lifted * scale[:, None] * scale, scale * a)
-        step = jnp.where(free, step, 0.0)
+        lifted = jnp.where(free[:, None] & free, lifted * scale[:, None] * scale, 0.0)
+        lifted = lifted + jnp.diag(jnp.where(free, 0.0, 1.0))
+        step = -scale * jnp.linalg.solve(lifted, scale * a)
         left = -0.5 * a @ step
-        return s, step, jnp.where(jnp.isfinite(left), left, jnp.inf)
+        return step, jnp.where(jnp.isfinite(left), left, jnp.inf)
+
+    def told(u: jax.Array, hessian: jax.Array) -> jax.Array:
+        """Information of each parameter, of a logarithm by its SI value, ``(n,)``."""
+        down = jnp.where(space.log, jnp.exp(-2.0 * space.log_width * u), 1.0)
+        return jnp.diag(hessian) * down
 
     def raised(u: jax.Array) -> jax.Array:
         return jnp.where(space.log, jnp.maximum(u, 0.0), u)
@@ -223,22 +229,32 @@ def adjust(
 
     def round_(carry: _Carry) -> _Carry:
         c = carry
-        s, step, left = scored(c.at, c.spread)
-        new = c.at, s.hessian, s.delta, step, left
+        s = fit.score(c.at, weight, draws, c.spread)
         share = s.cost / jnp.maximum(s.expected, 1e-30)
         quiet = c.spread * jnp.sqrt(jnp.clip(share, 0.0, 1.0))
-        better = (c.phase == _FIRST) | (c.phase == _MOVING) & (left < c.here[-1])
-        here = jax.tree.map(lambda x, y: jnp.where(better, x, y), new, c.here)
+        # Beyond a limit that was met there is no score, which makes nothing right.
+        u, found = c.here
+        known = told(u, found.hessian)
+        lost = told(c.at, s.hessian) < _LOST * known
+        lost &= (jnp.diag(found.hessian) > _PULL) & (c.phase == _MOVING)
+        held = c.held | lost
+        before = newton(u, found, held)[1]
+        left = newton(c.at, s, held)[1]
+        better = (c.phase == _FIRST) | (c.phase == _MOVING) & (left < before)
+        better &= ~lost.any()
+        here = jax.tree.map(lambda x, y: jnp.where(better, x, y), (c.at, s), c.here)
+        u = here[0]
+        step, rest = newton(u, here[1], held)
         # A step that gains little may have been too short.
-        longer = jnp.where(left < 0.25 * c.here[-1], 1.0, 2.0)
-        length = c.length * jnp.where(better, longer, 1.0 / 3.0)
+        longer = jnp.where(left < 0.25 * before, 1.0, 2.0)
+        shorter = jnp.where(lost.any(), 1.0, 1.0 / 3.0)
+        length = c.length * jnp.where(better, longer, shorter)
         length = jnp.where(c.phase == _MOVING, jnp.minimum(length, _LONGEST), 1.0)
-        ended = (c.phase >= _FIRST) & over(here[-1], c.k, length)
+        ended = (c.phase >= _FIRST) & over(rest, c.k, length)
         phase = jnp.where(c.phase < _MOVING, c.phase + 1, c.phase)
         phase = jnp.where(ended, _RAISED, phase)
         phase = jnp.where(c.phase == _RAISED, _DONE, phase)
-        u = here[0]
-        ahead = jnp.clip(moved(space, u, length * here[3]), low, high)
+        ahead = jnp.clip(moved(space, u, length * step), low, high)
         return _Carry(
             phase=phase,
             k=c.k + 1,
@@ -247,30 +263,31 @@ def adjust(
             ),
             spread=jnp.where(c.phase == _NOISE, quiet, c.spread),
             here=here,
+            held=held,
             length=length,
-            begun=jnp.where(c.phase == _FIRST, left, c.begun),
+            left=jnp.where(
+                c.phase == _RAISED,
+                c.left,
+                jnp.where(c.phase == _FIRST, rest, c.left.at[1].set(rest)),
+            ),
             seen=s.hessian,
         )
 
-    n, nv2 = space.size, len(noise)
-    square, infinite = jnp.zeros((n, n)), jnp.asarray(jnp.inf)
     # Below its initial range a logarithm has no slope, and no way back.
     begin = raised(unit)
+    shapes = jax.eval_shape(lambda: fit.score(begin, weight, draws, spread))
+    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     start = _Carry(
         phase=jnp.asarray(_NOISE),
         k=jnp.asarray(0),
         at=begin,
         spread=spread,
-        here=(
-            *(begin, square, jnp.zeros((segments.count, nv2))),
-            *(jnp.zeros(n), infinite),
-        ),
+        here=(begin, none),
+        held=jnp.zeros(space.size, bool),
         length=jnp.asarray(1.0),
-        begun=infinite,
-        seen=square,
+        left=jnp.full(2, jnp.inf),
+        seen=none.hessian,
     )
     end = jax.lax.while_loop(lambda c: c.phase < _DONE, round_, start)
-    u, hessian, delta, _, left = end.here
-    return Adjusted(
-        u, hessian, delta, raised(u), end.seen, jnp.stack([end.begun, left])
-    )
+    u, found = end.here
+    return Adjusted(u, found.hessian, found.delta, raised(u), end.seen, end.left)

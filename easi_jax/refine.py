@@ -33,6 +33,7 @@ _SHARES = 0.0, 0.3, 1.0  # of the step of its start, of which each piece takes t
 _TINY = 1e-24  # below what a parameter that is nearly zero has of information
 _SHORT = 0.02  # s of each piece that the first stage fits
 _PATIENCE = 3, 6  # rounds without progress that end each stage
+_BISECTED = 12  # rounds that a jump's reach is halved in: to a thousandth of it
 _UNSEEN = 1.0  # information of a unit coordinate: nothing
 _TOLD_APART = 0.05  # of the cost, which is minus a logarithm of likelihood
 _ROUNDING = 3e-6  # of the cost, which the best of many trials takes for progress
@@ -135,6 +136,7 @@ def refine(
         trusting: jax.Array,
         again: jax.Array,
         begun: jax.Array,
+        freed: jax.Array,
     ) -> Any:
         u, shift, damp, unchanged, raised, pieces, *_ = carry
         unchanged, raised = (
@@ -158,7 +160,8 @@ def refine(
         units, shifts, each = best_starts(units, shifts, each)
         data = _data(each, trust)
         costs = data + prior(units)
-        flat = jnp.diag(eq.hessian) < _UNSEEN
+        # What was put onto a plateau does not leave it for a dip.
+        flat = freed & (jnp.diag(eq.hessian) < _UNSEEN)
         entering = jnp.tile(_EDGE * jnp.append(flat, False)[: len(ways)], 2)
         costs = costs.at[jumps].add(jnp.where(moving, entering, 0.0))
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
@@ -181,7 +184,7 @@ def refine(
         rise = level[0, :n] - here
         dip = (foretold > 2 * _EDGE / _SHALLOW) & (rise < _SHALLOW * foretold)
         middle = jnp.minimum(up, jnp.maximum(0.5, u + _INSIDE))
-        freed = jnp.where(dip, middle, u)
+        above = jnp.where(dip, middle, u)
         new = (
             units[best],
             shifts[best],
@@ -190,7 +193,7 @@ def refine(
             raised,
             each[best],
             eq.hessian,
-            freed,
+            above,
         )
         told = jnp.where(first, home, 0)
         return new, each[told].sum() + prior(units[told])
@@ -290,14 +293,16 @@ def refine(
             moving = fitting & (k > 0)
             trusting = ~moving | (k > item.robust)
             # A jump that did not help then may help now.
-            again = k % _PATIENCE[1] == 0
+            again = k % _BISECTED == 0
             first = fitting & (k == 0)
-            carry, cost = step(carry, used, first, moving, trusting, again, item.begun)
+            flags = first, moving, trusting, again
+            carry, cost = step(carry, used, *flags, item.begun, item.freed)
             costs = jnp.where(jnp.arange(iterations + 2) >= k, cost, costs)
             # By less than this the data cannot tell two results apart.
             told_apart = _TOLD_APART + item.rough * cost
             settled = costs[jnp.maximum(k - item.patience, 0)] - cost < told_apart
-            settled &= k > item.robust + item.patience
+            least = jnp.where(item.patience == _PATIENCE[1], _BISECTED, 0)
+            settled &= k > jnp.maximum(item.robust + item.patience, least)
             over = settled | (k >= iterations)
             phase = jnp.where(fitting, jnp.where(over, _LOOKING, _MOVING), _FINISHED)
             return phase, k + 1, costs, carry
