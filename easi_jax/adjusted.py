@@ -26,11 +26,12 @@ from easi_jax.refine import moved, step_weights
 from easi_jax.segments import Segments
 
 _DRAWS = 2  # of the noise, for every piece
-_ROUNDS = 16  # at most
+_ROUNDS = 20  # at most
 _TURNS = 4  # looks at each start, a Gauss-Newton step between each two
 _FARTHEST = 4.0  # standard deviations that a start may be off
 _PULL = 12.0  # information of a uniform initial range, unit coordinates
 _LONGEST = 4.0  # times the Newton step: the average changes with the parameters, too
+_SHORT = 0.2  # a step which still loses what was known: it stays as it is
 _SHORTEST = 0.02
 _LOST = 0.2  # of what was known of a parameter: less must not be left by a step
 _SETTLED = 1e-2  # half the squared score that is left, in its standard deviations
@@ -237,7 +238,8 @@ def adjust(
         known = told(u, found.hessian)
         lost = told(c.at, s.hessian) < _LOST * known
         lost &= (jnp.diag(found.hessian) > _PULL) & (c.phase == _MOVING)
-        held = c.held | lost
+        short = c.length < _SHORT
+        held = jnp.where(short, c.held | lost, c.held)
         before = newton(u, found, held)[1]
         left = newton(c.at, s, held)[1]
         better = (c.phase == _FIRST) | (c.phase == _MOVING) & (left < before)
@@ -247,8 +249,8 @@ def adjust(
         step, rest = newton(u, here[1], held)
         # A step that gains little may have been too short.
         longer = jnp.where(left < 0.25 * before, 1.0, 2.0)
-        shorter = jnp.where(lost.any(), 1.0, 1.0 / 3.0)
-        length = c.length * jnp.where(better, longer, shorter)
+        length = c.length * jnp.where(better, longer, 1.0 / 3.0)
+        length = jnp.where(short & lost.any(), 1.0, length)
         length = jnp.where(c.phase == _MOVING, jnp.minimum(length, _LONGEST), 1.0)
         ended = (c.phase >= _FIRST) & over(rest, c.k, length)
         phase = jnp.where(c.phase < _MOVING, c.phase + 1, c.phase)
