@@ -22,7 +22,13 @@ from jax.sharding import Mesh
 from easi_jax.information import PairedFit, shift_start
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
-from easi_jax.refine import moved, step_weights
+from easi_jax.refine import (
+    balanced,
+    moved,
+    not_held_back,
+    raised_to_range,
+    step_weights,
+)
 from easi_jax.segments import Segments
 
 _DRAWS = 2  # of the noise, for every piece
@@ -126,7 +132,7 @@ class ProfileFit(PairedFit):
                     ahead = jnp.clip(d + parts[3], -most, most)
                     return ahead, (d, r, jac, parts)
 
-                _, turns = jax.lax.scan(turn, 0.0 * most, None, length=_TURNS)
+                _, turns = jax.lax.scan(turn, jnp.zeros_like(most), None, length=_TURNS)
                 return jax.tree.map(lambda x: x[-1], turns)
 
             def draw(real: Any, item: Any) -> Any:
@@ -207,12 +213,8 @@ def adjust(
     def newton(u: jax.Array, s: Score, held: jax.Array) -> tuple[Any, Any]:
         """The step, and what is left."""
         a = s.gradient - s.bias
-        free = ~((u <= low) & (a > 0) | (u >= high) & (a < 0) | held)
-        a = jnp.where(free, a, 0.0)
-        lifted = s.hessian + _PULL * jnp.eye(space.size)
-        scale = 1.0 / jnp.sqrt(jnp.diag(lifted))
-        lifted = jnp.where(free[:, None] & free, lifted * scale[:, None] * scale, 0.0)
-        lifted = lifted + jnp.diag(jnp.where(free, 0.0, 1.0))
+        free = not_held_back(space, u, a) & ~held
+        lifted, scale = balanced(s.hessian + _PULL * jnp.eye(space.size), free)
         step = -scale * jnp.linalg.solve(lifted, scale * a)
         left = -0.5 * a @ step
         return step, jnp.where(jnp.isfinite(left), left, jnp.inf)
@@ -221,9 +223,6 @@ def adjust(
         """Information of each parameter, of a logarithm by its SI value, ``(n,)``."""
         down = jnp.where(space.log, jnp.exp(-2.0 * space.log_width * u), 1.0)
         return jnp.diag(hessian) * down
-
-    def raised(u: jax.Array) -> jax.Array:
-        return jnp.where(space.log, jnp.maximum(u, 0.0), u)
 
     def over(left: jax.Array, k: jax.Array, length: jax.Array) -> jax.Array:
         return (left < _SETTLED) | (k > _ROUNDS) | (length < _SHORTEST)
@@ -261,7 +260,9 @@ def adjust(
             phase=phase,
             k=c.k + 1,
             at=jnp.where(
-                phase == _MOVING, ahead, jnp.where(phase == _RAISED, raised(u), c.at)
+                phase == _MOVING,
+                ahead,
+                jnp.where(phase == _RAISED, raised_to_range(space, u), c.at),
             ),
             spread=jnp.where(c.phase == _NOISE, quiet, c.spread),
             here=here,
@@ -275,8 +276,7 @@ def adjust(
             seen=s.hessian,
         )
 
-    # Below its initial range a logarithm has no slope, and no way back.
-    begin = raised(unit)
+    begin = raised_to_range(space, unit)
     shapes = jax.eval_shape(lambda: fit.score(begin, weight, draws, spread))
     none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     start = _Carry(
@@ -292,4 +292,6 @@ def adjust(
     )
     end = jax.lax.while_loop(lambda c: c.phase < _DONE, round_, start)
     u, found = end.here
-    return Adjusted(u, found.hessian, found.delta, raised(u), end.seen, end.left)
+    return Adjusted(
+        u, found.hessian, found.delta, raised_to_range(space, u), end.seen, end.left
+    )

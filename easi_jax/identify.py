@@ -1,14 +1,13 @@
 """From the end of a search to an honest distribution over parameters."""
 
 from dataclasses import replace
-from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from easi_jax.adjusted import adjust
+from easi_jax.adjusted import Adjusted, adjust
 from easi_jax.distribution import Distribution, gaussian
 from easi_jax.information import PairedFit
 from easi_jax.machine import Machine
@@ -105,7 +104,8 @@ def estimate(
             others=_draws(mean, cov, restarts) if restarts else None,
         )
         if adjusted and free_starts and not machine.wide:
-            fit = _adjusted(fit, machine, space, pieces, assumed, mesh, misfit)
+            given = machine, space, fit.unit, pieces, assumed, mesh, misfit
+            fit = _adjusted(fit, adjust(*given))
         center, hessian = fit.unit, fit.hessian
         cost, delta = fit.cost, fit.delta
     else:
@@ -131,10 +131,8 @@ def estimate(
     )
 
 
-def _adjusted(fit: RefineResult, *given: Any) -> RefineResult:
+def _adjusted(fit: RefineResult, new: Adjusted) -> RefineResult:
     """The fit with its score adjusted, where the simulation gets that far."""
-    machine, space, pieces, noise, mesh, misfit = given
-    new = adjust(machine, space, fit.unit, pieces, noise, mesh, misfit)
     found = replace(
         fit,
         unit=new.unit,

@@ -135,8 +135,7 @@ def refine(
         moving: jax.Array,
         trusting: jax.Array,
         again: jax.Array,
-        begun: jax.Array,
-        freed: jax.Array,
+        item: _Stage,
     ) -> Any:
         u, shift, damp, unchanged, raised, pieces, *_ = carry
         unchanged, raised = (
@@ -150,18 +149,18 @@ def refine(
         reach = 0.5 * (unchanged + raised)
         hops = jnp.clip(u + (reach * sides)[..., None] * ways, low, high)
         if machine.wide:
-            at = u, shift, damp, hops, begun
+            at = u, shift, damp, hops, item.begun
             eq, units, shifts, each = swept(*at, weight, trusted)
         else:
             eq = paired.normal(u, shift, trusted)
-            units, shifts = trials(u, shift, damp, hops, begun, eq)
+            units, shifts = trials(u, shift, damp, hops, item.begun, eq)
             each = paired.costs(units, shifts, weight)
         here = _data(each[:1], trust)
         units, shifts, each = best_starts(units, shifts, each)
         data = _data(each, trust)
         costs = data + prior(units)
         # What was put onto a plateau does not leave it for a dip.
-        flat = freed & (jnp.diag(eq.hessian) < _UNSEEN)
+        flat = item.freed & (jnp.diag(eq.hessian) < _UNSEEN)
         entering = jnp.tile(_EDGE * jnp.append(flat, False)[: len(ways)], 2)
         costs = costs.at[jumps].add(jnp.where(moving, entering, 0.0))
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
@@ -203,12 +202,8 @@ def refine(
         where the fit began."""
         slope = jax.jvp(away, (u,), (jnp.ones(n),))[1]
         grad = eq.gradient + pull * slope * away(u)
-        # A parameter that its bound holds back takes no part in the step.
-        free = ~((u <= low) & (grad > 0) | (u >= high) & (grad < 0))
         hess = eq.hessian + jnp.diag(pull * slope**2 + _TINY)
-        # By powers of ten, Fisher information spans more than single precision has.
-        scale = jnp.where(free, 1.0 / jnp.sqrt(jnp.diag(hess)), 0.0)
-        scaled = hess * scale[:, None] * scale + jnp.diag(jnp.where(free, 0.0, 1.0))
+        scaled, scale = balanced(hess, not_held_back(space, u, grad))
 
         def trial(damp: jax.Array) -> tuple[jax.Array, jax.Array]:
             lifted = scaled + damp * jnp.eye(n)
@@ -273,7 +268,7 @@ def refine(
         u = jnp.where(item.restart, item.begun, u)
         shift = jnp.where(item.restart, unmoved, shift)
         u = jnp.where(item.look, best[0], jnp.where(item.freed, freed, u))
-        u = jnp.where(item.raised & space.log, u.clip(0.0), u)
+        u = jnp.where(item.raised, raised_to_range(space, u), u)
         shift = jnp.where(item.look | item.freed, best[1], shift)
         phase = jnp.where(item.freed & (freed == best[0]).all(), _FINISHED, item.phase)
         used = jnp.where(item.short, weight * begin[:, None], weight)
@@ -295,14 +290,12 @@ def refine(
             # A jump that did not help then may help now.
             again = k % _BISECTED == 0
             first = fitting & (k == 0)
-            flags = first, moving, trusting, again
-            carry, cost = step(carry, used, *flags, item.begun, item.freed)
+            carry, cost = step(carry, used, first, moving, trusting, again, item)
             costs = jnp.where(jnp.arange(iterations + 2) >= k, cost, costs)
             # By less than this the data cannot tell two results apart.
             told_apart = _TOLD_APART + item.rough * cost
             settled = costs[jnp.maximum(k - item.patience, 0)] - cost < told_apart
-            least = jnp.where(item.patience == _PATIENCE[1], _BISECTED, 0)
-            settled &= k > jnp.maximum(item.robust + item.patience, least)
+            settled &= k > item.least
             over = settled | (k >= iterations)
             phase = jnp.where(fitting, jnp.where(over, _LOOKING, _MOVING), _FINISHED)
             return phase, k + 1, costs, carry
@@ -346,6 +339,7 @@ class _Stage:
     raised: jax.Array
     robust: jax.Array
     patience: jax.Array
+    least: jax.Array  # rounds
     rough: jax.Array
 
 
@@ -359,6 +353,9 @@ def _stages(starts: jax.Array, near: Any, robust: Any, rounding: float) -> _Stag
     short = (at < fits) & (at % 2 == 0)
     wanted = jnp.where(near, at == 1, True) | freed
     near |= freed
+    robust = jnp.where(short, 0, robust)
+    patience = jnp.where(short | near, *_PATIENCE)
+    bisected = jnp.where(short | near, 0, _BISECTED)
     return _Stage(
         begun=starts[jnp.minimum(at // 2, len(starts) - 1)],
         phase=jnp.where(look, _LOOKING, jnp.where(wanted, _MOVING, _FINISHED)),
@@ -369,8 +366,9 @@ def _stages(starts: jax.Array, near: Any, robust: Any, rounding: float) -> _Stag
         look=look,
         freed=freed,
         raised=at == fits + 2,
-        robust=jnp.where(short, 0, robust),
-        patience=jnp.where(short | near, *_PATIENCE),
+        robust=robust,
+        patience=patience,
+        least=jnp.maximum(robust + patience, bisected),
         rough=jnp.where(short, _NEAR_ENOUGH, rounding),
     )
 
@@ -420,6 +418,31 @@ def _distance(space: ParameterSpace, anchor: jax.Array, unit: jax.Array) -> jax.
         return jnp.where(space.log & (u < 0), below, u)
 
     return scale(unit) - scale(anchor)
+
+
+def raised_to_range(space: ParameterSpace, unit: jax.Array) -> jax.Array:
+    """``unit`` with logarithms raised to the low end of their initial range: further
+    down they have no slope, and no way back."""
+    return jnp.where(space.log, jnp.maximum(unit, 0.0), unit)
+
+
+def not_held_back(
+    space: ParameterSpace, unit: jax.Array, gradient: jax.Array
+) -> jax.Array:
+    """Which parameters no bound holds back from a step downhill, ``(n,)``."""
+    low, high = space.unit_bounds
+    return ~((unit <= low) & (gradient > 0) | (unit >= high) & (gradient < 0))
+
+
+def balanced(hessian: jax.Array, free: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """A system ``(n, n)`` of unit diagonal, and the ``scale (n,)`` of its gradient and
+    solution; what is not ``free`` takes no part.
+
+    By powers of ten, Fisher information spans more than single precision has.
+    """
+    scale = jnp.where(free, 1.0 / jnp.sqrt(jnp.diag(hessian)), 0.0)
+    rest = jnp.diag(jnp.where(free, 0.0, 1.0))
+    return hessian * scale[:, None] * scale + rest, scale
 
 
 def moved(space: ParameterSpace, unit: jax.Array, du: jax.Array) -> jax.Array:

@@ -84,7 +84,7 @@ def test_pieces_know_what_was_sent_before_them() -> None:
     demos = jax.jit(lambda k: rig.record(late, theta, k, 4, 1.0))(jax.random.key(0))
     task = Task(late, jnp.zeros(4))
     pieces = some_pieces(task, demos, 10, 16)
-    costs = jax.jit(lambda u: paired_cost(task, pieces)(u))
+    costs = jax.jit(paired_cost(task, pieces))
     right, wrong = costs(jnp.stack([late.space.to_unit(theta), jnp.full(7, 0.4)]))
     assert right < 1e-7 < 1e-4 < wrong
 
