@@ -23,7 +23,10 @@ from easi_jax.information import PairedFit, shift_start
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
 from easi_jax.refine import (
+    EDGE,
     balanced,
+    beyond_edge,
+    jumps,
     moved,
     not_held_back,
     raised_to_range,
@@ -39,6 +42,7 @@ _PULL = 12.0  # information of a uniform initial range, unit coordinates
 _LONGEST = 4.0  # times the Newton step: the average changes with the parameters, too
 _SHORT = 0.2  # a step which still loses what was known: it stays as it is
 _SHORTEST = 0.02
+_SHALLOW = 0.1  # of what its information foretells, that the cost rises beyond a dip
 _LOST = 0.2  # of what was known of a parameter: less must not be left by a step
 _SETTLED = 1e-2  # half the squared score that is left, in its standard deviations
 _NOISE, _FIRST, _MOVING, _RAISED, _DONE = range(5)
@@ -62,6 +66,11 @@ class Score:
     cost: jax.Array
     expected: jax.Array
     delta: jax.Array
+
+    @property
+    def surplus(self) -> jax.Array:
+        """Cost above its average, ``()``."""
+        return self.cost - self.expected
 
 
 @flax.struct.dataclass
@@ -132,7 +141,9 @@ class ProfileFit(PairedFit):
                     ahead = jnp.clip(d + parts[3], -most, most)
                     return ahead, (d, r, jac, parts)
 
-                _, turns = jax.lax.scan(turn, jnp.zeros_like(most), None, length=_TURNS)
+                _, turns = jax.lax.scan(
+                    turn, jnp.zeros(most.shape), None, length=_TURNS
+                )
                 return jax.tree.map(lambda x: x[-1], turns)
 
             def draw(real: Any, item: Any) -> Any:
@@ -224,6 +235,17 @@ def adjust(
         down = jnp.where(space.log, jnp.exp(-2.0 * space.log_width * u), 1.0)
         return jnp.diag(hessian) * down
 
+    def in_dip(u: jax.Array, found: Score) -> jax.Array:
+        """Which parameters' cost hardly rises far above ``u (n,)``."""
+        n = space.size
+        up = jnp.minimum(u + jumps(space)[1][:n], high)
+        hops = jnp.where(jnp.eye(n, dtype=bool), up, u)
+        starts = jnp.broadcast_to(found.delta, (n, *found.delta.shape))
+        rise = fit.costs(hops, starts, weight).sum(1) - found.cost
+        told = jnp.diag(found.hessian)
+        foretold = 0.5 * told * (up - u) ** 2
+        return (told > _PULL) & (rise < _SHALLOW * foretold)
+
     def over(left: jax.Array, k: jax.Array, length: jax.Array) -> jax.Array:
         return (left < _SETTLED) | (k > _ROUNDS) | (length < _SHORTEST)
 
@@ -279,7 +301,31 @@ def adjust(
     begin = raised_to_range(space, unit)
     shapes = jax.eval_shape(lambda: fit.score(begin, weight, draws, spread))
     none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    start = _Carry(
+
+    def search(found: _Carry, again: jax.Array) -> tuple[_Carry, None]:
+        """From ``unit``; then from what was found, with that beyond its limit which
+        was held, or costs next to nothing there."""
+        edges = found.held | in_dip(*found.here)
+        begun = jnp.where(again, beyond_edge(found.here[0], edges, high), begin)
+        phase = jnp.where(edges.any(), _FIRST, _DONE)
+        start = replace(
+            found,
+            phase=jnp.where(again, phase, _NOISE),
+            k=jnp.asarray(0),
+            at=begun,
+            here=(begun, none),
+            held=jnp.zeros(space.size, bool),
+            length=jnp.asarray(1.0),
+        )
+        end = jax.lax.while_loop(lambda c: c.phase < _DONE, round_, start)
+        # The limit stays where it says clearly more than that it may not be met.
+        freed = end.here[1].surplus < found.here[1].surplus + EDGE
+        freed = ~again | edges.any() & freed
+        first = jnp.where(again, found.left[0], end.left[0])
+        end = replace(end, left=end.left.at[0].set(first))
+        return jax.tree.map(lambda x, y: jnp.where(freed, x, y), end, found), None
+
+    nothing = _Carry(
         phase=jnp.asarray(_NOISE),
         k=jnp.asarray(0),
         at=begin,
@@ -290,7 +336,7 @@ def adjust(
         left=jnp.full(2, jnp.inf),
         seen=none.hessian,
     )
-    end = jax.lax.while_loop(lambda c: c.phase < _DONE, round_, start)
+    end, _ = jax.lax.scan(search, nothing, jnp.array([False, True]))
     u, found = end.here
     return Adjusted(
         u, found.hessian, found.delta, raised_to_range(space, u), end.seen, end.left

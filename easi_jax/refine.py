@@ -41,7 +41,7 @@ _ROUGH = 1e-3  # of the cost: less progress than that is not to be had by differ
 _NEAR_ENOUGH = 1e-2  # of the cost, for the first stage
 _MOVING, _LOOKING, _FINISHED = range(3)
 _FARTHEST = 0.8, 2.5  # jump that is tried, in initial ranges, in log ratios
-_EDGE = 4.0  # of the cost, that a place beyond a plateau's edge has to be better by
+EDGE = 4.0  # of the cost, that a place beyond a plateau's edge has to be better by
 _SHALLOW = 0.1  # of what its curvature foretells, that the cost rises beyond a dip
 _INSIDE = 0.25  # initial ranges beyond the edge, where a plateau is entered
 _OUTLYING = 9.0  # times the median cost: such a piece counts half
@@ -122,9 +122,9 @@ def refine(
     shares = jnp.asarray(_SHARES if free_starts else _SHARES[:1])
     steps = 1 + len(_DAMPING)  # trials before the jumps
     plain = len(shares) * steps
-    ways, farthest = _ways(space)
+    ways, farthest = jumps(space)
     fresh = jnp.zeros((2, len(ways))), jnp.tile(jnp.asarray(farthest), (2, 1))
-    jumps = slice(steps, steps + 2 * len(ways))
+    hopped = slice(steps, steps + 2 * len(ways))
     rounding = _ROUGH if machine.wide else _ROUNDING
     sides = jnp.array([[1.0], [-1.0]])
 
@@ -161,8 +161,8 @@ def refine(
         costs = data + prior(units)
         # What was put onto a plateau does not leave it for a dip.
         flat = item.freed & (jnp.diag(eq.hessian) < _UNSEEN)
-        entering = jnp.tile(_EDGE * jnp.append(flat, False)[: len(ways)], 2)
-        costs = costs.at[jumps].add(jnp.where(moving, entering, 0.0))
+        entering = jnp.tile(EDGE * jnp.append(flat, False)[: len(ways)], 2)
+        costs = costs.at[hopped].add(jnp.where(moving, entering, 0.0))
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
         home = len(costs) - 1
         best = jnp.where(first & (costs[home] < costs[0]), home, 0)
@@ -170,9 +170,9 @@ def refine(
         damped = costs[1 : 1 + len(_DAMPING)]
         damp = damp * jnp.asarray(_DAMPING)[jnp.argmin(damped)]
         damp = jnp.where(damped.min() < costs[0], damp, 100.0 * damp)
-        level = data[jumps].reshape(2, -1)
+        level = data[hopped].reshape(2, -1)
         same, worse = level == here, ~(level <= here)
-        chosen = (jnp.arange(level.size) == best - jumps.start).reshape(level.shape)
+        chosen = (jnp.arange(level.size) == best - hopped.start).reshape(level.shape)
         unchanged = jnp.where(
             moving & same, reach, jnp.where(chosen.any(0), 0.0, unchanged)
         )
@@ -181,9 +181,8 @@ def refine(
         up = jnp.diagonal(hops[0])
         foretold = 0.5 * jnp.diag(eq.hessian) * (up - u) ** 2
         rise = level[0, :n] - here
-        dip = (foretold > 2 * _EDGE / _SHALLOW) & (rise < _SHALLOW * foretold)
-        middle = jnp.minimum(up, jnp.maximum(0.5, u + _INSIDE))
-        above = jnp.where(dip, middle, u)
+        dip = (foretold > 2 * EDGE / _SHALLOW) & (rise < _SHALLOW * foretold)
+        above = beyond_edge(u, dip, up)
         new = (
             units[best],
             shifts[best],
@@ -305,7 +304,7 @@ def refine(
         u, shift, *_, hessian, up = carry
         # A plateau is wide, and likelier than a dip that noise may have dug.
         flat = ((freed == best[0]) | (jnp.diag(hessian) < _UNSEEN)).all()
-        least = best[2][-1] + jnp.where(item.freed & flat, _EDGE, 0.0)
+        least = best[2][-1] + jnp.where(item.freed & flat, EDGE, 0.0)
         better = item.whole & (item.first | (costs[-1] < least))
         better &= ~item.freed | (phase != _FINISHED)
         best = jax.tree.map(
@@ -373,7 +372,7 @@ def _stages(starts: jax.Array, near: Any, robust: Any, rounding: float) -> _Stag
     )
 
 
-def _ways(space: ParameterSpace) -> tuple[np.ndarray, np.ndarray]:
+def jumps(space: ParameterSpace) -> tuple[np.ndarray, np.ndarray]:
     """Directions of jumps, ``(n + 1 or n, n)``, and how far each may go: single
     parameters in unit coordinates, and the common scale of all masses and forces, along
     which motion changes least, in log ratios."""
@@ -424,6 +423,12 @@ def raised_to_range(space: ParameterSpace, unit: jax.Array) -> jax.Array:
     """``unit`` with logarithms raised to the low end of their initial range: further
     down they have no slope, and no way back."""
     return jnp.where(space.log, jnp.maximum(unit, 0.0), unit)
+
+
+def beyond_edge(unit: jax.Array, limits: jax.Array, most: jax.Array) -> jax.Array:
+    """``unit (n,)`` with ``limits (n,)`` on the plateau beyond the edge of a dip."""
+    middle = jnp.minimum(most, jnp.maximum(0.5, unit + _INSIDE))
+    return jnp.where(limits, middle, unit)
 
 
 def not_held_back(
