@@ -28,6 +28,19 @@ def run(*args: object) -> None:
     main(gap.Config, gap.run, name="train.gap", args=[str(a) for a in args])
 
 
+def test_what_is_read_back_is_summed_in_the_same_order(tmp_path: Path) -> None:
+    """The order of sums follows how an array lies in memory: results are bit-equal."""
+    x = np.moveaxis(np.random.default_rng(0).normal(size=(5, 30, 40)), 0, -1)
+    assert not x.flags.c_contiguous
+    first, again = (
+        Journal(tmp_path / "analysis").remember(lambda: {"slope": x})["slope"]
+        for _ in range(2)
+    )
+    assert first.strides == again.strides
+    np.testing.assert_array_equal(first, x)
+    np.testing.assert_array_equal(again, x)
+
+
 @pytest.fixture(scope="module")
 def case(tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("case")
