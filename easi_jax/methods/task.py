@@ -1,5 +1,6 @@
 """What every method is given, and what it gives back."""
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -93,9 +94,14 @@ class Task:
         return jnp.full(self.space.size, 12.0**-0.5)
 
 
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("distribution", "trace"),
+    meta_fields=("space", "simulated", "measured"),
+)
 @dataclass(frozen=True)
 class Identified:
-    """What a method found.
+    """What a method found; a pytree, so `jax.block_until_ready` waits for it.
 
     Attributes:
         distribution: over the parameters.
