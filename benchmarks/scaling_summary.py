@@ -10,12 +10,13 @@ from scipy.optimize import nnls
 
 from benchmarks._cells import read_rows
 from benchmarks._common import commits_of, markdown_table
+from easi_jax.search_config import SearchConfig
 
 OF = {
-    "parameters": "generation by parameters searched",
-    "population": "generation by individuals",
-    "horizon": "generation by control steps of a piece",
-    "seeds": "iteration of training by seeds in one program",
+    "parameters": "a generation by parameters searched",
+    "population": "a generation by individuals",
+    "horizon": "a generation by control steps of a piece",
+    "seeds": "an iteration of training by seeds in one program",
 }
 
 
@@ -39,7 +40,7 @@ def growth(folder: Path) -> list[str]:
         ]
         if lines:
             table = markdown_table(("", *map(str, sizes)), lines)
-            out += [f"Seconds of a {title}:", table]
+            out += [f"Seconds of {title}:", table]
     return out + on_paper(rows)
 
 
@@ -48,45 +49,73 @@ def on_paper(rows: Sequence[dict[str, Any]]) -> list[str]:
 
     A generation of N individuals takes a + b N on what was timed; on P of them a +
     b N / P, and an all-gather of every simulated state: bytes (P - 1) / P at the
-    link's rate, and its latency log2 P times.
+    link's rate, and its latency log2 P times. Where one population alone was timed, a
+    and b are not known apart, and the two ends are told: all of it a, all of it b N.
     """
-    lines: list[tuple[object, ...]] = []
-    timed = [r for r in rows if r["what"] == "population" and "gathered_bytes" in r]
-    for machine in sorted({_machine(r) for r in timed}):
-        part = sorted(
-            (r for r in timed if _machine(r) == machine), key=lambda r: r["size"]
-        )
-        if len(part) < 2:
-            continue
-        fixed, each = line_through(
-            [r["size"] for r in part], [r["seconds"] for r in part]
-        )
-        for r in part:
-            links = LINKS["cpu" if r["device"] == "cpu" else "gpu"]
-            cells = []
-            for _, count, rate, latency in links:
-                told = gathering(r["gathered_bytes"], count, rate, latency)
-                total = fixed + each * r["size"] / count + told
-                cells.append(f"{total:.3g} ({told / total:.0%})")
-            rate = links[-1][2]
-            equal = each * r["size"] * rate / r["gathered_bytes"]
-            shown = (machine, r["size"], f"{r['seconds']:.3g}", *cells, f"{equal:,.0f}")
-            lines.append((len(links), *shown))
+    timed = [r for r in rows if r["what"] == "population" and _own_cores(r)]
+    gathered = {
+        (r["robot"], *r["option"], r["size"]): r["gathered_bytes"]
+        for r in timed
+        if "gathered_bytes" in r
+    }
     out: list[str] = []
-    if lines:
-        out.append(
-            "On paper: seconds of a generation on more machines of the kind timed, in "
-            "brackets the share in which they tell each other what they simulated "
-            "(`benchmarks/scaling_summary.py` has the formula). Last, the number of "
-            "machines from which on telling takes longer than simulating. Seeds and "
-            "cells of experiments tell each other nothing."
-        )
     for kind, links in LINKS.items():
-        own = [x[1:] for x in lines if ("core" in str(x[1])) == (kind == "cpu")]
-        if own:
+        lines: list[tuple[object, ...]] = []
+        part = [r for r in rows if ("cpu" if r["device"] == "cpu" else "gpu") == kind]
+        for machine in sorted({_machine(r) for r in part}):
+            own = [r for r in part if _machine(r) == machine]
+            lines += _reckoned(machine, own, gathered, links)
+        if lines:
             head = ("", "individuals", "timed", *(name for name, *_ in links), "equal")
-            out.append(markdown_table(head, own))
-    return out
+            out.append(markdown_table(head, lines))
+    if not out:
+        return []
+    told = (
+        "On paper: seconds of a generation on more machines of the kind timed, in "
+        "brackets the share in which they tell each other what they simulated "
+        "(`benchmarks/scaling_summary.py` has the formula; two figures where one "
+        "population alone was timed: if its time did not depend on the population, and "
+        "if it were proportional to it). Last, the number of machines from which on "
+        "telling takes longer than simulating. Seeds and cells of experiments tell "
+        "each other nothing."
+    )
+    return [told, *out]
+
+
+def _reckoned(
+    machine: str, rows: Sequence[dict[str, Any]], gathered: Any, links: Any
+) -> list[tuple[object, ...]]:
+    """Lines of the table on paper for one machine; none where nothing can be told."""
+    robot = (rows[0]["robot"], *rows[0]["option"])
+    seconds = {
+        r["size"]: r["seconds"]
+        for r in sorted(rows, key=lambda r: r["size"])
+        if r["what"] == "population" and _own_cores(r)
+    }
+    full = [r for r in rows if r["what"] == "parameters"]
+    if len(seconds) > 1:
+        ends = [line_through(list(seconds), list(seconds.values()))]
+    elif full and rows[0]["device"] != "cpu":
+        # Sizes of the search are timed at the preset's population.
+        size = SearchConfig().population
+        one = seconds.get(size) or max(full, key=lambda r: r["size"])["seconds"]
+        seconds[size] = one
+        ends = [(one, 0.0), (0.0, one / size)]
+    else:
+        return []
+    lines = []
+    for *key, size in (k for k in sorted(gathered, key=str) if k[:-1] == robot):
+        sent = gathered[(*key, size)]
+        cells = []
+        for _, count, rate, latency in links:
+            told = gathering(sent, count, rate, latency)
+            total = [a + b * size / count + told for a, b in ends]
+            share = " to ".join(f"{told / t:.0%}" for t in total)
+            cells.append(" to ".join(f"{t:.3g}" for t in total) + f" ({share})")
+        equal = ends[-1][1] * size * links[-1][2] / sent
+        shown = f"{seconds[size]:.3g}" if size in seconds else "not run"
+        lines.append((machine, size, shown, *cells, f"{equal:,.0f}"))
+    return sorted(lines, key=lambda x: x[1])
 
 
 # Name, devices, bytes a second into each, seconds of latency. NVLink of an H100: 900
@@ -117,8 +146,19 @@ def line_through(sizes: Sequence[float], seconds: Sequence[float]) -> tuple[floa
 
 def _machine(row: dict[str, Any]) -> str:
     name = " ".join([row["robot"], *row["option"]])
+    if not _own_cores(row):
+        cores = row["versions"]["runtime"]["cores"]
+        return f"{name}, {row['devices']} virtual devices on {cores} cores"
     count = f"{row['devices']} {'core' if row['device'] == 'cpu' else row['device']}"
-    return f"{name}, {count}{'s' if count.endswith('core') else ''}"
+    return (
+        f"{name}, {count}{'s' if count.endswith('core') and count[:2] != '1 ' else ''}"
+    )
+
+
+def _own_cores(row: dict[str, Any]) -> bool:
+    """Whether each device is one; more of them than cores only show what is lost."""
+    known = row.get("versions", {}).get("runtime", {})
+    return row["device"] != "cpu" or row["devices"] <= known.get("cores", math.inf)
 
 
 def _cell(rows: Sequence[dict[str, Any]], size: int) -> str:

@@ -49,7 +49,7 @@ def test_what_was_not_run_is_said(tmp_path: Path) -> None:
     assert "Not run" in scaling_summary.growth(tmp_path)[1]
 
 
-def test_more_machines_on_paper() -> None:
+def test_more_machines_on_paper(tmp_path: Path) -> None:
     fixed, each = scaling_summary.line_through(
         [300, 1024, 4096], [0.13, 0.2024, 0.5096]
     )
@@ -68,6 +68,27 @@ def test_more_machines_on_paper() -> None:
     # 0.1 + 0.1 / 8 s, 1e8 bytes to 7/8 in 0.07 s and three latencies.
     assert "| ant, 2 cores | 1000 | 0.2 | 0.183 (38%) | " in table
     assert scaling_summary.on_paper(rows[:1]) == []
+    # More devices than cores are shown, and nothing is reckoned from them.
+    known = {"versions": {"commit": None, "runtime": {"cores": 1}}}
+    assert scaling_summary.on_paper([r | known for r in rows]) == []
+    (tmp_path / "scaling.jsonl").write_text(
+        "".join(
+            json.dumps(r | known | {"control_steps_per_s": 1.0}) + "\n" for r in rows
+        )
+    )
+    shown = "\n".join(scaling_summary.growth(tmp_path))
+    assert "| ant, 2 virtual devices on 1 cores | 0.2 (1) | 0.3 (1) |" in shown
+
+
+def test_one_population_alone_bounds_what_more_gpus_bring() -> None:
+    ant = {"robot": "ant", "option": []}
+    cpu = ant | {"devices": 1, "device": "cpu", "what": "population", "seconds": 9.0}
+    rows = [cpu | {"size": 3000, "gathered_bytes": 4.5e9}]
+    gpu = ant | {"devices": 1, "device": "H100", "what": "parameters"}
+    rows += [gpu | {"size": n, "seconds": 0.5} for n in (4, 11)]
+    (table,) = scaling_summary.on_paper(rows)[1:]
+    # 300 in 0.5 s: 3000 in 0.5 s, or in 5 s / 8; told in 4.5e9 * 7/8 / 450e9 s.
+    assert "| ant, 1 H100 | 3000 | not run | 0.509 to 0.634 (2% to 1%) |" in table
 
 
 @pytest.mark.slow
