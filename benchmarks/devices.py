@@ -1,18 +1,21 @@
 """Whether a CPU and a GPU, or several devices, compute the same.
 
-    JAX_PLATFORMS=cpu python -m benchmarks.devices --save cpu.npz
-    python -m benchmarks.devices --against cpu.npz
+    JAX_NUM_CPU_DEVICES=1 JAX_PLATFORMS=cpu python -m benchmarks.devices --save one.npz
+    python -m benchmarks.devices --against one.npz
 
 Every robot is simulated from the same resets under the same commands, for random
-models; and the Cartpole's search runs with its least-squares finish on the same logs.
-``benchmarks/results/devices.json`` holds the differences: of positions by control step,
-and of the search's result in its own standard deviations.
+models spread over all devices; and the Cartpole's search runs with its least-squares
+finish on the same logs. ``benchmarks/results/devices_*.json``, one for each pair, hold
+the differences: of positions by control step, and of the search's result in its own
+standard deviations.
 """
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
+from benchmarks._common import RESULTS
 from train._command import main, say, show_table
 
 ROBOTS = ("cartpole", "ant", "ballbalance", "go2")
@@ -28,10 +31,14 @@ class Config:
     """Where the figures of this device are kept."""
     against: Path | None = None
     """Figures of another device."""
+    robots: tuple[str, ...] = ROBOTS
+    """Built-in robots that are simulated."""
     population: int = 64
     """Models of each robot."""
     generations: int = 30
     """Generations of the search."""
+    folder: Path = RESULTS
+    """Where differences go."""
 
 
 def run(config: Config) -> None:
@@ -44,17 +51,19 @@ def run(config: Config) -> None:
 
     if (config.save is None) == (config.against is None):
         raise UserError("give either --save FILE or --against FILE")
-    figures = {name: moved(name, config.population) for name in ROBOTS}
+    kind = jax.devices()[0].device_kind
+    here = f"{jax.device_count()} {kind}"
+    figures = {name: moved(name, config.population) for name in config.robots}
     figures |= searched(config)
     if config.against is None:
-        figures["device"] = np.array(jax.devices()[0].device_kind)
+        figures["device"] = np.array(here)
         np.savez(str(config.save), **figures)
         say(f"written: {config.save}")
         return
     with np.load(config.against, allow_pickle=False) as found:
         other = dict(found)
     rows = {}
-    for name in ROBOTS:
+    for name in config.robots:
         off = np.abs(figures[name] - other[name]).max(-1)
         rows[name] = [
             {f"{p} %": float(np.percentile(off[:, s - 1], p)) for p in SHARES}
@@ -63,10 +72,14 @@ def run(config: Config) -> None:
     std = np.sqrt(np.diag(figures["cov"]))
     apart = np.abs(figures["mean"] - other["mean"]) / std
     refined = np.abs(figures["refined"] - other["refined"])
+    pair = [re.sub(r"\W+", "_", w) for w in (str(other["device"]), here)]
+    plain = dataclasses.replace(config, against=None, folder=RESULTS)
     path = write_result(
-        "devices",
-        command_of("benchmarks.devices", dataclasses.replace(config, against=None)),
-        dataclasses.replace(config, against=None),
+        "_".join(["devices", *pair]),
+        command_of("benchmarks.devices", plain),
+        plain,
+        config.folder,
+        device=here,
         other_device=str(other["device"]),
         control_steps=STEPS,
         positions=rows,
@@ -74,7 +87,7 @@ def run(config: Config) -> None:
         refined_apart_log=refined.tolist(),
     )
     show_table(
-        f"differences of positions [m, rad], {other['device']} beside this",
+        f"differences of positions [m, rad], {here} beside {other['device']}",
         ("robot", *(f"after {s}, {p} %" for s in STEPS for p in SHARES)),
         [
             (n, *(f"{x:.1e}" for step in r for x in step.values()))
@@ -93,10 +106,11 @@ def moved(name: str, population: int) -> Any:
     import numpy as np
 
     from benchmarks._common import wander
+    from easi_jax.mesh import make_mesh, sharded_map
     from easi_jax.rollout import policy_rollout
     from envs import make
 
-    env = make(name)
+    env, mesh = make(name), make_mesh()
     low, high = (jnp.asarray(x) for x in env.space.initial)
     act = wander(env)
 
@@ -108,7 +122,7 @@ def moved(name: str, population: int) -> Any:
         return seg.qpos[1:]
 
     keys = jax.random.split(jax.random.key(0), population)
-    return np.asarray(jax.jit(jax.vmap(one))(keys))
+    return np.asarray(jax.jit(lambda k: sharded_map(jax.vmap(one), mesh, k))(keys))
 
 
 def searched(config: Config) -> dict[str, Any]:

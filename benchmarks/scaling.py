@@ -2,6 +2,7 @@
 
     python -m benchmarks.scaling
     python -m benchmarks.scaling --robot go2 --generations 2 --seeds 1 2 4
+    python -m benchmarks.scaling --robot go2 --every-part --only parameters
 
 Seconds of a generation by population, horizon and number of parameters, and of training
 by seeds that one program holds; compiled before, the least of three timings. Each is a
@@ -19,6 +20,9 @@ from benchmarks._common import RESULTS, wander
 from train._command import main, say
 
 FEWEST = 4  # parameters
+WHAT = ("parameters", "population", "horizon", "seeds")
+_REACH = 0.01  # m, centers of mass to each side
+_FROM_ZERO = {"damping": 0.5, "density": 2.0}  # N m s/rad, kg/m^3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,6 +33,10 @@ class Config:
     """Built-in robot."""
     option: tuple[str, ...] = ()
     """Options of the robot, NAME=VALUE."""
+    every_part: bool = False
+    """Search what every joint, drive and body of the robot has, not its own list."""
+    only: tuple[str, ...] = WHAT
+    """What grows."""
     populations: tuple[int, ...] = (300, 1024, 4096, 16384)
     """Individuals."""
     horizons: tuple[int, ...] = (1, 4, 16, 64)
@@ -55,9 +63,10 @@ def run(config: Config) -> None:
     from envs import open_env
 
     env, mesh = open_env(config.robot, None, config.option), make_mesh(config.devices)
+    space = every_part(env.mj_model) if config.every_part else env.space
     where = {
         "robot": config.robot,
-        "option": list(config.option),
+        "option": [*config.option, *["every part"] * config.every_part],
         "devices": mesh.size,
         "device": jax.devices()[0].device_kind,
     }
@@ -67,7 +76,7 @@ def run(config: Config) -> None:
         for r in read_rows(config.out)
         if {k: r[k] for k in where} == where
     ]
-    names = env.space.names
+    names = space.names
     few = sorted({min(FEWEST, len(names)), len(names) // 2, len(names)})
     sizes = {
         "parameters": few,
@@ -75,19 +84,70 @@ def run(config: Config) -> None:
         "horizon": config.horizons,
         "seeds": config.seeds,
     }
-    for what, size in ((w, s) for w, each in sizes.items() for s in each):
+    for what, size in ((w, s) for w in config.only for s in sizes[w]):
         if (what, size) in done:
             continue
         if what == "seeds":
             figures = _training(config, env, mesh, size)
         elif what == "parameters":
-            figures = _generation(config, env, mesh, names=names[:size])
+            figures = _generation(config, env, mesh, space.select(names[:size]))
         else:
-            figures = _generation(config, env, mesh, **{what: size})
+            figures = _generation(config, env, mesh, space, **{what: size})
         row = {**where, "what": what, "size": size, **figures}
         add_row(config.out, {**row, "versions": versions()})
         words = ", ".join(f"{k} {v:.4g}" for k, v in figures.items())
         say(f"{config.robot}, {what} {size}: {words}")
+
+
+def every_part(mj_model: Any) -> Any:
+    """Gains and force limit of every position drive, damping and armature of every
+    joint, mass and center of every body, all that contacts take of named geoms, gravity
+    and density of the air: 117 of a Go2."""
+    import mujoco
+
+    from easi_jax.parameters import ParameterSpace, declare
+
+    def named(count: int, get: Callable[[int], Any]) -> list[str]:
+        return [get(i).name for i in range(count) if get(i).name not in ("", "world")]
+
+    m = mj_model
+    hinges = {int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)}
+    parts = {
+        "actuator": (named(m.nu, m.actuator), ("kp", "kv", "force_limit")),
+        "joint": (
+            [n for n in named(m.njnt, m.joint) if int(m.joint(n).type[0]) in hinges],
+            ("damping", "armature"),
+        ),
+        "body": (named(m.nbody, m.body), ("mass", "com_x", "com_y", "com_z")),
+        "geom": (
+            [n for n in named(m.ngeom, m.geom) if _touches(m, n)],
+            ("friction", "contact_stiffness", "contact_damping"),
+        ),
+        "option": ([""], ("gravity", "density")),
+    }
+    found = []
+    for kind, (names, quantities) in parts.items():
+        for quantity, name in ((q, n) for q in quantities for n in names):
+            given: dict[str, Any] = {}
+            if quantity in _FROM_ZERO:
+                given = {"initial": (0.0, _FROM_ZERO[quantity]), "log": False}
+            elif quantity.startswith("com_"):
+                at = float(m.body(name).ipos["xyz".index(quantity[-1])])
+                given = {"initial": (at - _REACH, at + _REACH), "log": False}
+            address = ".".join(w for w in (kind, name, quantity) if w)
+            found.append(declare(m, address.replace(".", "_"), address, **given))
+    return ParameterSpace(tuple(found))
+
+
+def _touches(m: Any, geom: str) -> bool:
+    """Whether contacts take anything of a geom."""
+    from easi_jax.addresses import places
+    from easi_jax.errors import UserError
+
+    try:
+        return bool(list(places(m, f"geom.{geom}.friction")))
+    except UserError:
+        return False
 
 
 def least(fun: Callable[[], Any]) -> float:
@@ -103,7 +163,7 @@ def least(fun: Callable[[], Any]) -> float:
 
 
 def _generation(
-    config: Config, env: Any, mesh: Any, names: Any = None, **search: int
+    config: Config, env: Any, mesh: Any, space: Any, **search: int
 ) -> dict[str, float]:
     import jax
     import jax.numpy as jnp
@@ -115,7 +175,6 @@ def _generation(
     from easi_jax.segments import windows
 
     chosen = preset("default", generations=config.generations, **search)
-    space = env.space if names is None else env.space.select(names)
     made = Search(env.machine.rebuilt(space=space), chosen, mesh=mesh)
 
     def data(key: jax.Array) -> SearchData:

@@ -20,6 +20,7 @@ from benchmarks import (
     scaling_summary,
 )
 from benchmarks._common import RESULTS, markdown_table
+from benchmarks.devices import STEPS
 from benchmarks.export import GOAL
 from benchmarks.physics import GOALS
 from benchmarks.recovery import CASES
@@ -56,6 +57,7 @@ def run(config: Config) -> None:
             _real,
             _fuzz,
             _export,
+            _devices,
             crash_summary.faults,
             crash_summary.crashes,
             crash_summary.soak,
@@ -329,6 +331,31 @@ def _fuzz(folder: Path) -> list[str]:
         "started, a file read or written elsewhere) is a failure: "
         f"{total['failed']} of them ({_met(total['failed'] == 0)}).",
         markdown_table(("reader", *columns, "slowest [ms]"), rows),
+    ]
+
+
+def _devices(folder: Path) -> list[str]:
+    out, head = ["## Same result on other devices"], []
+    rows: list[tuple[object, ...]] = []
+    for path in sorted(folder.glob("devices_*.json")):
+        r = _read(folder, path.stem)
+        last = {name: steps[-1] for name, steps in r["positions"].items()}
+        share = list(next(iter(last.values())))[-1]
+        head = [f"{name}, {share}" for name in last]
+        told = [f"{r['other_device']}, {r['device']}"]
+        told += [f"{x[share]:.1e}" for x in last.values()]
+        worst = (max(r["search_apart_std"]), max(r["refined_apart_log"]))
+        rows.append((*told, *(f"{x:.1e}" for x in worst)))
+    if not rows:
+        return [*out, "Not run: `python -m benchmarks.devices`."]
+    titles = ("", *head, "search [std]", "finish [log ratio]")
+    return [
+        *out,
+        f"`python -m benchmarks.devices`: positions [m, rad] after {STEPS[-1]} control "
+        "steps under the same commands, 64 random models of each robot; a search of "
+        "the Cartpole in its own standard deviations, and after its finish. Largest "
+        "differences, of positions the percentile that is named.",
+        markdown_table(titles, rows),
     ]
 
 

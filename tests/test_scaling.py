@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import scaling, scaling_summary
+from envs import make
 
 SMALL = scaling.Config(
     populations=(8, 16), horizons=(1,), seeds=(1,), generations=1, iterations=1
@@ -18,8 +19,8 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list:
     """Sizes that are timed, in place of timing them."""
     asked: list = []
 
-    def generation(*_, names=None, **search) -> dict[str, float]:
-        asked.append(search or len(names or ()))
+    def generation(_config, _env, _mesh, space, **search) -> dict[str, float]:
+        asked.append(search or space.size)
         return {"seconds": 0.5, "control_steps_per_s": 2000.0}
 
     def training(*args) -> dict[str, float]:
@@ -43,6 +44,13 @@ def test_a_stopped_run_goes_on(tmp_path: Path, counted: list) -> None:
     assert counted == [{"population": 16}, *rest]
     (text,) = [t for t in scaling_summary.growth(tmp_path) if "| 8 |" in t]
     assert "0.5 (2,000)" in text and text.count("cartpole, ") == 1
+
+
+def test_every_part_of_a_go2() -> None:
+    space = scaling.every_part(make("go2").mj_model)
+    assert space.size == 117 and "body_FL_calf_com_z" in space.names
+    low, high = space.initial
+    assert ((low <= space.nominal) & (space.nominal <= high)).all()
 
 
 def test_what_was_not_run_is_said(tmp_path: Path) -> None:

@@ -1,0 +1,26 @@
+"""The same result on one device and on eight, as `benchmarks.devices` compares them."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.processes import Processes
+
+SMALL = ("--robots", "cartpole", "--population", "12", "--generations", "5")
+
+
+@pytest.mark.slow
+def test_eight_devices_and_one(tmp_path: Path) -> None:
+    kept = tmp_path / "one.npz"
+    for devices, words in (
+        (1, ("--save", kept)),
+        (8, ("--against", kept, "--folder", tmp_path)),
+    ):
+        run = Processes(1, "benchmarks.devices", *SMALL, *words, devices=devices)
+        ((status, said, error),) = run.ended(600)
+        assert status == 0, said + error
+    told = json.loads((tmp_path / "devices_1_cpu_8_cpu.json").read_text())
+    assert max(max(s.values()) for s in told["positions"]["cartpole"]) < 1e-4
+    assert max(told["search_apart_std"]) < 1e-3
+    assert max(told["refined_apart_log"]) < 1e-4
