@@ -75,8 +75,9 @@ def run(config: Config) -> None:
         }
         for fault, count in sorted(faults.outcomes.items())
     }
+    plain = dataclasses.replace(config, folder=RESULTS)
     path = write_result(
-        *("faults", command_of("benchmarks.faults", config), config, config.folder),
+        *("faults", command_of("benchmarks.faults", plain), plain, config.folder),
         counts=counts,
     )
     lines = [
