@@ -103,7 +103,8 @@ def refine(
             stage, and a short one. Otherwise a first stage fits the beginning of each
             piece alone; the second starts from its result, or from ``unit`` where that
             fits better.
-        others: ``(K, n)`` more places to start from; what fits best is the result.
+        others: ``(K, n)`` more places to start from; what fits best is the result. One
+            that comes to within a standard deviation of it is followed no further.
     """
     paired = PairedFit(machine, space, segments, noise, mesh, free_starts)
     low, high = space.unit_bounds
@@ -281,6 +282,7 @@ def refine(
 
         def round_(state: Any) -> Any:
             phase, k, costs, carry = state
+            at = carry[0]
             # The first round only looks, and the last: cost and information at the
             # result.
             fitting = phase == _MOVING
@@ -297,7 +299,12 @@ def refine(
             settled &= k > item.least
             over = settled | (k >= iterations)
             phase = jnp.where(fitting, jnp.where(over, _LOOKING, _MOVING), _FINISHED)
-            return phase, k + 1, costs, carry
+            # From here it goes to where an earlier start has led.
+            off = at - best[0]
+            merged = (off @ best[3] @ off < 1.0) & (cost < best[2][-1] + 1.0)
+            merged &= item.again & fitting
+            costs = jnp.where(merged, jnp.inf, costs)
+            return jnp.where(merged, _FINISHED, phase), k + 1, costs, carry
 
         start = (phase, jnp.asarray(0), jnp.zeros(iterations + 2), init)
         _, _, costs, carry = jax.lax.while_loop(going, round_, start)
@@ -333,6 +340,7 @@ class _Stage:
     short: jax.Array
     whole: jax.Array
     first: jax.Array
+    again: jax.Array  # from another start than the first
     look: jax.Array
     freed: jax.Array
     raised: jax.Array
@@ -362,6 +370,7 @@ def _stages(starts: jax.Array, near: Any, robust: Any, rounding: float) -> _Stag
         short=short,
         whole=~short & ~look & wanted,
         first=at == 1,
+        again=(at > 1) & (at < fits) & ~short,
         look=look,
         freed=freed,
         raised=at == fits + 2,
