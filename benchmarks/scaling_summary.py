@@ -6,10 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from scipy.optimize import nnls
 
 from benchmarks._cells import read_rows
 from benchmarks._common import commits_of, markdown_table
+from easi_jax.io.figure_style import SERIES, dash, fit, grid, legend_above, styled, svg
 from easi_jax.search_config import SearchConfig
 
 OF = {
@@ -30,6 +33,7 @@ def growth(folder: Path) -> list[str]:
         f"`python -m benchmarks.scaling`, commits {commits_of(rows)}: seconds once "
         "compiled, the least of three; control steps simulated a second in brackets."
     )
+    out.append("![Seconds by size](scaling.svg)")
     for what, title in OF.items():
         part = [r for r in rows if r["what"] == what]
         sizes = sorted({r["size"] for r in part})
@@ -42,6 +46,44 @@ def growth(folder: Path) -> list[str]:
             table = markdown_table(("", *map(str, sizes)), lines)
             out += [f"Seconds of {title}:", table]
     return out + on_paper(rows)
+
+
+def figures(folder: Path) -> dict[str, str]:
+    """The same as curves, by file name; nothing where nothing was timed."""
+    rows = read_rows(folder / "scaling.jsonl")
+    return {"scaling.svg": _curves(rows)} if rows else {}
+
+
+@styled
+def _curves(rows: Sequence[dict[str, Any]]) -> str:
+    """Seconds by size, a panel for each quantity, a line for each machine."""
+    figure, axes = grid(len(OF), 2, height=2.3)
+    machines = sorted({_machine(r) for r in rows})
+    for axis, (what, title) in zip(axes, OF.items(), strict=True):
+        part = [r for r in rows if r["what"] == what]
+        for i, machine in enumerate(machines):
+            own = sorted(
+                (r["size"], r["seconds"]) for r in part if _machine(r) == machine
+            )
+            if own:
+                look = {"color": SERIES[i % len(SERIES)], "ls": dash(i), "lw": 1.4}
+                axis.plot(*zip(*own, strict=True), marker="o", ms=3, **look)
+        axis.set_xscale("log")
+        sizes: list[int] = []
+        for size in sorted({r["size"] for r in part}):
+            if not sizes or size > 1.2 * sizes[-1]:  # else their labels would touch
+                sizes.append(size)
+        axis.xaxis.set_major_locator(FixedLocator(sizes))
+        axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.xaxis.set_minor_locator(NullLocator())
+        fit(axis, np.array([r["seconds"] for r in part]), log=True)
+        axis.set_title(f"seconds of {title}")
+    handles = [
+        Line2D([], [], color=SERIES[i % len(SERIES)], ls=dash(i), lw=1.6, label=m)
+        for i, m in enumerate(machines)
+    ]
+    legend_above(figure, handles)
+    return svg(figure)
 
 
 def on_paper(rows: Sequence[dict[str, Any]]) -> list[str]:

@@ -67,7 +67,8 @@ def run(config: Config) -> None:
         scaling_summary.growth,
     ):
         parts += section(config.results)
-    for drawn in (gap_summary.figures, paper_tables.figures):
+    drawings = gap_summary.figures, paper_tables.figures, scaling_summary.figures
+    for drawn in drawings:
         for name, text in drawn(config.results).items():
             atomic_write(config.results / name, text)
     path = config.results / "README.md"

@@ -86,6 +86,8 @@ def test_more_machines_on_paper(tmp_path: Path) -> None:
     )
     shown = "\n".join(scaling_summary.growth(tmp_path))
     assert "| ant, 2 virtual devices on 1 cores | 0.2 (1) | 0.3 (1) |" in shown
+    drawn = scaling_summary.figures(tmp_path)["scaling.svg"]
+    assert "ant, 2 virtual devices on 1 cores" in drawn and ">2000<" in drawn
 
 
 def test_one_population_alone_bounds_what_more_gpus_bring() -> None:

@@ -31,6 +31,7 @@ ROUND = (1, 2, 5, 10)
 DASHED: Any = {"color": INK, "lw": 1.2, "ls": (0, (4, 2.5))}
 _TOLD = "told-"
 _WIDTH = 9.0  # inches; the report's text column
+_LETTERS = 140  # of a legend, in a row
 _STYLE: Any = {
     "svg.fonttype": "none",
     "svg.hashsalt": "easi-jax",
@@ -142,9 +143,11 @@ def labelled_map(
 
 
 def legend_above(figure: Figure, handles: list[Any]) -> None:
-    """One legend for all axes, in a row at the top left."""
+    """One legend for all axes at the top left; in a row where that is not too long."""
+    wide = [len(str(h.get_label())) + 8 for h in handles]
+    columns = len(handles) if sum(wide) <= _LETTERS else _LETTERS // max(wide)
     figure.legend(
-        handles=handles, loc="outside upper left", ncols=len(handles), borderpad=0
+        handles=handles, loc="outside upper left", ncols=max(1, columns), borderpad=0
     )
 
 
