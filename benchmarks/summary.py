@@ -345,18 +345,17 @@ def _devices(folder: Path) -> list[str]:
         head = [f"{name}, {share}" for name in last]
         told = [f"{r['other_device']}, {r['device']}"]
         told += [f"{x[share]:.1e}" for x in last.values()]
-        worst = (max(r["search_apart_std"]), r["refined_apart_log"])
+        worst = (max(r["search_apart_std"]), max(r["refined_apart_std"]))
         rows.append((*told, *(f"{x:.1e}" for x in worst)))
     if not rows:
         return [*out, "Not run: `python -m benchmarks.devices`."]
-    titles = ("", *head, "search [std]", "finish [log ratio]")
+    titles = ("", *head, "search [std]", "finish [std]")
     return [
         *out,
         f"`python -m benchmarks.devices`: positions [m, rad] after {STEPS[-1]} control "
-        "steps under the same commands, 64 random models of each robot; a search of "
-        "the Cartpole in its own standard deviations, and after its finish the RMS of "
-        "log ratios along what the data determine. Largest differences, of positions "
-        "the percentile that is named.",
+        "steps under the same commands, 64 random models of each robot; the results of "
+        "a search of the Cartpole and of its finish in their own standard deviations. "
+        "Largest differences, of positions the percentile that is named.",
         markdown_table(titles, rows),
     ]
 

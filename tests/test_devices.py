@@ -23,4 +23,4 @@ def test_eight_devices_and_one(tmp_path: Path) -> None:
     told = json.loads((tmp_path / "devices_1_cpu_8_cpu.json").read_text())
     assert max(max(s.values()) for s in told["positions"]["cartpole"]) < 1e-4
     assert max(told["search_apart_std"]) < 0.1  # a rank may differ by rounding
-    assert told["refined_apart_log"] < 1e-3
+    assert max(told["refined_apart_std"]) < 0.1

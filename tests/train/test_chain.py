@@ -68,15 +68,17 @@ def test_folder_of_udr(chain: Path) -> None:
     assert _restored(chain / "udr", "train").step == 24
 
 
+@pytest.mark.parametrize("kept", [12, 24])
 @pytest.mark.fault("killed (signal 9), then resumed")
-def test_killed_training_goes_on_bit_equal(chain: Path, tmp_path: Path) -> None:
-    import jax
-
+def test_killed_training_goes_on_bit_equal(
+    chain: Path, tmp_path: Path, kept: int
+) -> None:
     copy = tmp_path / "udr"
     shutil.copytree(chain / "udr", copy)
     whole = _restored(copy, "train")
-    # As a kill in the second chunk would have left it.
-    shutil.rmtree(copy / "checkpoints" / "train" / "step_000000000024")
+    # As a kill in the second chunk would have left it, or one at its end.
+    if kept < 24:
+        shutil.rmtree(copy / "checkpoints" / "train" / "step_000000000024")
     (copy / "results.json").unlink()
     command(udr, "--out", copy, *SMALL, "--chunk", 12, *TARGET, "--resume")
     again = _restored(copy, "train")
@@ -85,16 +87,29 @@ def test_killed_training_goes_on_bit_equal(chain: Path, tmp_path: Path) -> None:
         jax.tree.leaves(whole.state), jax.tree.leaves(again.state), strict=True
     ):
         np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+    told = [json.loads((r / "results.json").read_text()) for r in (copy, chain / "udr")]
+    assert told[0]["returns"] == told[1]["returns"]
 
 
+# Left by a kill in the second chunk of the search, and in that of the last training.
+LOST = {
+    "search": (
+        *("estimate", "final", "policy_EASI", "policy_UDR"),
+        "search/step_000000000004",
+    ),
+    "final": ("policy_EASI", "policy_UDR", "final/step_000000000024"),
+}
+
+
+@pytest.mark.parametrize("stage", LOST)
 @pytest.mark.fault("killed (signal 9), then resumed")
-def test_killed_search_goes_on_bit_equal(chain: Path, tmp_path: Path) -> None:
+def test_killed_search_goes_on_bit_equal(
+    chain: Path, tmp_path: Path, stage: str
+) -> None:
     copy = tmp_path / "easi"
     shutil.copytree(chain / "easi", copy)
-    # As a kill in the second chunk of the search would have left it.
-    for stage in ("estimate", "final", "policy_EASI", "policy_UDR"):
-        shutil.rmtree(copy / "checkpoints" / stage)
-    shutil.rmtree(copy / "checkpoints" / "search" / "step_000000000004")
+    for lost in LOST[stage]:
+        shutil.rmtree(copy / "checkpoints" / lost)
     for name in ("results.json", "distribution.json", "report.html"):
         (copy / name).unlink()
     command(
@@ -170,7 +185,7 @@ def test_evaluate_draws_an_episode(chain: Path, tmp_path: Path) -> None:
         assert image.n_frames > 10
 
 
-@pytest.mark.slow
+@pytest.mark.fault("killed (signal 9), then resumed")
 def test_pipeline_equals_the_two_commands(chain: Path, tmp_path: Path) -> None:
     out = tmp_path / "pipeline"
     command(pipeline, "--out", out, *SMALL, *SEARCH, *SETTINGS, *TARGET)

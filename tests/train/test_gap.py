@@ -121,8 +121,10 @@ def test_results_are_not_overwritten(
     assert "--overwrite" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("after", [5, 12])
 @pytest.mark.fault("killed (signal 9), then resumed")
 def test_a_stopped_analysis_goes_on(
+    after: int,
     case: Any,
     results: Path,
     tmp_path: Path,
@@ -134,7 +136,7 @@ def test_a_stopped_analysis_goes_on(
     words = ("--model", case.directory / "model.xml", "--out", out, "--data", *data)
 
     def stopping(self: Journal, make: Any) -> Any:
-        if self.kept == 5:
+        if self.kept == after:
             raise KeyboardInterrupt
         return remember(self, make)
 
@@ -145,7 +147,7 @@ def test_a_stopped_analysis_goes_on(
     assert stop.value.code == 130
     assert "--resume" in capsys.readouterr().err
     kept = sorted((out / "checkpoints" / "analysis").iterdir())
-    assert len(kept) == 5
+    assert len(kept) == after
 
     with pytest.raises(SystemExit) as stop:
         run(*words)
