@@ -190,7 +190,8 @@ def tiny(words: list[str], folder: Path) -> list[str]:
         found += [str(p.relative_to(folder)) for p in there] or [word]
     options = TINY.get(words[0], {})
     if words[0] == "train.easi" and "--model" in words:
-        options = {"--generations": "3", "--population": "8"}
+        # Beside the run in a target that other commands go on from.
+        options = {"--generations": "3", "--population": "8", "--out": "results/logs"}
     for option, value in options.items():
         found += [] if option in words else [option, value]
     if words[0] == "train.import_logs" and "--mapping" not in words:

@@ -159,8 +159,13 @@ def load_policies(
     from easi_jax.io.runs import read_config
     from easi_jax.pipeline import Pipeline, PipelineConfig
 
-    read_config(folder)
+    config = read_config(folder)
     if not (folder / "results.json").exists():
+        if config.get("data"):
+            raise UserError(
+                f"{folder} holds no policy: train.easi --data trains none; give a run "
+                "of train.udr, train.pipeline, or train.easi without --data"
+            )
         raise UserError(f"{folder} holds an unfinished run: finish it with --resume")
     result = read_policies(folder / "results.json")
     own = "EASI" if "EASI" in result["methods"] else result["methods"][0]

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from easi_jax import identify
-from train import _command, easi
+from tests.commands import refused
+from train import _command, easi, evaluate
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "lift_arm"
@@ -333,6 +334,7 @@ def test_degrees_are_noticed_and_earlier_results_kept(files, capsys):
     out = capsys.readouterr().out
     assert "degrees" in out
     assert out.strip().splitlines()[-1] == f"report: {files['out'] / 'report.html'}"
+    assert "holds no policy" in refused(capsys, evaluate, "--run", files["out"])
     kept = {p: p.read_bytes() for p in files["out"].rglob("*") if p.is_file()}
     refuse(capsys, arguments(files), "already holds a run")
     single_row(files)
