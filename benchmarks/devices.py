@@ -21,6 +21,7 @@ from train._command import main, say, show_table
 ROBOTS = ("cartpole", "ant", "ballbalance", "go2")
 STEPS = (1, 5, 20)  # control steps after which positions are compared
 SHARES = (50, 99)  # percentiles
+SAME = 0.5  # standard deviations of a result that another device may differ by
 
 
 @dataclasses.dataclass(frozen=True)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.devices import SAME
 from tests.processes import Processes
 
 SMALL = ("--robots", "cartpole", "--population", "12", "--generations", "5")
@@ -22,5 +23,6 @@ def test_eight_devices_and_one(tmp_path: Path) -> None:
         assert status == 0, said + error
     told = json.loads((tmp_path / "devices_1_cpu_8_cpu.json").read_text())
     assert max(max(s.values()) for s in told["positions"]["cartpole"]) < 1e-4
-    assert max(told["search_apart_std"]) < 0.1  # a rank may differ by rounding
-    assert max(told["refined_apart_std"]) < 0.1
+    # Ranks may differ by rounding; the finish ends where data tell no two apart.
+    assert max(told["search_apart_std"] + told["refined_apart_std"]) < SAME
+    assert min(told["refined_apart_std"]) < 0.1
