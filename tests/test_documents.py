@@ -165,7 +165,7 @@ def machine(folder: Path) -> None:
     (folder / "names.yaml").write_text(names)
     (folder / "hidden.yaml").write_text(HIDDEN)
     (folder / "my_env.py").write_text(
-        "from envs.cartpole import Cartpole\n\n\nclass Mine(Cartpole):\n    pass\n"
+        "from envs.cartpole import Cartpole\n\n\ndef make():\n    return Cartpole()\n"
     )
 
 
