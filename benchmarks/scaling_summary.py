@@ -188,13 +188,14 @@ def line_through(sizes: Sequence[float], seconds: Sequence[float]) -> tuple[floa
 
 def _machine(row: dict[str, Any]) -> str:
     name = " ".join([row["robot"], *row["option"]])
-    if not _own_cores(row):
-        cores = row["versions"]["runtime"]["cores"]
-        return f"{name}, {row['devices']} virtual devices on {cores} cores"
-    count = f"{row['devices']} {'core' if row['device'] == 'cpu' else row['device']}"
-    return (
-        f"{name}, {count}{'s' if count.endswith('core') and count[:2] != '1 ' else ''}"
-    )
+    count, device = row["devices"], row["device"]
+    if device != "cpu":
+        return f"{name}, {count} {device}"
+    cores = row.get("versions", {}).get("runtime", {}).get("cores", count)
+    if count != cores:  # one device uses more cores than one
+        few = "devices" if count > 1 else "device"
+        return f"{name}, {count} {'virtual ' * (count > cores)}{few} on {cores} cores"
+    return f"{name}, {count} {'cores' if count > 1 else 'core'}"
 
 
 def _own_cores(row: dict[str, Any]) -> bool:

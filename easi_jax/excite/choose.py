@@ -20,7 +20,7 @@ from easi_jax.excite.separation import (
 from easi_jax.gap.fit import bounds_of
 from easi_jax.gap.places import places, ripples
 from easi_jax.gap.scales import scales_of
-from easi_jax.gap.table import EFFECTS, Place, Scales, covered
+from easi_jax.gap.table import EFFECTS, Place, Scales, covered, does
 from easi_jax.parameters import ParameterSpace
 from easi_jax.physics import WRITTEN_OUT
 from easi_jax.quantities import scalar_dofs
@@ -128,9 +128,11 @@ def choose(
     if not scalar_dofs(m):
         raise UserError("the model has no hinge or slide joint: nothing to excite")
     scales = scales_of(m, runs) if scales is None else replace(scales, dt=runs[0].dt)
+    keys = {k for pair in pairs for k in pair}
+    space = less_named(space, [p for p in places(m, scales) if p.key in keys], m)
     found = effects_wanted(m, space, scales, names)
     if pairs:
-        found = _only(found, {k for pair in pairs for k in pair})
+        found = _only(found, keys)
     dt = runs[0].dt
     physics = max(10, round(horizon / dt)) * physics_steps(dt, m.opt.timestep)
     guess = (
@@ -178,6 +180,18 @@ def score(s: Separation, known: Alike, wanted: Sequence[tuple[int, int]]) -> flo
         return soft_minimum(np.array(able))
     distance, _ = nearest_rival(s, known)
     return soft_minimum(distance[~known.unseen])
+
+
+def less_named(
+    space: ParameterSpace, named: Sequence[Place], m: mujoco.MjModel
+) -> ParameterSpace:
+    """The model's own parameters without those that the gap workflow names as effects:
+    what lies beyond a refit's bounds is one."""
+    return space.select(
+        p.name
+        for p in space.parameters
+        if not any(does(place, a, m) for place in named for a in p.addresses)
+    )
 
 
 def _only(found: Sequence[Place], keys: set[str]) -> list[Place]:

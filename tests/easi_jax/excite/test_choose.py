@@ -1,0 +1,28 @@
+"""What a test is chosen for."""
+
+import numpy as np
+
+from easi_jax.excite.choose import effects_wanted, less_named
+from easi_jax.gap.own import own_space
+from easi_jax.gap.places import places
+from easi_jax.gap.table import Scales
+from envs import make
+
+
+def test_a_named_effect_is_no_parameter_of_the_model() -> None:
+    """The gap workflow names a friction that its own refit could not reach."""
+    m = make("cartpole").mj_model
+    own = own_space(m)
+    assert "joint.cart.frictionloss" in own.names
+    joint, drive, pairs = np.ones(m.nv), np.ones(m.nu), np.zeros(0)
+    scales = Scales(
+        *(joint, joint, joint, joint, joint, drive, drive, drive, joint, pairs),
+        dt=0.02,
+        longest=0.1,
+    )
+    key = "coulomb_friction@cart"
+    assert key not in [p.key for p in effects_wanted(m, own, scales, ())]
+    named = [p for p in places(m, scales) if p.key == key]
+    less = less_named(own, named, m)
+    assert set(own.names) - set(less.names) == {"joint.cart.frictionloss"}
+    assert key in [p.key for p in effects_wanted(m, less, scales, ())]
