@@ -11,7 +11,7 @@ import pytest
 from benchmarks.recovery import controller
 from benchmarks.rigs import RIGS
 from easi_jax import rollout
-from easi_jax.information import Normal, PairedFit, identifiability
+from easi_jax.information import identifiability
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace, declare
 from easi_jax.refine import RefineResult, refine
@@ -28,26 +28,12 @@ def space(cartpole: Cartpole) -> ParameterSpace:
 
 
 @pytest.fixture(scope="module")
-def visited() -> list[np.ndarray]:
-    """Where `fit` has taken derivatives."""
-    return []
-
-
-@pytest.fixture(scope="module")
-def fit(cartpole: Cartpole, space: ParameterSpace, visited: list[np.ndarray]) -> Any:
+def fit(cartpole: Cartpole, space: ParameterSpace) -> Any:
     machine = Machine(cartpole.mj_model, space, cartpole.dt)
-
-    class Watched(PairedFit):
-        def normal(self, unit: jax.Array, *rest: Any) -> Normal:
-            seen = lambda u: visited.append(np.asarray(u))  # noqa: E731
-            jax.debug.callback(seen, unit, ordered=True)
-            return super().normal(unit, *rest)
 
     @jax.jit
     def run(unit: jax.Array, seg: Segments, noise: jax.Array, more: jax.Array) -> Any:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("easi_jax.refine.PairedFit", Watched)
-            return refine(machine, space, unit, seg, noise, iterations=15, others=more)
+        return refine(machine, space, unit, seg, noise, iterations=15, others=more)
 
     def from_all(
         unit: jax.Array, seg: Segments, noise: jax.Array, others: Any = None
@@ -106,20 +92,6 @@ def test_the_best_of_several_starts_is_the_result(
     assert fit(beyond, pieces, NOISE).cost[-1] > good.cost[-1] + 20
     worse = fit(start, pieces, NOISE, beyond[None])
     np.testing.assert_array_equal(worse.unit, good.unit)
-
-
-def test_a_start_that_leads_to_the_same_place_is_not_followed_to_its_end(
-    fit: Any, start: jax.Array, trajectories: Segments, visited: list[np.ndarray]
-) -> None:
-    seen = rollout.measured(trajectories, NOISE, jax.random.key(7))
-    visited.clear()
-    jax.block_until_ready(fit(start, windows(seen, 10, 10), NOISE, start[None]))
-    jax.effects_barrier()
-    begun = [i for i, u in enumerate(visited) if (u == np.asarray(start)).all()]
-    again = next(i for i in begun if i > 3)  # it only looks at first, then it steps
-    pairs = zip(visited[:again], visited[again:], strict=False)
-    same = [bool((a == b).all()) for a, b in pairs]
-    assert 10 < same.index(False) < again - 2
 
 
 def test_what_is_as_good_as_zero_comes_back_though_little_is_known(
