@@ -103,31 +103,22 @@ def every_part(mj_model: Any) -> Any:
     """Gains and force limit of every position drive, damping and armature of every
     joint, mass and center of every body, all that contacts take of named geoms, gravity
     and density of the air: 117 of a Go2."""
-    import mujoco
-
+    from easi_jax.addresses import names, places
     from easi_jax.parameters import ParameterSpace, declare
-
-    def named(count: int, get: Callable[[int], Any]) -> list[str]:
-        return [get(i).name for i in range(count) if get(i).name not in ("", "world")]
+    from easi_jax.quantities import joint_name, scalar_dofs
 
     m = mj_model
-    hinges = {int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)}
+    touching = [m.geom(i).name for *_, i in places(m, "geom.*.friction")]
     parts = {
-        "actuator": (named(m.nu, m.actuator), ("kp", "kv", "force_limit")),
-        "joint": (
-            [n for n in named(m.njnt, m.joint) if int(m.joint(n).type[0]) in hinges],
-            ("damping", "armature"),
-        ),
-        "body": (named(m.nbody, m.body), ("mass", "com_x", "com_y", "com_z")),
-        "geom": (
-            [n for n in named(m.ngeom, m.geom) if _touches(m, n)],
-            ("friction", "contact_stiffness", "contact_damping"),
-        ),
+        "actuator": (names(m, "actuator"), ("kp", "kv", "force_limit")),
+        "joint": ([joint_name(m, j) for j in scalar_dofs(m)], ("damping", "armature")),
+        "body": (names(m, "body"), ("mass", "com_x", "com_y", "com_z")),
+        "geom": (touching, ("friction", "contact_stiffness", "contact_damping")),
         "option": ([""], ("gravity", "density")),
     }
     found = []
-    for kind, (names, quantities) in parts.items():
-        for quantity, name in ((q, n) for q in quantities for n in names):
+    for kind, (named, quantities) in parts.items():
+        for quantity, name in ((q, n) for q in quantities for n in named):
             given: dict[str, Any] = {}
             if quantity in _FROM_ZERO:
                 given = {"initial": (0.0, _FROM_ZERO[quantity]), "log": False}
@@ -137,17 +128,6 @@ def every_part(mj_model: Any) -> Any:
             address = ".".join(w for w in (kind, name, quantity) if w)
             found.append(declare(m, address.replace(".", "_"), address, **given))
     return ParameterSpace(tuple(found))
-
-
-def _touches(m: Any, geom: str) -> bool:
-    """Whether contacts take anything of a geom."""
-    from easi_jax.addresses import places
-    from easi_jax.errors import UserError
-
-    try:
-        return bool(list(places(m, f"geom.{geom}.friction")))
-    except UserError:
-        return False
 
 
 def least(fun: Callable[[], Any]) -> float:

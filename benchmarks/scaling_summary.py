@@ -94,11 +94,12 @@ def on_paper(rows: Sequence[dict[str, Any]]) -> list[str]:
     link's rate, and its latency log2 P times. Where one population alone was timed, a
     and b are not known apart, and the two ends are told: all of it a, all of it b N.
     """
-    timed = [r for r in rows if r["what"] == "population" and _own_cores(r)]
+    # More devices than cores only show what is lost.
+    rows = [r for r in rows if r["device"] != "cpu" or r["devices"] <= _cores(r)]
     gathered = {
         (r["robot"], *r["option"], r["size"]): r["gathered_bytes"]
-        for r in timed
-        if "gathered_bytes" in r
+        for r in rows
+        if r["what"] == "population" and "gathered_bytes" in r
     }
     out: list[str] = []
     for kind, links in LINKS.items():
@@ -132,7 +133,7 @@ def _reckoned(
     seconds = {
         r["size"]: r["seconds"]
         for r in sorted(rows, key=lambda r: r["size"])
-        if r["what"] == "population" and _own_cores(r)
+        if r["what"] == "population"
     }
     full = [r for r in rows if r["what"] == "parameters"]
     if len(seconds) > 1:
@@ -146,8 +147,8 @@ def _reckoned(
     else:
         return []
     lines = []
-    for *key, size in (k for k in sorted(gathered, key=str) if k[:-1] == robot):
-        sent = gathered[(*key, size)]
+    for size in sorted(k[-1] for k in gathered if k[:-1] == robot):
+        sent = gathered[(*robot, size)]
         cells = []
         for _, count, rate, latency in links:
             told = gathering(sent, count, rate, latency)
@@ -157,7 +158,7 @@ def _reckoned(
         equal = ends[-1][1] * size * links[-1][2] / sent
         shown = f"{seconds[size]:.3g}" if size in seconds else "not run"
         lines.append((machine, size, shown, *cells, f"{equal:,.0f}"))
-    return sorted(lines, key=lambda x: x[1])
+    return lines
 
 
 # Name, devices, bytes a second into each, seconds of latency. NVLink of an H100: 900
@@ -191,17 +192,16 @@ def _machine(row: dict[str, Any]) -> str:
     count, device = row["devices"], row["device"]
     if device != "cpu":
         return f"{name}, {count} {device}"
-    cores = row.get("versions", {}).get("runtime", {}).get("cores", count)
+    cores = _cores(row)
     if count != cores:  # one device uses more cores than one
         few = "devices" if count > 1 else "device"
         return f"{name}, {count} {'virtual ' * (count > cores)}{few} on {cores} cores"
     return f"{name}, {count} {'cores' if count > 1 else 'core'}"
 
 
-def _own_cores(row: dict[str, Any]) -> bool:
-    """Whether each device is one; more of them than cores only show what is lost."""
-    known = row.get("versions", {}).get("runtime", {})
-    return row["device"] != "cpu" or row["devices"] <= known.get("cores", math.inf)
+def _cores(row: dict[str, Any]) -> int:
+    """Cores that were there; one for each device where the row does not say."""
+    return row.get("versions", {}).get("runtime", {}).get("cores", row["devices"])
 
 
 def _cell(rows: Sequence[dict[str, Any]], size: int) -> str:

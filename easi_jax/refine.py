@@ -302,7 +302,7 @@ def refine(
             # From here it goes to where an earlier start has led.
             off = at - best[0]
             merged = (off @ best[3] @ off < 1.0) & (cost < best[2][-1] + 1.0)
-            merged &= item.again & fitting
+            merged &= item.whole & ~item.first & ~item.freed & fitting
             costs = jnp.where(merged, jnp.inf, costs)
             return jnp.where(merged, _FINISHED, phase), k + 1, costs, carry
 
@@ -340,7 +340,6 @@ class _Stage:
     short: jax.Array
     whole: jax.Array
     first: jax.Array
-    again: jax.Array  # from another start than the first
     look: jax.Array
     freed: jax.Array
     raised: jax.Array
@@ -370,7 +369,6 @@ def _stages(starts: jax.Array, near: Any, robust: Any, rounding: float) -> _Stag
         short=short,
         whole=~short & ~look & wanted,
         first=at == 1,
-        again=(at > 1) & (at < fits) & ~short,
         look=look,
         freed=freed,
         raised=at == fits + 2,
