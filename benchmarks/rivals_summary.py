@@ -139,10 +139,12 @@ def _costs(rows: Sequence[Row]) -> str:
         if not mine:
             continue
         real = max(r["measured"] for r in mine)
+        # Rows made before methods were waited for have none.
+        seconds = [r["seconds"] for r in mine if r["seconds"] is not None]
         lines.append(
             (
                 method,
-                f"{median(r['seconds'] for r in mine):.0f}",
+                f"{median(seconds):.0f}" if seconds else "not measured",
                 f"{median(r['simulated'] for r in mine) / 1e6:.2f}",
                 f"{real:,}" if real else "none",
             )
