@@ -13,6 +13,7 @@ from train._robots import (
     training_chunk,
 )
 from train._stages import (
+    as_read_back,
     found_check,
     jit_chunks,
     run_stage,
@@ -231,7 +232,7 @@ def _saved(folder: Any, name: str, make: Any, check: Any, refined: bool) -> Any:
     if found is not None:
         return found.state
     say("least squares on the paired data ..." if refined else "Fisher information ...")
-    result = distributed.local(make())
+    result = as_read_back(distributed.local(make()))
     check(result)
     checkpoints.save(place, 1, result, config_hash=folder.config_hash)
     return result

@@ -104,6 +104,18 @@ def placed(tree: Any) -> Any:
     return jax.device_put(tree, everywhere)
 
 
+def as_read_back(tree: Any) -> Any:
+    """Arrays on one device, as a checkpoint gives them: what is computed from them is
+    the same to the last bit whether a run was interrupted or not.
+
+    Sums over what lies on several devices have another order.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    return jax.tree.map(jnp.asarray, jax.device_get(tree))
+
+
 def training_rows(seeds: Sequence[int], per_step: int) -> Callable[[int, Any], Rows]:
     """Metrics of policy training: one line for each evaluation.
 

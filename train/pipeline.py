@@ -107,7 +107,7 @@ def run(config: Config) -> None:
     from envs import open_env
     from train._pseudo_real import held_out_errors
     from train._results import write_pseudo_real
-    from train._stages import found_check, search_rows, training_rows
+    from train._stages import as_read_back, found_check, search_rows, training_rows
 
     given = read_given(config)
     env, real = robots(open_env(config.robot, config.env, config.option), given)
@@ -169,8 +169,7 @@ def run(config: Config) -> None:
             seconds = jnp.array([compiling, running], jnp.float32)
             state = {"out": out, "seconds": seconds}
             checkpoints.save(place, 1, state, config_hash=stamp)
-        # On one device, as what is read back: what follows is the same to the last bit.
-        out = jax.tree.map(jnp.asarray, jax.device_get(out))
+        out = as_read_back(out)
         info = jax.device_get(out["search"])
         for step, row in search_rows(config.seeds, env.space.names, pipe.space.to_si)(
             0, info

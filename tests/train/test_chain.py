@@ -91,14 +91,22 @@ def test_killed_training_goes_on_bit_equal(
     assert told[0]["returns"] == told[1]["returns"]
 
 
+KILLED_IN = {
+    "search": ("search/step_000000000004", "estimate", "final"),
+    "last training": ("final/step_000000000024",),
+}
+
+
+@pytest.mark.parametrize("stage", KILLED_IN)
 @pytest.mark.fault("killed (signal 9), then resumed")
-def test_killed_search_goes_on_bit_equal(chain: Path, tmp_path: Path) -> None:
+def test_killed_search_goes_on_bit_equal(
+    chain: Path, tmp_path: Path, stage: str
+) -> None:
     copy = tmp_path / "easi"
     shutil.copytree(chain / "easi", copy)
-    # As a kill in the second chunk of the search would have left it.
-    for stage in ("estimate", "final", "policy_EASI", "policy_UDR"):
-        shutil.rmtree(copy / "checkpoints" / stage)
-    shutil.rmtree(copy / "checkpoints" / "search" / "step_000000000004")
+    # As a kill in the second chunk of the stage would have left it.
+    for lost in (*KILLED_IN[stage], "policy_EASI", "policy_UDR"):
+        shutil.rmtree(copy / "checkpoints" / lost)
     for name in ("results.json", "distribution.json", "report.html"):
         (copy / name).unlink()
     command(
@@ -180,21 +188,14 @@ def test_pipeline_equals_the_two_commands(chain: Path, tmp_path: Path) -> None:
     command(pipeline, "--out", out, *SMALL, *SEARCH, *SETTINGS, *TARGET)
     one = json.loads((out / "distribution.json").read_text())["seeds"]["0"]
     two = json.loads((chain / "easi" / "distribution.json").read_text())["seeds"]["0"]
-    np.testing.assert_allclose(one["unit_mean"], two["unit_mean"], atol=2e-2)
+    # Closely where the data say something, within half a standard deviation elsewhere.
+    variance, along = np.linalg.eigh(np.array(two["unit_covariance"]))
+    apart = along.T @ (np.array(one["unit_mean"]) - two["unit_mean"])
+    std = np.sqrt(np.maximum(variance, 0.0))
+    assert (np.abs(apart) < 1e-3 + 0.5 * std).all(), (apart, std)
     result = json.loads((out / "results.json").read_text())["returns"]
     other = json.loads((chain / "easi" / "results.json").read_text())["returns"]
     np.testing.assert_allclose(result["UDR"]["0"], other["UDR"]["0"], rtol=0.05)
-
-    # As a kill after the program would have left it, then one before it ended.
-    files = ("results.json", "distribution.json")
-    whole = [(out / name).read_text() for name in files]
-    for lost in ("results.json", "checkpoints/program"):
-        path = out / lost
-        path.unlink() if path.is_file() else shutil.rmtree(path)
-        command(pipeline, "--out", out, *SMALL, *SEARCH, *SETTINGS, *TARGET, "--resume")
-        assert [(out / name).read_text() for name in files] == whole
-    steps = [json.loads(x) for x in (out / "metrics.jsonl").read_text().splitlines()]
-    assert len({(x["stage"], x["step"]) for x in steps}) == len(steps)
 
 
 @pytest.mark.parametrize(
