@@ -68,6 +68,8 @@ class PairedFit:
         noise: standard deviations of measured positions and velocities, ``(2 nv,)``.
         mesh: devices that share the segments; all of them by default.
         free_starts: whether starts are free within the noise, or known exactly.
+        steps: control steps of each piece that are simulated, all by default; the
+            others are to weigh nothing.
     """
 
     machine: Machine
@@ -76,6 +78,7 @@ class PairedFit:
     noise: jax.Array
     mesh: Mesh | None = None
     free_starts: bool = True
+    steps: int | jax.Array | None = None
 
     def normal(self, unit: jax.Array, delta: jax.Array, weight: jax.Array) -> Normal:
         """Gauss-Newton system at parameters ``unit (n,)`` and start shifts ``delta``.
@@ -242,7 +245,7 @@ class PairedFit:
         one = jax.tree.map(lambda x: x[None], s)
         moved = shift_start(self.machine, one, d[None])
         model = self.machine.model(self.space.to_si(unit))
-        return -replay.errors_from(self.machine, model, moved, one)[0]
+        return -replay.errors_from(self.machine, model, moved, one, self.steps)[0]
 
 
 @dataclass(frozen=True)

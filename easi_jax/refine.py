@@ -15,6 +15,7 @@ or about distributions.
 """
 
 import functools
+from dataclasses import replace
 from typing import Any
 
 import flax.struct
@@ -106,12 +107,13 @@ def refine(
         others: ``(K, n)`` more places to start from; what fits best is the result. One
             that comes to within a standard deviation of it is followed no further.
     """
-    paired = PairedFit(machine, space, segments, noise, mesh, free_starts)
+    whole = PairedFit(machine, space, segments, noise, mesh, free_starts)
     low, high = space.unit_bounds
     anchor = unit
     pull = jnp.full(space.size, 1.0 / prior_std**2)
     weight = step_weights(segments, noise, misfit)
-    begin = jnp.arange(segments.horizon) < max(1, round(_SHORT / machine.dt))
+    short = min(segments.horizon, max(1, round(_SHORT / machine.dt)))
+    begin = jnp.arange(segments.horizon) < short
     unmoved = jnp.zeros((segments.count, 2 * machine.mj_model.nv))
 
     away = functools.partial(_distance, space, anchor)
@@ -139,6 +141,10 @@ def refine(
         item: _Stage,
     ) -> Any:
         u, shift, damp, unchanged, raised, pieces, *_ = carry
+        paired = whole
+        if short < segments.horizon:
+            simulated = jnp.where(item.short, short, segments.horizon)
+            paired = replace(whole, steps=simulated)
         unchanged, raised = (
             jnp.where(again, x, y)
             for x, y in zip(fresh, (unchanged, raised), strict=True)
@@ -151,7 +157,7 @@ def refine(
         hops = jnp.clip(u + (reach * sides)[..., None] * ways, low, high)
         if machine.wide:
             at = u, shift, damp, hops, item.begun
-            eq, units, shifts, each = swept(*at, weight, trusted)
+            eq, units, shifts, each = swept(paired, *at, weight, trusted)
         else:
             eq = paired.normal(u, shift, trusted)
             units, shifts = trials(u, shift, damp, hops, item.begun, eq)
@@ -239,7 +245,14 @@ def refine(
         )
 
     def swept(
-        u: Any, shift: Any, damp: Any, hops: Any, begun: Any, weight: Any, trusted: Any
+        paired: PairedFit,
+        u: Any,
+        shift: Any,
+        damp: Any,
+        hops: Any,
+        begun: Any,
+        weight: Any,
+        trusted: Any,
     ) -> Any:
         """Derivatives, then trials, by one simulation that is compiled once."""
         size = plain + 2 * len(ways) + 1

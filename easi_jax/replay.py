@@ -11,12 +11,16 @@ from easi_jax.segments import Segments
 
 
 def predict(
-    machine: Machine, model: Any, segments: Segments
+    machine: Machine,
+    model: Any,
+    segments: Segments,
+    steps: int | jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Open-loop prediction: ``qpos (M, H, nq)``, ``qvel (M, H, nv)``.
 
     Commands on their way at the start are those that the segments know of; before
-    them, the first one counts as sent for ever.
+    them, the first one counts as sent for ever. ``steps``: how many control steps are
+    simulated, all H by default; the others hold the start.
     """
     model = machine.without_sense(model)  # only controllers read it
 
@@ -28,7 +32,19 @@ def predict(
         first = dataclasses.replace(machine.start(qpos, qvel), sensed=())
         if not isinstance(past, tuple):
             first = machine.after(model, first, past)
-        return jax.lax.scan(step, first, ctrl)[1]
+        if steps is None:
+            return jax.lax.scan(step, first, ctrl)[1]
+        begun = jax.tree.map(
+            lambda x: jnp.broadcast_to(x, (ctrl.shape[0], *x.shape)),
+            (first.qpos, first.qvel),
+        )
+
+        def at(i: jax.Array, carry: Any) -> Any:
+            state, seen = step(carry[0], ctrl[i])
+            put = jax.tree.map(lambda row, x: row.at[i].set(x), carry[1], seen)
+            return state, put
+
+        return jax.lax.fori_loop(0, steps, at, (first, begun))[1]
 
     return jax.vmap(one)(segments.qpos, segments.qvel, segments.ctrl, segments.past)
 
@@ -49,11 +65,16 @@ def errors(machine: Machine, model: Any, segments: Segments) -> jax.Array:
 
 
 def errors_from(
-    machine: Machine, model: Any, starts: Segments, measured: Segments
+    machine: Machine,
+    model: Any,
+    starts: Segments,
+    measured: Segments,
+    steps: int | jax.Array | None = None,
 ) -> jax.Array:
-    """Measured minus what is predicted from other starts, ``(M, H, 2 nv)``."""
+    """Measured minus what is predicted from other starts, ``(M, H, 2 nv)``; ``steps``
+    as in `predict`."""
     target = (measured.next_qpos, measured.next_qvel)
-    return innovations(machine, predict(machine, model, starts), target)
+    return innovations(machine, predict(machine, model, starts, steps), target)
 
 
 def motion(machine: Machine, segments: Segments) -> jax.Array:

@@ -1,12 +1,16 @@
 """What Cartpole's motion says of its parameters, and how that is told."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from easi_jax import replay
 from easi_jax.information import (
     Identifiability,
+    Normal,
     PairedFit,
     describe,
     identifiability,
@@ -39,6 +43,33 @@ def angle_to_null(found: Identifiability, direction: dict[str, float]) -> float:
     v = np.array([direction.get(n, 0.0) for n in found.names])
     v /= np.linalg.norm(v)
     return float(np.linalg.norm(v - found.null @ (found.null.T @ v)))
+
+
+def test_steps_that_weigh_nothing_need_no_simulation(
+    cartpole: Cartpole, trajectories: Segments
+) -> None:
+    seg = windows(trajectories, 6, 6).spread(8)
+    machine, space = cartpole.machine, cartpole.space
+    weight = jnp.zeros((8, 6, 4)).at[:, :2].set(1.0)
+    fit = PairedFit(machine, space, seg, NOISE)
+    shift = jnp.zeros((8, 4))
+    unit = jnp.full(space.size, 0.6)
+
+    @jax.jit
+    def normal(steps: jax.Array) -> Normal:
+        return replace(fit, steps=steps).normal(unit, shift, weight)
+
+    for few, whole in zip(
+        jax.tree.leaves(normal(2)), jax.tree.leaves(normal(6)), strict=True
+    ):
+        np.testing.assert_allclose(few, whole, rtol=1e-4, atol=1e-6 * abs(whole).max())
+    model = machine.model(space.to_si(unit))
+    qpos, qvel = jax.jit(lambda n: replay.predict(machine, model, seg, n))(2)
+    whole = jax.jit(lambda: replay.predict(machine, model, seg))()
+    for found, all_, start in ((qpos, whole[0], seg.qpos), (qvel, whole[1], seg.qvel)):
+        np.testing.assert_allclose(found[:, :2], all_[:, :2], rtol=1e-5, atol=1e-6)
+        np.testing.assert_array_equal(found[:, 2:], start[:, None].repeat(4, 1))
+        assert np.abs(all_[:, 2:] - start[:, None]).max() > 1e-2
 
 
 def test_nine_of_eleven_directions_are_seen(found: Identifiability) -> None:
