@@ -14,9 +14,12 @@ from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
 from easi_jax.refine import RefineResult, refine, step_weights
 from easi_jax.replay import motion
-from easi_jax.segments import Segments
+from easi_jax.segments import Segments, windows
 
 RESTARTS = 2  # of the finish on noisy data, where it has more than one minimum
+_STEPS = 25  # control steps of a piece in the finish
+_WIDE_SECONDS = 0.25  # of a piece there for larger robots, whose motion is stiffer
+_WIDE_PIECES = 64  # and how many of them
 FLOOR = 1e-3  # of the motion: what a model is never trusted to be better than
 _RESOLVED = 1e-5  # smallest eigenvalue of a float32 correlation matrix worth its name
 _SHARP = 1.0 / 3.0  # of a value: its standard deviation where logarithms will do
@@ -45,6 +48,28 @@ class Estimate:
     noise: jax.Array
     cost: jax.Array
     delta: jax.Array
+
+
+def finish_pieces(
+    machine: Machine,
+    trajectories: Segments,
+    steps: int | None = None,
+    most: int | None = None,
+) -> Segments:
+    """Pieces for the least-squares finish, from trajectories ``(B, T, 1, ...)``.
+
+    Args:
+        steps: control steps of a piece, cut to those of a trajectory; not given: 25,
+            or a quarter of a second for larger robots.
+        most: pieces at most; not given: all, or 64 for larger robots.
+    """
+    if steps is None:
+        steps = round(_WIDE_SECONDS / machine.dt) if machine.wide else _STEPS
+    steps = max(1, min(steps, trajectories.weight.shape[1]))
+    found = windows(trajectories, steps, steps + 1, machine.past_steps)
+    if most is None:
+        most = _WIDE_PIECES if machine.wide else found.count
+    return found.spread(most) if most < found.count else found
 
 
 def effective_noise(

@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 from easi_jax import distribution
 from easi_jax.distribution import Distribution
 from easi_jax.errors import UserError, nearest
-from easi_jax.identify import RESTARTS, Estimate, estimate
+from easi_jax.identify import RESTARTS, Estimate, estimate, finish_pieces
 from easi_jax.mesh import make_mesh, sharded_map
 from easi_jax.parameters import ParameterSpace
 from easi_jax.rl.config import SacConfig
@@ -29,8 +29,6 @@ from easi_jax.rollout import collect, measured
 from easi_jax.search import Search, SearchData, SearchInfo, SearchState
 from easi_jax.search_config import SearchConfig
 from easi_jax.segments import Segments, windows
-
-_WIDE_PIECES = 64
 
 
 @dataclass(frozen=True)
@@ -289,12 +287,8 @@ class Pipeline:
 
     def pieces(self, demos: Segments) -> Segments:
         """Pieces of one seed for the least-squares finish, from ``(B, T, 1, ...)``."""
-        c, wide = self.config, self.machine.wide
-        steps = c.refine_horizon or (round(0.25 / self.env.dt) if wide else 25)
-        steps = max(1, min(steps, demos.weight.shape[1]))
-        found = windows(demos, steps, steps + 1)
-        most = c.refine_pieces or (_WIDE_PIECES if wide else found.count)
-        return found.spread(most) if most < found.count else found
+        c = self.config
+        return finish_pieces(self.machine, demos, c.refine_horizon, c.refine_pieces)
 
     def play(
         self, policies: PolicyParams, target: jax.Array, keys: jax.Array

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import jax
 import numpy as np
 
-from easi_jax.identify import RESTARTS, estimate
+from easi_jax.identify import RESTARTS, estimate, finish_pieces
 from easi_jax.methods.task import Budget, Identified, Task
 from easi_jax.runtime import fast_loops
 from easi_jax.search import Search, SearchData
@@ -26,8 +26,10 @@ class Easi:
     """Finish with least squares on the paired data."""
     restarts: int | None = None
     """More starts of it, as in `easi_jax.pipeline.PipelineConfig`."""
-    refine_horizon: int = 25
-    """Control steps of a piece there."""
+    refine_horizon: int | None = None
+    """Control steps of a piece there, as in `easi_jax.identify.finish_pieces`."""
+    refine_pieces: int | None = None
+    """Pieces at most, as there."""
 
     def fit(
         self, task: Task, demonstrations: Segments, budget: Budget, key: jax.Array
@@ -57,9 +59,9 @@ class Easi:
         mean, cov, *trace = jax.jit(found, compiler_options=fast_loops())(
             key, task.policy
         )
-        steps_of = min(self.refine_horizon, demonstrations.weight.shape[1])
-        longer = windows(demonstrations, steps_of, steps_of + 1, past)
-
+        longer = finish_pieces(
+            task.machine, demonstrations, self.refine_horizon, self.refine_pieces
+        )
         restarts = self.restarts
         if restarts is None:
             restarts = RESTARTS if noisy and not task.machine.wide else 0

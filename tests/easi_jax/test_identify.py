@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from easi_jax.identify import _inverse, _near_zero, _posterior
+from easi_jax.identify import _inverse, _near_zero, _posterior, finish_pieces
 from easi_jax.parameters import Parameter, ParameterSpace
+from easi_jax.segments import Segments
+from envs import make
 
 PRIOR = 12.0 * np.eye(11)
 
@@ -125,3 +127,29 @@ def test_values_known_by_their_sum_alone_stay_finite() -> None:
         got = _inverse(cov, std) @ x
         assert np.isfinite(got).all()
         np.testing.assert_allclose(cov @ got, x, atol=2e-3 * np.abs(x).max())
+
+
+@pytest.mark.parametrize(
+    ("robot", "count", "steps"), [("cartpole", 56, 25), ("ant", 64, 15)]
+)
+def test_pieces_of_the_finish_suit_the_robot(
+    robot: str, count: int, steps: int
+) -> None:
+    """A large robot's finish would take hours with every step of 200 trajectories."""
+    machine = make(robot).machine
+    model = machine.mj_model
+    shape, following = (8, 200), (8, 200, 1)
+    demos = Segments(
+        qpos=jnp.zeros((*shape, model.nq)),
+        qvel=jnp.zeros((*shape, model.nv)),
+        ctrl=jnp.zeros((*following, model.nu)),
+        next_qpos=jnp.zeros((*following, model.nq)),
+        next_qvel=jnp.zeros((*following, model.nv)),
+        weight=jnp.ones(shape),
+    )
+    found = finish_pieces(machine, demos)
+    assert (found.count, found.horizon) == (count, steps)
+    assert float(found.weight.sum()) == count
+    told = finish_pieces(machine, demos, 10, 7)
+    assert (told.count, told.horizon) == (7, 10)
+    assert finish_pieces(machine, demos, 300).horizon == 200
