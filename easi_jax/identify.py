@@ -61,14 +61,14 @@ def finish_pieces(
     Args:
         steps: control steps of a piece, cut to those of a trajectory; not given: 25,
             or a quarter of a second for larger robots.
-        most: pieces at most; not given: all, or 64 for larger robots.
+        most: pieces at most; not given: all, or for larger robots as many control
+            steps as 64 of the usual length have.
     """
-    if steps is None:
-        steps = round(_WIDE_SECONDS / machine.dt) if machine.wide else _STEPS
-    steps = max(1, min(steps, trajectories.weight.shape[1]))
+    usual = max(1, round(_WIDE_SECONDS / machine.dt)) if machine.wide else _STEPS
+    steps = max(1, min(steps or usual, trajectories.weight.shape[1]))
     found = windows(trajectories, steps, steps + 1, machine.past_steps)
     if most is None:
-        most = _WIDE_PIECES if machine.wide else found.count
+        most = _WIDE_PIECES * usual // steps if machine.wide else found.count
     return found.spread(most) if most < found.count else found
 
 

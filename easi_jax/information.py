@@ -24,7 +24,7 @@ from easi_jax.segments import Segments
 
 _WEAK = 0.5  # std of a log ratio beyond which a direction is called undetermined
 _ALONE = 0.998  # of a parameter's own direction unseen: it leaves no trace
-_CHUNK = 256  # segments simulated at once
+_LANES = 64  # simulations at once of a smaller robot, whose loop is one piece then
 _STEP = 0.01  # of an initial range, for differences along a parameter
 _MOVE = 1e-4  # at least, along a start [m, rad, m/s, rad/s]
 _NUMERIC = 1e-4  # relative singular value that single precision cannot resolve
@@ -212,7 +212,8 @@ class PairedFit:
         """
         mesh = self.mesh or make_mesh()
         share = -(-self.segments.count // mesh.size)
-        wanted = self.machine.batch // points if self.machine.wide else _CHUNK
+        at_once = self.machine.batch if self.machine.wide else _LANES
+        wanted = at_once // points
         batch = min(share, max(1, wanted))
         rounds = -(-share // batch)
         batch = -(-share // rounds)  # even ones: a shorter last one compiles again

@@ -130,10 +130,11 @@ def test_values_known_by_their_sum_alone_stay_finite() -> None:
 
 
 @pytest.mark.parametrize(
-    ("robot", "count", "steps"), [("cartpole", 56, 25), ("ant", 64, 15)]
+    ("robot", "count", "steps", "singles"),
+    [("cartpole", 56, 25, 1600), ("ant", 64, 15, 64 * 15)],
 )
 def test_pieces_of_the_finish_suit_the_robot(
-    robot: str, count: int, steps: int
+    robot: str, count: int, steps: int, singles: int
 ) -> None:
     """A large robot's finish would take hours with every step of 200 trajectories."""
     machine = make(robot).machine
@@ -153,3 +154,6 @@ def test_pieces_of_the_finish_suit_the_robot(
     told = finish_pieces(machine, demos, 10, 7)
     assert (told.count, told.horizon) == (7, 10)
     assert finish_pieces(machine, demos, 300).horizon == 200
+    # Single transitions, as where nothing is known of what came before.
+    single = jax.tree.map(lambda x: x.reshape(1600, 1, *x.shape[2:]), demos)
+    assert finish_pieces(machine, single).count == singles
