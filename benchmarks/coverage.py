@@ -69,7 +69,7 @@ def _solver(config: Config) -> Any:
     import numpy as np
 
     from easi_jax import distribution
-    from easi_jax.identify import RESTARTS, estimate
+    from easi_jax.identify import RESTARTS, estimate, finish_pieces
     from easi_jax.information import PairedFit, identifiability
     from easi_jax.machine import Machine
     from easi_jax.refine import step_weights
@@ -102,7 +102,7 @@ def _solver(config: Config) -> Any:
 
     @jax.jit
     def judge(demos: Any, mean: jax.Array, cov: jax.Array, truth: jax.Array) -> Any:
-        pieces = windows(demos, 25, 26)
+        pieces = finish_pieces(machine, demos)
         found = [
             estimate(
                 *(machine, search.space, mean, cov, pieces, noise, *how),

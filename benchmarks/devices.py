@@ -135,7 +135,7 @@ def searched(config: Config) -> dict[str, Any]:
 
     from benchmarks.recovery import NOISE, controller
     from easi_jax.distribution import covariance
-    from easi_jax.identify import estimate
+    from easi_jax.identify import estimate, finish_pieces
     from easi_jax.rollout import collect, measured
     from easi_jax.search import Search, SearchData
     from easi_jax.search_config import preset
@@ -156,7 +156,7 @@ def searched(config: Config) -> dict[str, Any]:
         data = SearchData(windows(demos, 8, 8), noise, ())
         state, _ = search.run(search.init(key, data), data, config.generations)
         mean, cov = state.result_mean, state.result_cov
-        pieces = windows(demos, 25, 26)
+        pieces = finish_pieces(machine, demos)
         fit = estimate(machine, search.space, mean, cov, pieces, noise, True)
         return mean, cov, fit.distribution
 

@@ -80,7 +80,7 @@ def _case(
 
     from benchmarks._common import write_result
     from easi_jax.heldout import relative_errors
-    from easi_jax.identify import estimate
+    from easi_jax.identify import estimate, finish_pieces
     from easi_jax.information import describe, identifiability
     from easi_jax.machine import Machine
     from easi_jax.rollout import collect, measured
@@ -125,7 +125,7 @@ def _case(
 
     @jax.jit
     def finish(mean: jax.Array, cov: jax.Array, demos: Any) -> Any:
-        pieces = windows(demos, 25, 26)
+        pieces = finish_pieces(machine, demos)
         return estimate(machine, search.space, mean, cov, pieces, deviation, True)
 
     @jax.jit

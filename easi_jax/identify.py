@@ -72,6 +72,11 @@ def finish_pieces(
     return found.spread(most) if most < found.count else found
 
 
+def finish_restarts(machine: Machine, noisy: bool) -> int:
+    """More starts of the least-squares finish, where a user does not say."""
+    return RESTARTS if noisy and not machine.wide else 0
+
+
 def effective_noise(
     machine: Machine, segments: Segments, noise: jax.Array
 ) -> jax.Array:

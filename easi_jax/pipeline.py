@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 from easi_jax import distribution
 from easi_jax.distribution import Distribution
 from easi_jax.errors import UserError, nearest
-from easi_jax.identify import RESTARTS, Estimate, estimate, finish_pieces
+from easi_jax.identify import Estimate, estimate, finish_pieces, finish_restarts
 from easi_jax.mesh import make_mesh, sharded_map
 from easi_jax.parameters import ParameterSpace
 from easi_jax.rl.config import SacConfig
@@ -52,7 +52,7 @@ class PipelineConfig:
     """Control steps of a piece in the least-squares finish; not given: 25, or a
     quarter of a second for larger robots, whose motion is stiffer."""
     refine_pieces: int | None = None
-    """Pieces that it takes; not given: all, or 64 for larger robots."""
+    """Pieces that it takes at most, as `easi_jax.identify.finish_pieces` has it."""
     eval_episodes: int = 100
     """Episodes of a final evaluation."""
 
@@ -264,7 +264,7 @@ class Pipeline:
         noisy = any(x > 0 for x in self.config.noise)
         restarts = self.config.restarts
         if restarts is None:
-            restarts = RESTARTS if noisy and not self.machine.wide else 0
+            restarts = finish_restarts(self.machine, noisy)
 
         def one(item: Any) -> Estimate:
             mean, cov, demo = item

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import jax
 import numpy as np
 
-from easi_jax.identify import RESTARTS, estimate, finish_pieces
+from easi_jax.identify import estimate, finish_pieces, finish_restarts
 from easi_jax.methods.task import Budget, Identified, Task
 from easi_jax.runtime import fast_loops
 from easi_jax.search import Search, SearchData
@@ -64,7 +64,7 @@ class Easi:
         )
         restarts = self.restarts
         if restarts is None:
-            restarts = RESTARTS if noisy and not task.machine.wide else 0
+            restarts = finish_restarts(task.machine, noisy)
 
         def result(mean: jax.Array, cov: jax.Array) -> object:
             return estimate(
