@@ -15,8 +15,12 @@ SETTINGS = ("clean", "paired", "unpaired", "stochastic", "effect")
 
 _SPREAD = 1.5  # factor, at most, between a truth and the nominal values
 _LATE = 0.03  # s that commands are late where the target has an effect
-_STEPS = 32 * 25  # control steps that an individual replays, however they are cut
-_PIECE = 25  # control steps of a piece that information is counted on
+# Control steps that may be simulated: what EASI takes at most, its finish included.
+BUDGETS = {"cartpole": 40_000_000, "arm6": 40_000_000, "go2": 6_000_000}
+# Of a budget for each piece that a rival's individual replays, and for each transition
+# of DROPO, so that the budget pays for some sixty generations.
+_FOR_A_PIECE, _FOR_A_TRANSITION = 93_750, 15_000
+_PIECE = 25  # control steps of a piece
 _REGION = 0.9
 
 
@@ -57,7 +61,8 @@ class Cell:
 
 
 def method_of(cell: Cell, xml: str) -> Any:
-    """The method; where only single transitions are known, it replays as many steps."""
+    """The method, with as many pieces of the recording as the budget pays for; where
+    only single transitions are known, as many control steps."""
     from benchmarks.gap_first import GapFirst
     from easi_jax.methods import (
         Dropo,
@@ -69,13 +74,15 @@ def method_of(cell: Cell, xml: str) -> Any:
         SimOpt,
     )
 
-    cut: dict[str, Any] = {}
+    pieces = max(1, cell.budget // _FOR_A_PIECE)
+    cut: dict[str, Any] = {"pieces": pieces, "horizon": _PIECE}
     if cell.setting == "unpaired":
-        cut = {"pieces": _STEPS, "horizon": 1}
+        cut = {"pieces": pieces * _PIECE, "horizon": 1}
+    transitions = max(1, cell.budget // _FOR_A_TRANSITION)
     known = {
         "EASI": lambda: Easi(refine=True),
         "CMA-ES": lambda: PairedCmaEs(**cut),
-        "DROPO": lambda: Dropo(),
+        "DROPO": lambda: Dropo(transitions=transitions),
         "SimOpt": lambda: SimOpt(),
         "random search": lambda: RandomSearch(**cut),
         "mujoco.sysid": lambda: MujocoSysid(**cut),

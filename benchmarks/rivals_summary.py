@@ -1,6 +1,7 @@
 """Section of the results page on identification beside rivals and today's tools."""
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -23,7 +24,8 @@ def section(folder: Path) -> list[str]:
         return [*out, "Not run: `python -m benchmarks.rivals`."]
     out.append(
         f"`python -m benchmarks.rivals`, commits {commits_of(rows)}: equal data and "
-        "budget, each seed a machine of its own. RMS of the log ratio to the truth "
+        "budget (simulated control steps, a derivative as one), each seed a machine of "
+        "its own. RMS of the log ratio to the truth "
         "along the directions that the data determine, median over seeds (every seed); "
         "in how many the truth lies in the stated 90 % region of these directions. "
         "`clean`: no noise; the others have sensor noise. `unpaired`: single "
@@ -37,7 +39,7 @@ def section(folder: Path) -> list[str]:
         if not mine:
             out.append(f"Not run: `python -m benchmarks.rivals --robots {robot}`.")
             continue
-        out += [f"### {robot}", _errors(mine), *_verdicts(mine), _costs(mine)]
+        out += [f"### {robot}", _errors(mine), *_verdicts(mine), *_costs(mine)]
     return out
 
 
@@ -132,7 +134,7 @@ def verdict(method: str, error: float, own: float) -> str:
     return f"**{method} ahead**: {OURS} {pair} ({own / error:.1f} times)"
 
 
-def _costs(rows: Sequence[Row]) -> str:
+def _costs(rows: Sequence[Row]) -> list[str]:
     lines = []
     for method in METHODS:
         mine = [r for r in rows if r["method"] == method]
@@ -150,4 +152,20 @@ def _costs(rows: Sequence[Row]) -> str:
             )
         )
     head = ("method", "seconds, one core", "million steps simulated")
-    return markdown_table((*head, "further steps of the real machine"), lines)
+    table = markdown_table((*head, "further steps of the real machine"), lines)
+    return [table, *_beyond(rows)]
+
+
+def _beyond(rows: Sequence[Row]) -> list[str]:
+    """Who simulated more than the budget, if anybody."""
+    said = []
+    for budget, method in product(sorted({r["budget"] for r in rows}), METHODS):
+        mine = [r for r in rows if (r["budget"], r["method"]) == (budget, method)]
+        most = max((r["simulated"] for r in mine), default=0)
+        if most > budget:
+            over = sum(r["simulated"] > budget for r in mine)
+            said.append(
+                f"Beyond the budget of {budget / 1e6:.3g} million: {method} in {over} "
+                f"of {len(mine)} cells, up to {most / 1e6:.3g}."
+            )
+    return said

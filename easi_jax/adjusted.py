@@ -85,6 +85,7 @@ class Adjusted:
         raised_hessian: information there.
         left: half the squared score that is left, in its standard deviations, ``()``,
             at the start and at the result, ``(2,)``.
+        simulated: control steps simulated, ``()``; a derivative counts as one more.
     """
 
     unit: jax.Array
@@ -93,6 +94,7 @@ class Adjusted:
     raised: jax.Array
     raised_hessian: jax.Array
     left: jax.Array
+    simulated: jax.Array
 
 
 @flax.struct.dataclass
@@ -302,7 +304,7 @@ def adjust(
     shapes = jax.eval_shape(lambda: fit.score(begin, weight, draws, spread))
     none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
-    def search(found: _Carry, again: jax.Array) -> tuple[_Carry, None]:
+    def search(found: _Carry, again: jax.Array) -> tuple[_Carry, jax.Array]:
         """From ``unit``; then from what was found, with that beyond its limit which
         was held, or costs next to nothing there."""
         edges = found.held | in_dip(*found.here)
@@ -323,7 +325,7 @@ def adjust(
         freed = ~again | edges.any() & freed
         first = jnp.where(again, found.left[0], end.left[0])
         end = replace(end, left=end.left.at[0].set(first))
-        return jax.tree.map(lambda x, y: jnp.where(freed, x, y), end, found), None
+        return jax.tree.map(lambda x, y: jnp.where(freed, x, y), end, found), end.k
 
     nothing = _Carry(
         phase=jnp.asarray(_NOISE),
@@ -336,8 +338,16 @@ def adjust(
         left=jnp.full(2, jnp.inf),
         seen=none.hessian,
     )
-    end, _ = jax.lax.scan(search, nothing, jnp.array([False, True]))
+    end, rounds = jax.lax.scan(search, nothing, jnp.array([False, True]))
     u, found = end.here
+    points = (1 + _DRAWS) * _TURNS * fit.points * rounds.sum()
+    points += len(rounds) * space.size  # of `in_dip`
     return Adjusted(
-        u, found.hessian, found.delta, raised_to_range(space, u), end.seen, end.left
+        unit=u,
+        hessian=found.hessian,
+        delta=found.delta,
+        raised=raised_to_range(space, u),
+        raised_hessian=end.seen,
+        left=end.left,
+        simulated=1.0 * segments.count * segments.horizon * points,
     )

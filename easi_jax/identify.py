@@ -39,6 +39,8 @@ class Estimate:
         noise: standard deviations that the information was computed with.
         cost: weighted error after each step of refinement (empty without).
         delta: corrections of the pieces' starts within their noise, ``(M, 2 nv)``.
+        simulated: control steps simulated since the search, ``()``; a derivative
+            counts as one more.
     """
 
     distribution: Distribution
@@ -48,6 +50,7 @@ class Estimate:
     noise: jax.Array
     cost: jax.Array
     delta: jax.Array
+    simulated: jax.Array
 
 
 def finish_pieces(
@@ -137,7 +140,7 @@ def estimate(
             given = machine, space, fit.unit, pieces, assumed, mesh, misfit
             fit = _adjusted(fit, adjust(*given))
         center, hessian = fit.unit, fit.hessian
-        cost, delta = fit.cost, fit.delta
+        cost, delta, simulated = fit.cost, fit.delta, fit.simulated
     else:
         weight = step_weights(pieces, assumed, misfit)
         zero = jnp.zeros((pieces.count, len(noise)))
@@ -145,6 +148,7 @@ def estimate(
         eq = paired.normal(mean, zero, weight)
         center, hessian = mean, eq.hessian
         cost, delta = jnp.zeros(0), eq.start_step
+        simulated = jnp.asarray(1.0 * paired.points * pieces.count * pieces.horizon)
     open_cov, seen, _ = _posterior(hessian)
     own = jnp.zeros((n, n)) if refined else seen @ cov @ seen.T
     if refined:
@@ -158,6 +162,7 @@ def estimate(
         noise=assumed,
         cost=cost,
         delta=delta,
+        simulated=simulated,
     )
 
 
@@ -172,7 +177,8 @@ def _adjusted(fit: RefineResult, new: Adjusted) -> RefineResult:
         raised_hessian=new.raised_hessian,
     )
     fine = jnp.isfinite(new.left[1])
-    return jax.tree.map(lambda x, y: jnp.where(fine, x, y), found, fit)
+    found = jax.tree.map(lambda x, y: jnp.where(fine, x, y), found, fit)
+    return replace(found, simulated=fit.simulated + new.simulated)
 
 
 def _posterior(hessian: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -201,6 +201,11 @@ class PairedFit:
         return self._each(one, unit.shape[0], shifts, weight).T
 
     @property
+    def points(self) -> int:
+        """Simulations of each piece that `normal` takes, a derivative as one."""
+        return 1 + self._directions * (2 if self.machine.wide else 1)
+
+    @property
     def _directions(self) -> int:
         starts = 2 * self.machine.mj_model.nv if self.free_starts else 0
         return self.space.size + starts

@@ -63,6 +63,7 @@ class RefineResult:
             initial range: below it they may be as good as zero, where the logarithm has
             no slope.
         raised_hessian: information there.
+        simulated: control steps simulated, ``()``; a derivative counts as one more.
     """
 
     unit: jax.Array
@@ -71,6 +72,7 @@ class RefineResult:
     delta: jax.Array
     raised: jax.Array
     raised_hessian: jax.Array
+    simulated: jax.Array
 
 
 def refine(
@@ -129,6 +131,7 @@ def refine(
     fresh = jnp.zeros((2, len(ways))), jnp.tile(jnp.asarray(farthest), (2, 1))
     hopped = slice(steps, steps + 2 * len(ways))
     rounding = _ROUGH if machine.wide else _ROUNDING
+    places = plain + 2 * len(ways) + 1  # that a round looks at
     sides = jnp.array([[1.0], [-1.0]])
 
     def step(
@@ -255,9 +258,8 @@ def refine(
         trusted: Any,
     ) -> Any:
         """Derivatives, then trials, by one simulation that is compiled once."""
-        size = plain + 2 * len(ways) + 1
         points = paired.around(u, shift)
-        most = max(size, points[0].shape[0])
+        most = max(places, points[0].shape[0])
 
         def padded(x: jax.Array) -> jax.Array:
             last = jnp.broadcast_to(x[:1], (most - x.shape[0], *x.shape[1:]))
@@ -265,8 +267,8 @@ def refine(
 
         def turn(points: Any, weights: jax.Array) -> Any:
             eq, each = paired.sweep(points[0], points[1], weights)
-            tried = trials(u, shift, damp, hops, begun, eq)
-            return jax.tree.map(padded, tried), (eq, tried, each[:size])
+            told = trials(u, shift, damp, hops, begun, eq)
+            return jax.tree.map(padded, told), (eq, told, each[:places])
 
         points = jax.tree.map(padded, points)
         out = jax.lax.scan(turn, points, jnp.stack([trusted, weight]))[1]
@@ -320,7 +322,8 @@ def refine(
             return jnp.where(merged, _FINISHED, phase), k + 1, costs, carry
 
         start = (phase, jnp.asarray(0), jnp.zeros(iterations + 2), init)
-        _, _, costs, carry = jax.lax.while_loop(going, round_, start)
+        _, rounds, costs, carry = jax.lax.while_loop(going, round_, start)
+        steps = rounds * jnp.where(item.short, short, segments.horizon)
         u, shift, *_, hessian, up = carry
         # A plateau is wide, and likelier than a dip that noise may have dug.
         flat = ((freed == best[0]) | (jnp.diag(hessian) < _UNSEEN)).all()
@@ -332,7 +335,7 @@ def refine(
             (u, shift, costs, hessian),
             best,
         )
-        return ((u, shift), best, jnp.where(item.look, up, freed)), (u, hessian)
+        return ((u, shift), best, jnp.where(item.look, up, freed)), (u, hessian, steps)
 
     starts = unit[None] if others is None else jnp.concatenate([unit[None], others])
     # As a scan, so that a stage is compiled once.
@@ -340,7 +343,13 @@ def refine(
     stages = _stages(starts, near, robust, rounding)
     found, looked = jax.lax.scan(stage, ((unit, unmoved), none, unit), stages)
     u, shift, costs, hessian = found[1]
-    return RefineResult(u, hessian, costs, shift, looked[0][-1], looked[1][-1])
+    points = whole.points + places
+    if machine.wide:  # one simulation for both, see `swept`
+        points = 2 * max(whole.points, places)
+    simulated = 1.0 * points * count * looked[2].sum()
+    return RefineResult(
+        u, hessian, costs, shift, looked[0][-1], looked[1][-1], simulated
+    )
 
 
 @flax.struct.dataclass

@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from benchmarks import rivals
 from benchmarks._cells import Share, read_rows, run_cells
 from benchmarks.gap_first import own, runs
 from benchmarks.rigs import RIGS
-from benchmarks.rival_cells import score
+from benchmarks.rival_cells import BUDGETS, Cell, method_of, score
 from benchmarks.rivals_summary import best_rival, section, verdict
 from easi_jax.distribution import covariance, gaussian
 from easi_jax.errors import UserError
@@ -111,6 +112,7 @@ def line(method: str, seed: int, error: float, setting: str = "paired") -> dict:
         "start_error": 0.3,
         "seconds": 4.0,
         "simulated": 3_000_000,
+        "budget": 3_000_000,
         "measured": 6000 if method == "SimOpt" else 0,
         "versions": {"commit": "0123456789"},
     }
@@ -140,9 +142,28 @@ def test_the_page_says_who_is_ahead(tmp_path: Path) -> None:
     assert "paired: EASI ahead, 0.06 against 0.12 of CMA-ES" in text
     assert "| SimOpt | 4 | 3.00 | 6,000 |" in text
     assert "| CMA-ES | not measured | 3.00 | none |" in text
+    assert "beyond the budget" not in text
     assert "Not run: `python -m benchmarks.rivals --robots go2`." in text
     assert "**NPE ahead**: EASI 0.05 against 0.01" in verdict("NPE", 0.01, 0.05)
     assert "both exact" in verdict("NPE", 1e-5, 1e-4)
+    rows[1]["simulated"] = 4_500_000
+    out.write_text("".join(json.dumps(r) + "\n" for r in rows))
+    text = "\n".join(section(tmp_path))
+    assert "Beyond the budget of 3 million: EASI in 1 of 3 cells, up to 4.5." in text
+
+
+def test_rivals_replay_as_much_as_the_budget_pays_for() -> None:
+    def of(method: str, budget: int, setting: str = "paired") -> Any:
+        return method_of(Cell("arm6", setting, method, 0, 40, budget), "")
+
+    assert of("CMA-ES", 3_000_000).pieces == 32
+    assert of("NPE", 40_000_000).pieces >= 40 * 200 / 25
+    assert of("DROPO", 3_000_000).transitions == 200
+    single = of("mujoco.sysid", 3_000_000, "unpaired")
+    assert (single.pieces, single.horizon) == (32 * 25, 1)
+    assert {c.budget for c in rivals.cells(rivals.Config(robots=("go2",)))} == {
+        BUDGETS["go2"]
+    }
 
 
 def test_a_result_is_told_in_the_coordinates_that_were_asked_for() -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import jax
 import numpy as np
 
-from easi_jax.identify import estimate, finish_pieces, finish_restarts
+from easi_jax.identify import Estimate, estimate, finish_pieces, finish_restarts
 from easi_jax.methods.task import Budget, Identified, Task
 from easi_jax.runtime import fast_loops
 from easi_jax.search import Search, SearchData
@@ -23,7 +23,8 @@ class Easi:
     search: SearchConfig = field(default_factory=SearchConfig)
     """The search; its generations are cut to the budget."""
     refine: bool = False
-    """Finish with least squares on the paired data."""
+    """Finish with least squares on the paired data. What that simulates comes on top of
+    the budget, and is counted."""
     restarts: int | None = None
     """More starts of it, as in `easi_jax.pipeline.PipelineConfig`."""
     refine_horizon: int | None = None
@@ -66,7 +67,7 @@ class Easi:
         if restarts is None:
             restarts = finish_restarts(task.machine, noisy)
 
-        def result(mean: jax.Array, cov: jax.Array) -> object:
+        def result(mean: jax.Array, cov: jax.Array) -> Estimate:
             return estimate(
                 task.machine,
                 search.space,
@@ -80,10 +81,10 @@ class Easi:
                 free_starts=noisy,
                 restarts=restarts,
                 adjusted=True,
-            ).distribution
+            )
 
-        distribution = jax.jit(result)(mean, cov)
-        simulated = rounds * c.population * steps
+        finish = jax.jit(result)(mean, cov)
+        simulated = rounds * c.population * steps + round(float(finish.simulated))
         return Identified(
-            distribution, search.space, simulated, trace=(trace[0], trace[1])
+            finish.distribution, search.space, simulated, trace=(trace[0], trace[1])
         )

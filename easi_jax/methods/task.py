@@ -106,7 +106,8 @@ class Identified:
     Attributes:
         distribution: over the parameters.
         space: whose unit coordinates it is in.
-        simulated: control steps simulated to identify it.
+        simulated: control steps simulated to identify it; a derivative counts as one
+            more.
         measured: control steps of the real machine beyond the demonstrations.
         trace: mean and standard deviation after each generation, unit coordinates,
             ``(G, n)`` each; None where a method has no generations to show.

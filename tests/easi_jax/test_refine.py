@@ -14,7 +14,7 @@ from easi_jax import rollout
 from easi_jax.information import identifiability
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace, declare
-from easi_jax.refine import RefineResult, refine
+from easi_jax.refine import RefineResult, jumps, refine
 from easi_jax.segments import Segments, cut, to_device, windows
 from envs.cartpole import Cartpole
 
@@ -58,6 +58,13 @@ def test_recovers_the_truth_without_noise(
     for name, r in ratio.items():
         assert r == pytest.approx(1.0, abs=1e-3), (name, ratio)
     assert out.cost[-1] < 1e-4 * out.cost[0]
+    # Whole rounds of derivatives and trials, each of one step or of all ten.
+    pieces, rounds = windows(trajectories, 10, 10).count, 15 + 2
+    derivatives = 1 + space.size + len(NOISE)
+    places = 3 * (1 + 6) + 2 * len(jumps(space)[0]) + 1
+    steps = float(out.simulated) / (pieces * (derivatives + places))
+    assert steps == pytest.approx(round(steps), rel=1e-6)
+    assert 10 * 13 < steps <= 2 * rounds * (1 + 10) + (1 + rounds + 1) * 10
 
 
 def test_is_as_good_as_the_cramer_rao_bound(
