@@ -117,8 +117,9 @@ def estimate(
     step, on top of the noise; it, ``robust``, ``free_starts`` and ``near`` go to
     `easi_jax.refine.refine`, which starts from so many draws of the search's spread as
     well as ``restarts`` says. With ``adjusted``, what the fitted starts add to the
-    score is taken off (`easi_jax.adjusted`); not where starts are exact, nor for larger
-    machines. What may be as good as zero is stated as `_near_zero` says.
+    score is taken off (`easi_jax.adjusted`); not where starts are exact, nor where
+    slopes are differences (`Machine.by_differences`). What may be as good as zero is
+    stated as `_near_zero` says.
     """
     assumed = effective_noise(machine, pieces, noise)
     n = space.size
@@ -136,7 +137,7 @@ def estimate(
             near=near,
             others=_draws(mean, cov, restarts) if restarts else None,
         )
-        if adjusted and free_starts and not machine.wide:
+        if adjusted and free_starts and not machine.by_differences:
             given = machine, space, fit.unit, pieces, assumed, mesh, misfit
             fit = _adjusted(fit, adjust(*given))
         center, hessian = fit.unit, fit.hessian

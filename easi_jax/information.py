@@ -1,7 +1,8 @@
 """What measured segments say about the parameters: Fisher information.
 
-Derivatives of the simulation are forward-mode or, for larger robots, central
-differences: their batches simulate many times faster than derivatives go through them
+Derivatives of the simulation are forward-mode or, beyond three degrees of freedom,
+central differences: derivatives of an arm of six compile for minutes, and batches of
+larger robots simulate many times faster than derivatives go through them
 (`easi_jax.lanes`). The start state of each segment is unknown within its noise and
 eliminated (Schur complement). The inverse is the Cramer-Rao bound.
 """
@@ -87,7 +88,7 @@ class PairedFit:
             delta: ``(M, 2 nv)``.
             weight: of each measured number, ``(M, H, 2 nv)``.
         """
-        if self.machine.wide:
+        if self.machine.by_differences:
             units, deltas = self.around(unit, delta)
             return self.sweep(units, deltas, weight)[0]
 
@@ -203,7 +204,7 @@ class PairedFit:
     @property
     def points(self) -> int:
         """Simulations of each piece that `normal` takes, a derivative as one."""
-        return 1 + self._directions * (2 if self.machine.wide else 1)
+        return 1 + self._directions * (2 if self.machine.by_differences else 1)
 
     @property
     def _directions(self) -> int:

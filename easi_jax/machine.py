@@ -23,6 +23,7 @@ from easi_jax.recording import physics_steps
 # Small enough for XLA to run a simulation as one piece (see `runtime`).
 _BATCH = 128  # benchmarks/speed.py
 _WIDE_BATCH = 32  # benchmarks/physics.py
+_FORWARD_MODE = 3  # degrees of freedom: of six, written out, it compiles for minutes
 _SETTLED = 4.0  # time constants after which a lag has forgotten
 
 
@@ -38,6 +39,8 @@ class Machine:
             divided by the smallest whole number that brings it to the model's own
             timestep or below.
         wide: whether it is too large to be written out entry by entry.
+        by_differences: whether slopes of a fit are central differences, not
+            forward-mode derivatives.
         batch: simulations at once on a device; more would leave a CPU core's cache.
         fixed: values by address that are not those of ``mj_model``, effects among them.
         past_steps: commands before a measured start that its simulation has use for;
@@ -66,6 +69,7 @@ class Machine:
         self.space = space
         self.fixed = dict(fixed or {})
         self.wide = mj_model.nv > WRITTEN_OUT
+        self.by_differences = mj_model.nv > _FORWARD_MODE
         self.batch = _WIDE_BATCH if self.wide else _BATCH
         self.base = self._put().replace(
             sense=sense,

@@ -130,7 +130,7 @@ def refine(
     ways, farthest = jumps(space)
     fresh = jnp.zeros((2, len(ways))), jnp.tile(jnp.asarray(farthest), (2, 1))
     hopped = slice(steps, steps + 2 * len(ways))
-    rounding = _ROUGH if machine.wide else _ROUNDING
+    rounding = _ROUGH if machine.by_differences else _ROUNDING
     places = plain + 2 * len(ways) + 1  # that a round looks at
     sides = jnp.array([[1.0], [-1.0]])
 
@@ -158,7 +158,7 @@ def refine(
         # as it was and where it has raised it: at the edge of a plateau it may fall.
         reach = 0.5 * (unchanged + raised)
         hops = jnp.clip(u + (reach * sides)[..., None] * ways, low, high)
-        if machine.wide:
+        if machine.by_differences:
             at = u, shift, damp, hops, item.begun
             eq, units, shifts, each = swept(paired, *at, weight, trusted)
         else:
@@ -344,7 +344,7 @@ def refine(
     found, looked = jax.lax.scan(stage, ((unit, unmoved), none, unit), stages)
     u, shift, costs, hessian = found[1]
     points = whole.points + places
-    if machine.wide:  # one simulation for both, see `swept`
+    if machine.by_differences:  # one simulation for both, see `swept`
         points = 2 * max(whole.points, places)
     simulated = 1.0 * points * count * looked[2].sum()
     return RefineResult(

@@ -49,7 +49,7 @@ def exact(problem: Any) -> dict[bool, Normal]:
 def test_equal_forward_mode(
     problem: Any, exact: dict[bool, Normal], free: bool, monkeypatch: Any
 ) -> None:
-    monkeypatch.setattr(problem[0], "wide", True)
+    monkeypatch.setattr(problem[0], "by_differences", True)
     found, known = normal(problem, free), exact[free]
     scale = np.sqrt(np.diag(np.asarray(known.hessian)))
     np.testing.assert_allclose(
@@ -87,8 +87,8 @@ def test_a_parameter_at_its_bound_has_its_slope(problem: Any, monkeypatch: Any) 
     parameters = (*space.parameters[:k], edge, *space.parameters[k + 1 :])
     bounded = (machine, ParameterSpace(parameters), pieces)
     slopes = []
-    for wide in (False, True):
-        monkeypatch.setattr(machine, "wide", wide)
+    for differences in (False, True):
+        monkeypatch.setattr(machine, "by_differences", differences)
         _, s, _ = bounded
         unit = s.to_unit(jnp.asarray(s.nominal)).at[k].set(s.unit_bounds[1][k])
         slopes.append(np.asarray(normal(bounded, False, unit).hessian)[k, k])
@@ -98,7 +98,7 @@ def test_a_parameter_at_its_bound_has_its_slope(problem: Any, monkeypatch: Any) 
 @pytest.mark.fault("simulations that explode, parameters at absurd corners")
 def test_a_piece_that_explodes_is_left_out(problem: Any, monkeypatch: Any) -> None:
     machine, space, pieces = problem
-    monkeypatch.setattr(machine, "wide", True)
+    monkeypatch.setattr(machine, "by_differences", True)
     broken = dataclasses.replace(pieces, next_qvel=pieces.next_qvel.at[3].set(jnp.nan))
     without = dataclasses.replace(pieces, weight=pieces.weight.at[3].set(0.0))
     found = normal((machine, space, broken), False)
@@ -109,7 +109,7 @@ def test_a_piece_that_explodes_is_left_out(problem: Any, monkeypatch: Any) -> No
 @pytest.mark.parametrize("free", [True, False])
 def test_refines_to_the_truth(problem: Any, free: bool, monkeypatch: Any) -> None:
     machine, space, pieces = problem
-    monkeypatch.setattr(machine, "wide", True)
+    monkeypatch.setattr(machine, "by_differences", True)
     off = np.where(np.arange(space.size) % 2, 0.7, 1.3)
     unit = space.to_unit(jnp.asarray(off * space.nominal))
     noise = 1e-2 * NOISE
