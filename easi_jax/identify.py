@@ -12,6 +12,7 @@ from easi_jax.distribution import Distribution, gaussian
 from easi_jax.information import PairedFit
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
+from easi_jax.polish import polish
 from easi_jax.refine import RefineResult, refine, step_weights
 from easi_jax.replay import motion
 from easi_jax.segments import Segments, windows
@@ -20,6 +21,7 @@ RESTARTS = 2  # of the finish on noisy data, where it has more than one minimum
 _STEPS = 25  # control steps of a piece in the finish
 _WIDE_SECONDS = 0.25  # of a piece there for larger robots, whose motion is stiffer
 _WIDE_PIECES = 64  # and how many of them
+_REST = 10  # times as many that the finish ends on
 FLOOR = 1e-3  # of the motion: what a model is never trusted to be better than
 _RESOLVED = 1e-5  # smallest eigenvalue of a float32 correlation matrix worth its name
 _SHARP = 1.0 / 3.0  # of a value: its standard deviation where logarithms will do
@@ -75,6 +77,24 @@ def finish_pieces(
     return found.spread(most) if most < found.count else found
 
 
+def finish_rest(
+    machine: Machine,
+    trajectories: Segments,
+    noisy: bool,
+    steps: int | None = None,
+    most: int | None = None,
+) -> Segments | None:
+    """What the finish ends on (`estimate`): ten times as much as `finish_pieces` gives
+    of a larger robot's recording. None for clean data, where ``most`` is given, and
+    where there is no more."""
+    if not (noisy and machine.wide) or most is not None:
+        return None
+    part = finish_pieces(machine, trajectories, steps)
+    most = _REST * part.count
+    whole = finish_pieces(machine, trajectories, steps, most)
+    return whole if whole.count > part.count else None
+
+
 def finish_restarts(machine: Machine, noisy: bool) -> int:
     """More starts of the least-squares finish, where a user does not say."""
     return RESTARTS if noisy and not machine.wide else 0
@@ -106,6 +126,7 @@ def estimate(
     near: bool | jax.Array = False,
     restarts: int = 0,
     adjusted: bool = False,
+    rest: Segments | None = None,
 ) -> Estimate:
     """The result of a search at ``mean``, ``cov`` (unit coordinates); pure.
 
@@ -118,8 +139,9 @@ def estimate(
     `easi_jax.refine.refine`, which starts from so many draws of the search's spread as
     well as ``restarts`` says. With ``adjusted``, what the fitted starts add to the
     score is taken off (`easi_jax.adjusted`); not where starts are exact, nor where
-    slopes are differences (`Machine.by_differences`). What may be as good as zero is
-    stated as `_near_zero` says.
+    slopes are differences (`Machine.by_differences`). ``rest`` is more of the
+    recording, ``pieces`` among it: the fit ends on that (`easi_jax.polish`). What may
+    be as good as zero is stated as `_near_zero` says.
     """
     assumed = effective_noise(machine, pieces, noise)
     n = space.size
@@ -140,6 +162,8 @@ def estimate(
         if adjusted and free_starts and not machine.by_differences:
             given = machine, space, fit.unit, pieces, assumed, mesh, misfit
             fit = _adjusted(fit, adjust(*given))
+        if rest is not None:
+            fit = polish(machine, space, fit, rest, assumed, mesh, misfit)
         center, hessian = fit.unit, fit.hessian
         cost, delta, simulated = fit.cost, fit.delta, fit.simulated
     else:

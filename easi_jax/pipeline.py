@@ -16,7 +16,13 @@ from jax.sharding import Mesh
 from easi_jax import distribution
 from easi_jax.distribution import Distribution
 from easi_jax.errors import UserError, nearest
-from easi_jax.identify import Estimate, estimate, finish_pieces, finish_restarts
+from easi_jax.identify import (
+    Estimate,
+    estimate,
+    finish_pieces,
+    finish_rest,
+    finish_restarts,
+)
 from easi_jax.mesh import make_mesh, sharded_map
 from easi_jax.parameters import ParameterSpace
 from easi_jax.rl.config import SacConfig
@@ -52,7 +58,8 @@ class PipelineConfig:
     """Control steps of a piece in the least-squares finish; not given: 25, or a
     quarter of a second for larger robots, whose motion is stiffer."""
     refine_pieces: int | None = None
-    """Pieces that it takes at most, as `easi_jax.identify.finish_pieces` has it."""
+    """Pieces that it takes at most; not given: as `easi_jax.identify.finish_pieces` and
+    `finish_rest` have it."""
     eval_episodes: int = 100
     """Episodes of a final evaluation."""
 
@@ -281,6 +288,13 @@ class Pipeline:
                 free_starts=noisy,
                 restarts=restarts,
                 adjusted=True,
+                rest=finish_rest(
+                    self.machine,
+                    demo,
+                    noisy,
+                    self.config.refine_horizon,
+                    self.config.refine_pieces,
+                ),
             )
 
         return jax.lax.map(one, (states.result_mean, states.result_cov, demos))

@@ -5,7 +5,13 @@ from dataclasses import dataclass, field, replace
 import jax
 import numpy as np
 
-from easi_jax.identify import Estimate, estimate, finish_pieces, finish_restarts
+from easi_jax.identify import (
+    Estimate,
+    estimate,
+    finish_pieces,
+    finish_rest,
+    finish_restarts,
+)
 from easi_jax.methods.task import Budget, Identified, Task
 from easi_jax.runtime import fast_loops
 from easi_jax.search import Search, SearchData
@@ -63,6 +69,9 @@ class Easi:
         longer = finish_pieces(
             task.machine, demonstrations, self.refine_horizon, self.refine_pieces
         )
+        rest = finish_rest(
+            task.machine, demonstrations, noisy, self.refine_horizon, self.refine_pieces
+        )
         restarts = self.restarts
         if restarts is None:
             restarts = finish_restarts(task.machine, noisy)
@@ -81,6 +90,7 @@ class Easi:
                 free_starts=noisy,
                 restarts=restarts,
                 adjusted=True,
+                rest=rest,
             )
 
         finish = jax.jit(result)(mean, cov)

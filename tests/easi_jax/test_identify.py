@@ -5,7 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from easi_jax.identify import _inverse, _near_zero, _posterior, finish_pieces
+from easi_jax.identify import (
+    _inverse,
+    _near_zero,
+    _posterior,
+    finish_pieces,
+    finish_rest,
+)
 from easi_jax.parameters import Parameter, ParameterSpace
 from easi_jax.segments import Segments
 from envs import make
@@ -157,3 +163,10 @@ def test_pieces_of_the_finish_suit_the_robot(
     # Single transitions, as where nothing is known of what came before.
     single = jax.tree.map(lambda x: x.reshape(1600, 1, *x.shape[2:]), demos)
     assert finish_pieces(machine, single).count == singles
+    # A larger robot's noisy recording counts as a whole in the end.
+    rest = finish_rest(machine, demos, noisy=True)
+    assert (rest is None) == (robot == "cartpole")
+    if rest is not None:
+        assert rest.horizon == steps and count < rest.count <= 10 * count
+    assert finish_rest(machine, demos, noisy=False) is None
+    assert finish_rest(machine, demos, True, 10, 7) is None

@@ -1,0 +1,138 @@
+"""A few last Gauss-Newton steps of a fit, on more pieces than it was found with.
+
+What makes a fit long, its many trials, jumps and restarts, has to find the valley; a
+tenth of a long recording shows where that is. How far along it the best place lies is a
+matter of all the data, and near it a few steps are enough.
+"""
+
+from dataclasses import replace
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from easi_jax.information import Normal, PairedFit
+from easi_jax.machine import Machine
+from easi_jax.parameters import ParameterSpace
+from easi_jax.refine import (
+    RefineResult,
+    balanced,
+    moved,
+    not_held_back,
+    raised_to_range,
+    step_weights,
+)
+from easi_jax.segments import Segments
+
+_LOOKS = 6  # at most: at the fit, then after each step
+_SETTLED = 0.01  # of the cost, that the next step is foretold to gain
+_STEPPING, _RAISING, _FINISHED = range(3)
+_PULL = 0.1  # information added to a unit coordinate, for what the data do not show
+_DAMPING = 1e-6  # of a step, relative to the information
+_FALLS_BY, _RISES_BY = 0.1, 1e4  # after a step that helped, and one that did not
+
+
+@flax.struct.dataclass
+class _Look:
+    """Where it looks, and the best place so far."""
+
+    k: jax.Array
+    phase: jax.Array
+    unit: jax.Array
+    starts: jax.Array
+    damping: jax.Array
+    best: tuple[jax.Array, jax.Array, Normal]  # parameters, starts, what is seen there
+    seen: jax.Array  # information at the place looked at last
+    cost: jax.Array
+
+
+def polish(
+    machine: Machine,
+    space: ParameterSpace,
+    fit: RefineResult,
+    segments: Segments,
+    noise: jax.Array,
+    mesh: Mesh | None = None,
+    misfit: jax.Array | None = None,
+) -> RefineResult:
+    """``fit`` after steps on ``segments``, starts free; pure, for use inside jit.
+
+    Args:
+        segments: those that count now, all M of them; ``fit`` may come from others.
+        noise: standard deviations of the measurement, ``(2 nv,)``, above zero.
+        misfit: as in `easi_jax.refine.refine`.
+
+    Returns:
+        The place of least cost among the fit's own, its starts as they were measured,
+        and those after each step; information, starts and costs, ``(6,)`` and infinite
+        where it had settled, are those of ``segments``.
+    """
+    paired = PairedFit(machine, space, segments, noise, mesh)
+    weight = step_weights(segments, noise, misfit)
+    low, high = space.unit_bounds
+    unmoved = jnp.zeros((segments.count, noise.shape[0]))
+
+    def going(c: _Look) -> jax.Array:
+        return c.phase < _FINISHED
+
+    def look(c: _Look) -> _Look:
+        eq = paired.normal(c.unit, c.starts, weight)
+        stepping = c.phase == _STEPPING
+        better = stepping & jnp.isfinite(eq.cost) & ~(eq.cost >= c.best[2].cost)
+        best = jax.tree.map(
+            lambda new, old: jnp.where(better, new, old),
+            (c.unit, c.starts, eq),
+            c.best,
+        )
+        damping = c.damping * jnp.where(better, _FALLS_BY, _RISES_BY)
+        at, starts, told = best
+        free = not_held_back(space, at, told.gradient)
+        scaled, scale = balanced(told.hessian + _PULL * jnp.eye(space.size), free)
+        lifted = scaled + damping * jnp.eye(space.size)
+        du = -scale * jnp.linalg.solve(lifted, scale * told.gradient)
+        new = jnp.clip(moved(space, at, du), low, high)
+        here = jnp.arange(_LOOKS) == c.k
+        follow = starts + told.start_step + told.start_gain @ (new - at)
+        gain = -0.5 * jnp.where(free, told.gradient, 0.0) @ du
+        done = ~stepping | (better & (gain < _SETTLED)) | (c.k + 1 >= _LOOKS)
+        raised = raised_to_range(space, at)
+        below = (raised != at).any() & stepping
+        over = jnp.where(below, _RAISING, _FINISHED)
+        return _Look(
+            k=c.k + 1,
+            phase=jnp.where(done, over, _STEPPING),
+            unit=jnp.where(done, raised, new),
+            starts=jnp.where(done, starts, follow),
+            damping=damping,
+            best=best,
+            seen=eq.hessian,
+            cost=jnp.where(here & stepping, eq.cost, c.cost),
+        )
+
+    like = jax.eval_shape(paired.normal, fit.unit, unmoved, weight)
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    nothing = replace(nothing, cost=jnp.asarray(jnp.inf))
+    begin = _Look(
+        k=jnp.asarray(0),
+        phase=jnp.asarray(_STEPPING),
+        unit=fit.unit,
+        starts=unmoved,
+        damping=jnp.asarray(_DAMPING),
+        best=(fit.unit, unmoved, nothing),
+        seen=nothing.hessian,
+        cost=jnp.full(_LOOKS, jnp.inf),
+    )
+    end = jax.lax.while_loop(going, look, begin)
+    unit, starts, told = end.best
+    raised = raised_to_range(space, unit)
+    whole = paired.points * segments.count * segments.horizon
+    return RefineResult(
+        unit=unit,
+        hessian=told.hessian,
+        cost=end.cost,
+        delta=starts,
+        raised=raised,
+        raised_hessian=jnp.where((raised != unit).any(), end.seen, told.hessian),
+        simulated=fit.simulated + 1.0 * whole * end.k,
+    )

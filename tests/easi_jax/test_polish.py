@@ -1,0 +1,111 @@
+"""A fit on few pieces ends where all of them have it."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from easi_jax.machine import Machine
+from easi_jax.polish import polish
+from easi_jax.refine import RefineResult, refine
+from easi_jax.rollout import measured
+from easi_jax.segments import Segments, windows
+from envs.cartpole import Cartpole
+
+NOISE = jnp.array([5e-4, 2e-3, 1e-2, 2e-2])
+# None that may be as good as zero: on a logarithmic scale that takes many steps.
+NAMES = ["pole_length", "pole_armature", "cart_kp", "cart_kv", "cart_force_limit"]
+
+
+@pytest.fixture(scope="module")
+def problem(cartpole: Cartpole, trajectories: Segments) -> Any:
+    space = cartpole.space.select(NAMES)
+    machine = Machine(cartpole.mj_model, space, cartpole.dt)
+    noisy = measured(trajectories, NOISE, jax.random.key(3))
+    return machine, space, windows(noisy, 10, 10)
+
+
+@pytest.fixture(scope="module")
+def run(problem: Any) -> Any:
+    machine, space, _ = problem
+
+    @jax.jit
+    def run(fit: RefineResult, segments: Segments) -> RefineResult:
+        return polish(machine, space, fit, segments, NOISE)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def fits(problem: Any) -> tuple[RefineResult, RefineResult]:
+    """On a quarter of the pieces, and on all."""
+    machine, space, pieces = problem
+    start = space.to_unit(1.2 * jnp.asarray(space.nominal))
+
+    def fitted(pieces: Segments) -> RefineResult:
+        return jax.jit(
+            lambda u: refine(machine, space, u, pieces, NOISE, iterations=20)
+        )(start)
+
+    return fitted(pieces.spread(32)), fitted(pieces)
+
+
+def far(a: RefineResult, b: RefineResult) -> float:
+    """In standard deviations of what all pieces say."""
+    off = np.asarray(a.unit - b.unit)
+    return float(np.sqrt(off @ np.asarray(b.hessian) @ off))
+
+
+def test_few_pieces_end_where_all_have_it(problem: Any, run: Any, fits: Any) -> None:
+    few, known = fits
+    found = run(few, problem[2])
+    assert far(few, known) > 2.0
+    assert far(found, known) < 0.5
+    assert float(found.cost.min()) == pytest.approx(float(known.cost[-1]), rel=1e-3)
+    np.testing.assert_allclose(
+        np.diag(np.asarray(found.hessian)),
+        np.diag(np.asarray(known.hessian)),
+        rtol=0.1,
+    )
+    assert found.delta.shape == known.delta.shape
+    assert looks(problem, found, few) == np.isfinite(found.cost).sum() < 6
+    assert (found.raised == found.unit).all()
+    assert (found.raised_hessian == found.hessian).all()
+
+
+def looks(problem: Any, found: RefineResult, begun: RefineResult) -> float:
+    _, space, pieces = problem
+    whole = (1 + space.size + 4) * pieces.count * pieces.horizon
+    return float(found.simulated - begun.simulated) / whole
+
+
+def test_information_of_what_is_below_its_range_is_that_at_its_low_end(
+    problem: Any, run: Any, fits: Any
+) -> None:
+    pieces = problem[2]
+    begun = replace(fits[0], unit=fits[0].unit.at[1].set(-1.5))
+    # Nothing counts, so nothing moves but what is looked at.
+    still = replace(pieces, weight=pieces.weight.at[1:].set(0.0))
+    found = run(begun, still)
+    if not (found.unit < 0).any():
+        pytest.fail("the step led back into the range")
+    assert looks(problem, found, begun) == 1 + np.isfinite(found.cost).sum()
+    np.testing.assert_array_equal(found.raised, jnp.maximum(found.unit, 0.0))
+    assert (found.raised_hessian != found.hessian).any()
+
+
+@pytest.mark.fault("simulations that explode, parameters at absurd corners")
+def test_a_step_that_fits_worse_is_not_taken(problem: Any, run: Any, fits: Any) -> None:
+    """From far off, or past a piece that explodes, the result is never worse."""
+    _, space, pieces = problem
+    corner = jnp.where(jnp.arange(space.size) % 2, 0.02, 0.98)
+    broken = replace(pieces, next_qvel=pieces.next_qvel.at[3].set(jnp.nan))
+    for given in (pieces, broken):
+        found = run(replace(fits[0], unit=corner), given)
+        assert np.isfinite(found.unit).all() and np.isfinite(found.hessian).all()
+        assert float(found.cost.min()) <= float(found.cost[0])
+        best = int(np.argmin(found.cost))
+        assert (best == 0) == bool((found.unit == corner).all())
