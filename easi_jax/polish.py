@@ -25,7 +25,7 @@ from easi_jax.refine import (
 )
 from easi_jax.segments import Segments
 
-_LOOKS = 6  # at most: at the fit, then after each step
+_LOOKS = 8  # at most: at the fit, then after each step
 _SETTLED = 0.01  # of the cost, that the next step is foretold to gain
 _STEPPING, _RAISING, _FINISHED = range(3)
 _PULL = 0.1  # information added to a unit coordinate, for what the data do not show
@@ -65,7 +65,7 @@ def polish(
 
     Returns:
         The place of least cost among the fit's own, its starts as they were measured,
-        and those after each step; information, starts and costs, ``(6,)`` and infinite
+        and those after each step; information, starts and costs, ``(8,)`` and infinite
         where it had settled, are those of ``segments``.
     """
     paired = PairedFit(machine, space, segments, noise, mesh)

@@ -17,7 +17,7 @@ from envs.cartpole import Cartpole
 
 NOISE = jnp.array([5e-4, 2e-3, 1e-2, 2e-2])
 # None that may be as good as zero: on a logarithmic scale that takes many steps.
-NAMES = ["pole_length", "pole_armature", "cart_kp", "cart_kv", "cart_force_limit"]
+NAMES = ["pole_armature", "cart_kp", "cart_kv", "cart_force_limit", "cart_speed_limit"]
 
 
 @pytest.fixture(scope="module")
@@ -45,12 +45,13 @@ def fits(problem: Any) -> tuple[RefineResult, RefineResult]:
     machine, space, pieces = problem
     start = space.to_unit(1.2 * jnp.asarray(space.nominal))
 
+    @jax.jit
     def fitted(pieces: Segments) -> RefineResult:
-        return jax.jit(
-            lambda u: refine(machine, space, u, pieces, NOISE, iterations=20)
-        )(start)
+        return refine(machine, space, start, pieces, NOISE, iterations=20)
 
-    return fitted(pieces.spread(32)), fitted(pieces)
+    part = jnp.arange(pieces.count) % 4 == 0
+    few = replace(pieces, weight=pieces.weight * part)
+    return fitted(few), fitted(pieces)
 
 
 def far(a: RefineResult, b: RefineResult) -> float:
@@ -71,7 +72,7 @@ def test_few_pieces_end_where_all_have_it(problem: Any, run: Any, fits: Any) -> 
         rtol=0.1,
     )
     assert found.delta.shape == known.delta.shape
-    assert looks(problem, found, few) == np.isfinite(found.cost).sum() < 6
+    assert looks(problem, found, few) == np.isfinite(found.cost).sum() < 8
     assert (found.raised == found.unit).all()
     assert (found.raised_hessian == found.hessian).all()
 
@@ -87,11 +88,10 @@ def test_information_of_what_is_below_its_range_is_that_at_its_low_end(
 ) -> None:
     pieces = problem[2]
     begun = replace(fits[0], unit=fits[0].unit.at[1].set(-1.5))
-    # Nothing counts, so nothing moves but what is looked at.
-    still = replace(pieces, weight=pieces.weight.at[1:].set(0.0))
+    # So little counts that it stays there.
+    still = replace(pieces, weight=1e-8 * pieces.weight)
     found = run(begun, still)
-    if not (found.unit < 0).any():
-        pytest.fail("the step led back into the range")
+    assert float(found.unit[1]) == pytest.approx(-1.5, abs=0.1)
     assert looks(problem, found, begun) == 1 + np.isfinite(found.cost).sum()
     np.testing.assert_array_equal(found.raised, jnp.maximum(found.unit, 0.0))
     assert (found.raised_hessian != found.hessian).any()
