@@ -24,10 +24,10 @@ from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
 from easi_jax.refine import (
     EDGE,
-    balanced,
     beyond_edge,
     jumps,
     moved,
+    newton_step,
     not_held_back,
     raised_to_range,
     step_weights,
@@ -227,8 +227,7 @@ def adjust(
         """The step, and what is left."""
         a = s.gradient - s.bias
         free = not_held_back(space, u, a) & ~held
-        lifted, scale = balanced(s.hessian + _PULL * jnp.eye(space.size), free)
-        step = -scale * jnp.linalg.solve(lifted, scale * a)
+        step = newton_step(s.hessian + _PULL * jnp.eye(space.size), a, free)
         left = -0.5 * a @ step
         return step, jnp.where(jnp.isfinite(left), left, jnp.inf)
 

@@ -17,8 +17,8 @@ from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
 from easi_jax.refine import (
     RefineResult,
-    balanced,
     moved,
+    newton_step,
     not_held_back,
     raised_to_range,
     step_weights,
@@ -88,13 +88,12 @@ def polish(
         damping = c.damping * jnp.where(better, _FALLS_BY, _RISES_BY)
         at, starts, told = best
         free = not_held_back(space, at, told.gradient)
-        scaled, scale = balanced(told.hessian + _PULL * jnp.eye(space.size), free)
-        lifted = scaled + damping * jnp.eye(space.size)
-        du = -scale * jnp.linalg.solve(lifted, scale * told.gradient)
+        held = told.hessian + _PULL * jnp.eye(space.size)
+        du = newton_step(held, told.gradient, free, damping)
         new = jnp.clip(moved(space, at, du), low, high)
         here = jnp.arange(_LOOKS) == c.k
         follow = starts + told.start_step + told.start_gain @ (new - at)
-        gain = -0.5 * jnp.where(free, told.gradient, 0.0) @ du
+        gain = -0.5 * told.gradient @ du
         done = ~stepping | (better & (gain < _SETTLED)) | (c.k + 1 >= _LOOKS)
         raised = raised_to_range(space, at)
         below = (raised != at).any() & stepping

@@ -212,11 +212,10 @@ def refine(
         slope = jax.jvp(away, (u,), (jnp.ones(n),))[1]
         grad = eq.gradient + pull * slope * away(u)
         hess = eq.hessian + jnp.diag(pull * slope**2 + _TINY)
-        scaled, scale = balanced(hess, not_held_back(space, u, grad))
+        free = not_held_back(space, u, grad)
 
         def trial(damp: jax.Array) -> tuple[jax.Array, jax.Array]:
-            lifted = scaled + damp * jnp.eye(n)
-            du = -scale * jnp.linalg.solve(lifted, scale * grad)
+            du = newton_step(hess, grad, free, damp)
             new = jnp.clip(moved(space, u, du), low, high)
             return new, jnp.einsum("mdn,n->md", eq.start_gain, new - u)
 
@@ -477,6 +476,19 @@ def balanced(hessian: jax.Array, free: jax.Array) -> tuple[jax.Array, jax.Array]
     scale = jnp.where(free, 1.0 / jnp.sqrt(jnp.diag(hessian)), 0.0)
     rest = jnp.diag(jnp.where(free, 0.0, 1.0))
     return hessian * scale[:, None] * scale + rest, scale
+
+
+def newton_step(
+    hessian: jax.Array,
+    gradient: jax.Array,
+    free: jax.Array,
+    damping: float | jax.Array = 0.0,
+) -> jax.Array:
+    """Levenberg-Marquardt step of the `balanced` system, ``(n,)``; zero where not
+    ``free``."""
+    scaled, scale = balanced(hessian, free)
+    lifted = scaled + damping * jnp.eye(len(gradient))
+    return -scale * jnp.linalg.solve(lifted, scale * gradient)
 
 
 def moved(space: ParameterSpace, unit: jax.Array, du: jax.Array) -> jax.Array:
