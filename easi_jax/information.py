@@ -40,14 +40,15 @@ class Normal:
     Attributes:
         hessian: ``(n, n)``, information in unit coordinates.
         gradient: ``(n,)``.
-        cost: half the weighted squared error, ``()``.
+        costs: half the weighted squared error of each piece, ``(M,)``; inf where the
+            simulation is not finite, which leaves no other trace here.
         start_step: ``(M, 2 nv)`` correction of each start at zero parameter step.
         start_gain: ``(M, 2 nv, n)``: correction per unit of parameter step.
     """
 
     hessian: jax.Array
     gradient: jax.Array
-    cost: jax.Array
+    costs: jax.Array
     start_step: jax.Array
     start_gain: jax.Array
 
@@ -161,7 +162,7 @@ class PairedFit:
         jw = jw.reshape(rw.shape[0], -1)
         a, b = jw[:, :n], jw[:, n:]
         hess, grad = a.T @ a, a.T @ rw
-        cost = 0.5 * (rw @ rw + jnp.sum((d / noise) ** 2))
+        cost = self._cost(r, d, w)
         if not self.free_starts:
             return hess, grad, cost, jnp.zeros(nv2), jnp.zeros((nv2, n))
         # The start was measured too: its own shift costs d / noise.
@@ -173,7 +174,7 @@ class PairedFit:
 
     def _summed(self, parts: Any) -> Normal:
         hess, grad, cost, step, gain = parts
-        return Normal(hess.sum(0), grad.sum(0), cost.sum(), step, gain)
+        return Normal(hess.sum(0), grad.sum(0), cost, step, gain)
 
     def _cost(self, r: jax.Array, d: jax.Array, w: jax.Array) -> jax.Array:
         square = jnp.where(w > 0, w * (r / self.noise) ** 2, 0.0).sum()
@@ -181,7 +182,7 @@ class PairedFit:
         return jnp.where(jnp.isfinite(total), total, jnp.inf)
 
     def costs(self, unit: jax.Array, delta: jax.Array, weight: jax.Array) -> jax.Array:
-        """The cost of `normal`, piece by piece and for several points at once.
+        """The costs of `normal`, for several points at once.
 
         Args:
             unit: ``(K, n)``.

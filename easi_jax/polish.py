@@ -5,8 +5,6 @@ tenth of a long recording shows where that is. How far along it the best place l
 matter of all the data, and near it a few steps are enough.
 """
 
-from dataclasses import replace
-
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -43,6 +41,8 @@ class _Look:
     starts: jax.Array
     damping: jax.Array
     best: tuple[jax.Array, jax.Array, Normal]  # parameters, starts, what is seen there
+    used: jax.Array  # pieces that the simulation gets through at the fit
+    least: jax.Array  # cost of the best place
     seen: jax.Array  # information at the place looked at last
     cost: jax.Array
 
@@ -66,7 +66,9 @@ def polish(
     Returns:
         The place of least cost among the fit's own, its starts as they were measured,
         and those after each step; information, starts and costs, ``(8,)`` and infinite
-        where it had settled, are those of ``segments``.
+        where it had settled, are those of ``segments``. A piece that the simulation
+        does not get through at ``fit`` counts nothing; at a place where one of the
+        others explodes the cost is infinite.
     """
     paired = PairedFit(machine, space, segments, noise, mesh)
     weight = step_weights(segments, noise, misfit)
@@ -77,9 +79,11 @@ def polish(
         return c.phase < _FINISHED
 
     def look(c: _Look) -> _Look:
-        eq = paired.normal(c.unit, c.starts, weight)
+        eq = paired.normal(c.unit, c.starts, weight * c.used[:, None, None])
         stepping = c.phase == _STEPPING
-        better = stepping & jnp.isfinite(eq.cost) & ~(eq.cost >= c.best[2].cost)
+        used = jnp.where(c.k == 0, jnp.isfinite(eq.costs), c.used)
+        cost = jnp.where(used, eq.costs, 0.0).sum()
+        better = stepping & ((c.k == 0) | (cost < c.least))
         best = jax.tree.map(
             lambda new, old: jnp.where(better, new, old),
             (c.unit, c.starts, eq),
@@ -105,13 +109,14 @@ def polish(
             starts=jnp.where(done, starts, follow),
             damping=damping,
             best=best,
+            used=used,
+            least=jnp.where(better, cost, c.least),
             seen=eq.hessian,
-            cost=jnp.where(here & stepping, eq.cost, c.cost),
+            cost=jnp.where(here & stepping, cost, c.cost),
         )
 
     like = jax.eval_shape(paired.normal, fit.unit, unmoved, weight)
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-    nothing = replace(nothing, cost=jnp.asarray(jnp.inf))
     begin = _Look(
         k=jnp.asarray(0),
         phase=jnp.asarray(_STEPPING),
@@ -119,6 +124,8 @@ def polish(
         starts=unmoved,
         damping=jnp.asarray(_DAMPING),
         best=(fit.unit, unmoved, nothing),
+        used=jnp.ones(segments.count, bool),
+        least=jnp.asarray(jnp.inf),
         seen=nothing.hessian,
         cost=jnp.full(_LOOKS, jnp.inf),
     )

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import easi_jax.polish as module
+from easi_jax.information import PairedFit
 from easi_jax.machine import Machine
 from easi_jax.polish import polish
 from easi_jax.refine import RefineResult, refine
@@ -109,3 +111,30 @@ def test_a_step_that_fits_worse_is_not_taken(problem: Any, run: Any, fits: Any) 
         assert float(found.cost.min()) <= float(found.cost[0])
         best = int(np.argmin(found.cost))
         assert (best == 0) == bool((found.unit == corner).all())
+
+
+@pytest.mark.fault("simulations that explode beyond a place that fits better")
+def test_a_step_that_makes_pieces_explode_is_not_taken(
+    problem: Any, fits: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fewer pieces would cost less; those lost at the fit itself count nowhere."""
+    machine, space, pieces = problem
+    few, known = fits
+    gap = few.unit - known.unit
+    wall = 0.5 * (few.unit + known.unit)
+
+    class Walled(PairedFit):
+        def _residual(self, unit: jax.Array, d: jax.Array, s: Segments) -> jax.Array:
+            r = super()._residual(unit, d, s)
+            beyond = (unit - wall) @ gap < 0
+            gone = jnp.where(beyond, s.qvel[0] > 0, s.qpos[0] > far_right)
+            return jnp.where(gone, jnp.nan, r)
+
+    far_right = float(np.quantile(pieces.qpos[:, 0], 0.9))
+    monkeypatch.setattr(module, "PairedFit", Walled)
+    found = jax.jit(lambda fit: polish(machine, space, fit, pieces, NOISE))(few)
+    assert (found.unit - wall) @ gap >= 0
+    assert np.isinf(found.cost[1]), "the first step leads beyond the wall"
+    assert np.isfinite(found.cost[0]) and float(found.cost.min()) < float(found.cost[0])
+    lost = np.asarray(pieces.qpos[:, 0]) > far_right
+    assert 0 < lost.sum() < pieces.count and (np.asarray(found.delta)[lost] == 0).all()
