@@ -79,8 +79,8 @@ def _case(
     import numpy as np
 
     from benchmarks._common import write_result
+    from easi_jax import identify
     from easi_jax.heldout import relative_errors
-    from easi_jax.identify import estimate, finish_pieces
     from easi_jax.information import describe, identifiability
     from easi_jax.machine import Machine
     from easi_jax.rollout import collect, measured
@@ -125,8 +125,8 @@ def _case(
 
     @jax.jit
     def finish(mean: jax.Array, cov: jax.Array, demos: Any) -> Any:
-        pieces = finish_pieces(machine, demos)
-        return estimate(machine, search.space, mean, cov, pieces, deviation, True)
+        given = machine, search.space, mean, cov, demos, deviation, noisy
+        return identify.finish(*given, refined=True)
 
     @jax.jit
     def errors(mean: jax.Array, key: jax.Array) -> Any:

@@ -95,11 +95,6 @@ def finish_rest(
     return whole if whole.count > part.count else None
 
 
-def finish_restarts(machine: Machine, noisy: bool) -> int:
-    """More starts of the least-squares finish, where a user does not say."""
-    return RESTARTS if noisy and not machine.wide else 0
-
-
 def effective_noise(
     machine: Machine, segments: Segments, noise: jax.Array
 ) -> jax.Array:
@@ -188,6 +183,49 @@ def estimate(
         cost=cost,
         delta=delta,
         simulated=simulated,
+    )
+
+
+def finish(
+    machine: Machine,
+    space: ParameterSpace,
+    mean: jax.Array,
+    cov: jax.Array,
+    trajectories: Segments,
+    noise: jax.Array,
+    noisy: bool,
+    refined: bool,
+    informed: bool = True,
+    mesh: Mesh | None = None,
+    restarts: int | None = None,
+    steps: int | None = None,
+    most: int | None = None,
+) -> Estimate:
+    """`estimate` from whole trajectories ``(B, T, 1, ...)``; pure, for use inside jit.
+
+    Args:
+        noisy: whether any of ``noise (2 nv,)`` is above zero; otherwise starts are
+            exact.
+        refined, informed: as in `estimate`.
+        restarts: more starts; not given: `RESTARTS` with noise, none for larger robots.
+        steps, most: as in `finish_pieces` and `finish_rest`.
+    """
+    if restarts is None:
+        restarts = RESTARTS if noisy and not machine.wide else 0
+    return estimate(
+        machine,
+        space,
+        mean,
+        cov,
+        finish_pieces(machine, trajectories, steps, most),
+        noise,
+        refined,
+        informed,
+        mesh,
+        free_starts=noisy,
+        restarts=restarts,
+        adjusted=True,
+        rest=finish_rest(machine, trajectories, noisy, steps, most),
     )
 
 

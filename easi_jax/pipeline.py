@@ -16,13 +16,7 @@ from jax.sharding import Mesh
 from easi_jax import distribution
 from easi_jax.distribution import Distribution
 from easi_jax.errors import UserError, nearest
-from easi_jax.identify import (
-    Estimate,
-    estimate,
-    finish_pieces,
-    finish_rest,
-    finish_restarts,
-)
+from easi_jax.identify import Estimate, finish, finish_pieces
 from easi_jax.mesh import make_mesh, sharded_map
 from easi_jax.parameters import ParameterSpace
 from easi_jax.rl.config import SacConfig
@@ -267,34 +261,24 @@ class Pipeline:
 
     def estimate(self, states: SearchState, demos: Segments) -> Estimate:
         """Results of searches, refined where asked, ``(S, ...)``."""
-
-        noisy = any(x > 0 for x in self.config.noise)
-        restarts = self.config.restarts
-        if restarts is None:
-            restarts = finish_restarts(self.machine, noisy)
+        c = self.config
 
         def one(item: Any) -> Estimate:
             mean, cov, demo = item
-            return estimate(
+            return finish(
                 self.machine,
                 self.space,
                 mean,
                 cov,
-                self.pieces(demo),
+                demo,
                 self.noise,
-                self.config.refine,
-                self.config.search.informed_spread,
+                any(x > 0 for x in c.noise),
+                c.refine,
+                c.search.informed_spread,
                 self.mesh,
-                free_starts=noisy,
-                restarts=restarts,
-                adjusted=True,
-                rest=finish_rest(
-                    self.machine,
-                    demo,
-                    noisy,
-                    self.config.refine_horizon,
-                    self.config.refine_pieces,
-                ),
+                c.restarts,
+                c.refine_horizon,
+                c.refine_pieces,
             )
 
         return jax.lax.map(one, (states.result_mean, states.result_cov, demos))

@@ -5,13 +5,7 @@ from dataclasses import dataclass, field, replace
 import jax
 import numpy as np
 
-from easi_jax.identify import (
-    Estimate,
-    estimate,
-    finish_pieces,
-    finish_rest,
-    finish_restarts,
-)
+from easi_jax.identify import Estimate, finish
 from easi_jax.methods.task import Budget, Identified, Task
 from easi_jax.runtime import fast_loops
 from easi_jax.search import Search, SearchData
@@ -66,35 +60,26 @@ class Easi:
         mean, cov, *trace = jax.jit(found, compiler_options=fast_loops())(
             key, task.policy
         )
-        longer = finish_pieces(
-            task.machine, demonstrations, self.refine_horizon, self.refine_pieces
-        )
-        rest = finish_rest(
-            task.machine, demonstrations, noisy, self.refine_horizon, self.refine_pieces
-        )
-        restarts = self.restarts
-        if restarts is None:
-            restarts = finish_restarts(task.machine, noisy)
 
-        def result(mean: jax.Array, cov: jax.Array) -> Estimate:
-            return estimate(
+        def result(mean: jax.Array, cov: jax.Array, runs: Segments) -> Estimate:
+            return finish(
                 task.machine,
                 search.space,
                 mean,
                 cov,
-                longer,
+                runs,
                 noise,
+                noisy,
                 self.refine,
                 c.informed_spread,
                 task.mesh,
-                free_starts=noisy,
-                restarts=restarts,
-                adjusted=True,
-                rest=rest,
+                self.restarts,
+                self.refine_horizon,
+                self.refine_pieces,
             )
 
-        finish = jax.jit(result)(mean, cov)
-        simulated = rounds * c.population * steps + round(float(finish.simulated))
+        out = jax.jit(result)(mean, cov, demonstrations)
+        simulated = rounds * c.population * steps + round(float(out.simulated))
         return Identified(
-            finish.distribution, search.space, simulated, trace=(trace[0], trace[1])
+            out.distribution, search.space, simulated, trace=(trace[0], trace[1])
         )
