@@ -105,6 +105,8 @@ class Predictor:
         self._scalar = scalar_places(m).T
         self._mesh = make_mesh()
         self.blocks = -(-len(windows) // BLOCK)
+        # By powers of two, so that the program of one log often serves the next.
+        self._room = 1 << (self.blocks - 1).bit_length()
         self._data = self._placed(windows)
         latest = sum(
             max((c.high for c in layout.columns if c.field == name), default=0.0)
@@ -126,14 +128,14 @@ class Predictor:
 
     def _placed(self, windows: WindowSet) -> tuple[jax.Array, ...]:
         """The windows in blocks, on all devices; the last is repeated to fill them."""
-        fill = np.minimum(np.arange(self.blocks * BLOCK), len(windows) - 1)
+        fill = np.minimum(np.arange(self._room * BLOCK), len(windows) - 1)
         padded = windows.take(fill)
         read = padded.read
         read = np.where(self.wrapped, np.unwrap(read, axis=1), read)
         whole = NamedSharding(self._mesh, PartitionSpec())
 
         def blocks(x: np.ndarray) -> jax.Array:
-            shape = (self.blocks, BLOCK, *x.shape[1:])
+            shape = (self._room, BLOCK, *x.shape[1:])
             return jax.device_put(np.asarray(x, np.float32).reshape(shape), whole)
 
         return tuple(
@@ -158,7 +160,7 @@ class Predictor:
     @property
     def capacity(self) -> int:
         """Windows that the compiled program has room for."""
-        return self.blocks * BLOCK
+        return self._room * BLOCK
 
     def on(self, windows: WindowSet) -> "Predictor":
         """The same predictions of other windows, by the program that is compiled.
@@ -178,6 +180,7 @@ class Predictor:
         self._program(False)
         other = copy.copy(self)
         other.windows = windows
+        other.blocks = -(-len(windows) // BLOCK)
         other._data = other._placed(windows)
         return other
 
@@ -216,7 +219,9 @@ class Predictor:
                 np.zeros(batch, np.int32),
                 np.zeros((batch, BLOCK, 2 * self.nv), np.float32),
             )
-            lowered = [p.lower(*like, *self._data) for p in self._programs]
+            # Where no drive can have play, the first alone.
+            programs = self._programs[: 1 + (len(self._width) > 0)]
+            lowered = [p.lower(*like, *self._data) for p in programs]
             self._compiled = [started(p.compile) for p in lowered]
         return self._compiled[play]()
 
