@@ -36,7 +36,7 @@ class GapFirst:
 
     xml: str
     """The model, MJCF."""
-    time_limit: float = 3600.0
+    time_limit: float = 14400.0
     """Of train.gap [s]."""
 
     def fit(
