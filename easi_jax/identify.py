@@ -66,15 +66,26 @@ def finish_pieces(
     Args:
         steps: control steps of a piece, cut to those of a trajectory; not given: 25,
             or a quarter of a second for larger robots.
-        most: pieces at most; not given: all, or for larger robots as many control
-            steps as 64 of the usual length have.
+        most: pieces at most; not given: as `few` has it.
     """
-    usual = max(1, round(_WIDE_SECONDS / machine.dt)) if machine.wide else _STEPS
+    usual = _usual(machine) if machine.wide else _STEPS
     steps = max(1, min(steps or usual, trajectories.weight.shape[1]))
     found = windows(trajectories, steps, steps + 1, machine.past_steps)
     if most is None:
-        most = _WIDE_PIECES * usual // steps if machine.wide else found.count
+        return few(machine, found)
     return found.spread(most) if most < found.count else found
+
+
+def few(machine: Machine, pieces: Segments) -> Segments:
+    """Some of ``pieces``, with which the many trials of a fit do not take hours: all,
+    or of a larger robot's as many control steps as 64 of a quarter of a second have."""
+    most = max(1, _WIDE_PIECES * _usual(machine) // pieces.horizon)
+    return pieces.spread(most) if machine.wide and most < pieces.count else pieces
+
+
+def _usual(machine: Machine) -> int:
+    """Control steps of a larger robot's piece."""
+    return max(1, round(_WIDE_SECONDS / machine.dt))
 
 
 def finish_rest(
@@ -139,7 +150,6 @@ def estimate(
     be as good as zero is stated as `_near_zero` says.
     """
     assumed = effective_noise(machine, pieces, noise)
-    n = space.size
     if refined:
         fit = refine(
             machine,
@@ -158,24 +168,22 @@ def estimate(
             given = machine, space, fit.unit, pieces, assumed, mesh, misfit
             fit = _adjusted(fit, adjust(*given))
         if rest is not None:
-            fit = polish(machine, space, fit, rest, assumed, mesh, misfit)
-        center, hessian = fit.unit, fit.hessian
-        cost, delta, simulated = fit.cost, fit.delta, fit.simulated
+            more = polish(machine, space, fit.unit, rest, assumed, mesh, misfit)
+            fit = replace(more, simulated=fit.simulated + more.simulated)
+        center, spread = _stated(space, fit)
+        hessian, cost, delta = fit.hessian, fit.cost, fit.delta
+        simulated = fit.simulated
     else:
         weight = step_weights(pieces, assumed, misfit)
         zero = jnp.zeros((pieces.count, len(noise)))
         paired = PairedFit(machine, space, pieces, assumed, mesh, free_starts)
         eq = paired.normal(mean, zero, weight)
-        center, hessian = mean, eq.hessian
-        cost, delta = jnp.zeros(0), eq.start_step
+        open_cov, seen, _ = _posterior(eq.hessian)
+        center, spread = mean, open_cov + seen @ cov @ seen.T
+        hessian, cost, delta = eq.hessian, jnp.zeros(0), eq.start_step
         simulated = jnp.asarray(1.0 * paired.points * pieces.count * pieces.horizon)
-    open_cov, seen, _ = _posterior(hessian)
-    own = jnp.zeros((n, n)) if refined else seen @ cov @ seen.T
-    if refined:
-        raised_cov, _, shown = _posterior(fit.raised_hessian)
-        center, open_cov = _near_zero(space, center, fit.raised, raised_cov, shown)
     return Estimate(
-        distribution=gaussian(space, center, open_cov + own if informed else cov),
+        distribution=gaussian(space, center, spread if informed else cov),
         search_mean=mean,
         search_cov=cov,
         hessian=hessian,
@@ -184,6 +192,41 @@ def estimate(
         delta=delta,
         simulated=simulated,
     )
+
+
+def polished(
+    machine: Machine,
+    space: ParameterSpace,
+    found: Estimate,
+    rest: Segments,
+    informed: bool = True,
+    mesh: Mesh | None = None,
+    misfit: jax.Array | None = None,
+) -> Estimate:
+    """A refined estimate after `easi_jax.polish` on ``rest``; pure.
+
+    Args:
+        rest: pieces of the whole recording, R of them: cost, corrections of starts
+            ``(R, 2 nv)`` and information are theirs.
+        informed, misfit: as in `estimate`.
+    """
+    center = found.distribution.mean
+    fit = polish(machine, space, center, rest, found.noise, mesh, misfit)
+    center, cov = _stated(space, fit)
+    return replace(
+        found,
+        distribution=gaussian(space, center, cov if informed else found.search_cov),
+        hessian=fit.hessian,
+        cost=fit.cost,
+        delta=fit.delta,
+        simulated=found.simulated + fit.simulated,
+    )
+
+
+def _stated(space: ParameterSpace, fit: RefineResult) -> tuple[jax.Array, jax.Array]:
+    """Mean and covariance of a fit, unit coordinates."""
+    cov, _, shown = _posterior(fit.raised_hessian)
+    return _near_zero(space, fit.unit, fit.raised, cov, shown)
 
 
 def finish(

@@ -50,16 +50,17 @@ class _Look:
 def polish(
     machine: Machine,
     space: ParameterSpace,
-    fit: RefineResult,
+    unit: jax.Array,
     segments: Segments,
     noise: jax.Array,
     mesh: Mesh | None = None,
     misfit: jax.Array | None = None,
 ) -> RefineResult:
-    """``fit`` after steps on ``segments``, starts free; pure, for use inside jit.
+    """A fit ``unit (n,)`` after steps on ``segments``, starts free; pure, for use
+    inside jit.
 
     Args:
-        segments: those that count now, all M of them; ``fit`` may come from others.
+        segments: those that count now, all M of them; the fit may come from others.
         noise: standard deviations of the measurement, ``(2 nv,)``, above zero.
         misfit: as in `easi_jax.refine.refine`.
 
@@ -67,12 +68,13 @@ def polish(
         The place of least cost among the fit's own, its starts as they were measured,
         and those after each step; information, starts and costs, ``(8,)`` and infinite
         where it had settled, are those of ``segments``. A piece that the simulation
-        does not get through at ``fit`` counts nothing; at a place where one of the
+        does not get through at ``unit`` counts nothing; at a place where one of the
         others explodes the cost is infinite.
     """
     paired = PairedFit(machine, space, segments, noise, mesh)
     weight = step_weights(segments, noise, misfit)
     low, high = space.unit_bounds
+    given = unit
     unmoved = jnp.zeros((segments.count, noise.shape[0]))
 
     def going(c: _Look) -> jax.Array:
@@ -115,15 +117,15 @@ def polish(
             cost=jnp.where(here & stepping, cost, c.cost),
         )
 
-    like = jax.eval_shape(paired.normal, fit.unit, unmoved, weight)
+    like = jax.eval_shape(paired.normal, given, unmoved, weight)
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
     begin = _Look(
         k=jnp.asarray(0),
         phase=jnp.asarray(_STEPPING),
-        unit=fit.unit,
+        unit=given,
         starts=unmoved,
         damping=jnp.asarray(_DAMPING),
-        best=(fit.unit, unmoved, nothing),
+        best=(given, unmoved, nothing),
         used=jnp.ones(segments.count, bool),
         least=jnp.asarray(jnp.inf),
         seen=nothing.hessian,
@@ -140,5 +142,5 @@ def polish(
         delta=starts,
         raised=raised,
         raised_hessian=jnp.where((raised != unit).any(), end.seen, told.hessian),
-        simulated=fit.simulated + 1.0 * whole * end.k,
+        simulated=1.0 * whole * end.k,
     )

@@ -10,6 +10,7 @@ from train._log_problem import FINISH, Problem, read_problem
 
 _STEPS = 500_000  # physics steps in a generation that are worth their time
 _PASSES = 3  # of the finish: the model's own error is learned from the one before
+_ENDINGS = 2  # of a larger robot's, on all pieces
 _ROBUST = 12  # rounds of the first pass; later ones know which pieces fit badly
 _OUTLIER = 2.5  # times the median error: windows beyond it weigh less
 
@@ -133,7 +134,7 @@ def _ready_finish(
     import numpy as np
 
     from easi_jax import distributed, replay
-    from easi_jax.identify import effective_noise, estimate
+    from easi_jax.identify import effective_noise, estimate, few, polished
     from easi_jax.information import shift_start
     from easi_jax.log_data import misfit_of, outlier_weights, segments_from_runs
     from easi_jax.runtime import quick_compile
@@ -145,8 +146,10 @@ def _ready_finish(
     steps = min(steps, max(len(r) for r in problem.fit) - 1)
     # Twice over, each counted half: where pieces begin matters less.
     every = max(1, steps // 2)
-    pieces = to_device(segments_from_runs(machine, problem.fit, steps, every))
-    pieces = replace(pieces, weight=pieces.weight * every / steps)
+    whole = to_device(segments_from_runs(machine, problem.fit, steps, every))
+    whole = replace(whole, weight=whole.weight * every / steps)
+    pieces = few(machine, whole) if refined else whole
+    more = pieces.count < whole.count
     noise = jnp.asarray(problem.noise, jnp.result_type(float))
     # Velocities derived from the positions say nothing that those do not.
     seen = jnp.asarray(np.concatenate([np.ones(machine.mj_model.nv), problem.measured]))
@@ -170,24 +173,51 @@ def _ready_finish(
             near=near,
             restarts=restarts,
         )
+        return found, errors(found, pieces)
+
+    def ending(found: Any, whole: Any, misfit: Any) -> Any:
+        informed = search.config.informed_spread
+        given = machine, space, found, whole, informed, search.mesh, misfit
+        found = polished(*given)
+        return found, errors(found, whole)
+
+    def errors(found: Any, pieces: Any) -> Any:
         model = machine.model(space.to_si(found.distribution.mean))
         starts = shift_start(machine, pieces, found.delta)
-        return found, replay.errors_from(machine, model, starts, pieces)
+        return replay.errors_from(machine, model, starts, pieces)
 
     n = space.size
     like = placed((jnp.zeros(n), jnp.eye(n), pieces, hidden, _ROBUST, False))
-    compiled = jax.jit(finish).lower(*like).compile(quick_compile())
+    fitted = jax.jit(finish).lower(*like).compile(quick_compile())
     assumed = effective_noise(machine, pieces, noise)
+    if more:
+        out = jax.tree.map(
+            lambda x: np.zeros(x.shape, x.dtype), jax.eval_shape(finish, *like)[0]
+        )
+        like = placed((out, whole, hidden))
+        ended = jax.jit(ending).lower(*like).compile(quick_compile())
 
     def passes(mean: Any, cov: Any) -> tuple[Any, Any]:
         misfit, weighed, center = hidden, pieces, mean
+
+        def judged(error: Any, weight: Any) -> tuple[Any, Any]:
+            misfit = jnp.maximum(misfit_of(error, assumed, weight), hidden)
+            return misfit, outlier_weights(error, assumed, misfit, _OUTLIER)
+
         for k in range(_PASSES):
             given = (center, cov, weighed, misfit, 0 if k else _ROBUST, k > 0)
-            found, error = distributed.local(compiled(*placed(given)))
-            misfit = jnp.maximum(misfit_of(error, assumed, weighed.weight), hidden)
-            weight = outlier_weights(error, assumed, misfit, _OUTLIER)
+            found, error = distributed.local(fitted(*placed(given)))
+            misfit, weight = judged(error, weighed.weight)
             weighed = replace(pieces, weight=pieces.weight * weight)
             center = found.distribution.mean
+            say(f"least-squares finish: pass {k + 1} of {_PASSES}")
+        weighed = whole
+        for k in range(_ENDINGS if more else 0):
+            given = found, weighed, misfit
+            found, error = distributed.local(ended(*placed(given)))
+            misfit, weight = judged(error, weighed.weight)
+            weighed = replace(whole, weight=whole.weight * weight)
+            say(f"on all of the logs: pass {k + 1} of {_ENDINGS}")
         return found.replace(search_mean=mean, search_cov=cov), weight
 
     def estimates(states: Any) -> tuple[list[Any], list[str]]:
@@ -197,7 +227,7 @@ def _ready_finish(
         notes = []
         if odd.size:
             notes.append(
-                f"{odd.size} of {pieces.count} pieces of {steps * machine.dt:g} s "
+                f"{odd.size} of {whole.count} pieces of {steps * machine.dt:g} s "
                 "fit much worse than the rest and weigh less than half "
                 "(a bump, a wrong reading, or motion that the model lacks)"
             )
