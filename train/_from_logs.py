@@ -211,9 +211,12 @@ def _ready_finish(
             weighed = replace(pieces, weight=pieces.weight * weight)
             center = found.distribution.mean
             say(f"least-squares finish: pass {k + 1} of {_PASSES}")
-        weighed = whole
+        weighed, begun = whole, found
         for k in range(_ENDINGS if more else 0):
-            given = found, weighed, misfit
+            begun = replace(
+                begun, distribution=found.distribution, simulated=found.simulated
+            )
+            given = begun, weighed, misfit
             found, error = distributed.local(ended(*placed(given)))
             misfit, weight = judged(error, weighed.weight)
             weighed = replace(whole, weight=whole.weight * weight)

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import jax
+import mujoco
 import numpy as np
 import pytest
 
@@ -340,6 +341,39 @@ def test_degrees_are_noticed_and_earlier_results_kept(files, capsys):
     single_row(files)
     refuse(capsys, arguments(files, "--overwrite"), "a single row")
     assert {p: p.read_bytes() for p in files["out"].rglob("*") if p.is_file()} == kept
+
+
+def test_a_fit_on_some_of_the_logs_ends_where_all_have_it(files, capsys, monkeypatch):
+    """As larger robots have it, whose fits would take hours with all pieces."""
+    swing(files["log"], damping=0.1)
+    found = {}
+    for some in (False, True):
+        if some:
+            monkeypatch.setattr(identify, "few", lambda _, pieces: pieces.spread(6))
+        call(*arguments(files, "--overwrite"))
+        said = capsys.readouterr().out
+        assert said.count("least-squares finish") == 3
+        assert said.count("on all of the logs") == (2 if some else 0)
+        found[some] = json.loads((files["out"] / "distribution.json").read_text())
+        found[some] = found[some]["seeds"]["0"]
+    assert found[False]["mean"][0] == pytest.approx(0.1, rel=0.05)
+    std = [found[k]["unit_covariance"][0][0] ** 0.5 for k in (False, True)]
+    apart = found[True]["unit_mean"][0] - found[False]["unit_mean"][0]
+    assert abs(apart) < 0.5 * std[0]
+    assert std[1] == pytest.approx(std[0], rel=0.2)
+
+
+def swing(path: Path, damping: float) -> None:
+    """A log of the model, damped otherwise, with sensor noise."""
+    m = mujoco.MjModel.from_xml_string(MODEL)
+    m.dof_damping[0] = damping
+    d, rng, rows = mujoco.MjData(m), np.random.default_rng(0), []
+    for k in range(1500):
+        d.ctrl[0] = 0.8 * np.sin(0.05 * k) + 0.5 * np.sin(0.013 * k)
+        angle = d.qpos[0] + 1e-3 * rng.normal()
+        rows.append(f"{0.01 * k:.6g},{angle:.6f},{d.ctrl[0]:.6f}")
+        mujoco.mj_step(m, d)
+    path.write_text("\n".join(["time,qpos.hinge,ctrl.drive", *rows]) + "\n")
 
 
 @pytest.mark.fault("killed (signal 9), then resumed")
