@@ -168,6 +168,7 @@ def estimate(
             given = machine, space, fit.unit, pieces, assumed, mesh, misfit
             fit = _adjusted(fit, adjust(*given))
         if rest is not None:
+            assumed = effective_noise(machine, rest, noise)
             more = polish(machine, space, fit.unit, rest, assumed, mesh, misfit)
             fit = replace(more, simulated=fit.simulated + more.simulated)
         center, spread = _stated(space, fit)

@@ -189,7 +189,6 @@ def _ready_finish(
     n = space.size
     like = placed((jnp.zeros(n), jnp.eye(n), pieces, hidden, _ROBUST, False))
     fitted = jax.jit(finish).lower(*like).compile(quick_compile())
-    assumed = effective_noise(machine, pieces, noise)
     if more:
         out = jax.tree.map(
             lambda x: np.zeros(x.shape, x.dtype), jax.eval_shape(finish, *like)[0]
@@ -199,26 +198,28 @@ def _ready_finish(
 
     def passes(mean: Any, cov: Any) -> tuple[Any, Any]:
         misfit, weighed, center = hidden, pieces, mean
+        assumed = effective_noise(machine, pieces, noise)
 
-        def judged(error: Any, weight: Any) -> tuple[Any, Any]:
+        def judged(error: Any, weight: Any, assumed: Any) -> tuple[Any, Any]:
             misfit = jnp.maximum(misfit_of(error, assumed, weight), hidden)
             return misfit, outlier_weights(error, assumed, misfit, _OUTLIER)
 
         for k in range(_PASSES):
             given = (center, cov, weighed, misfit, 0 if k else _ROBUST, k > 0)
             found, error = distributed.local(fitted(*placed(given)))
-            misfit, weight = judged(error, weighed.weight)
+            misfit, weight = judged(error, weighed.weight, assumed)
             weighed = replace(pieces, weight=pieces.weight * weight)
             center = found.distribution.mean
             say(f"least-squares finish: pass {k + 1} of {_PASSES}")
-        weighed, begun = whole, found
+        assumed = effective_noise(machine, whole, noise)
+        weighed, begun = whole, found.replace(noise=np.asarray(assumed))
         for k in range(_ENDINGS if more else 0):
             begun = replace(
                 begun, distribution=found.distribution, simulated=found.simulated
             )
             given = begun, weighed, misfit
             found, error = distributed.local(ended(*placed(given)))
-            misfit, weight = judged(error, weighed.weight)
+            misfit, weight = judged(error, weighed.weight, assumed)
             weighed = replace(whole, weight=whole.weight * weight)
             say(f"on all of the logs: pass {k + 1} of {_ENDINGS}")
         return found.replace(search_mean=mean, search_cov=cov), weight
