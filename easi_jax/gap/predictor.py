@@ -104,7 +104,6 @@ class Predictor:
                 self.wrapped[m.jnt_dofadr[j]] = True
         self._scalar = scalar_places(m).T
         self._mesh = make_mesh()
-        self.blocks = -(-len(windows) // BLOCK)
         # By powers of two, so that the program of one log often serves the next.
         self._room = 1 << (self.blocks - 1).bit_length()
         self._data = self._placed(windows)
@@ -158,6 +157,11 @@ class Predictor:
         return self._mesh.size
 
     @property
+    def blocks(self) -> int:
+        """Of `BLOCK` windows each; the last may not be full."""
+        return -(-len(self.windows) // BLOCK)
+
+    @property
     def capacity(self) -> int:
         """Windows that the compiled program has room for."""
         return self._room * BLOCK
@@ -180,7 +184,6 @@ class Predictor:
         self._program(False)
         other = copy.copy(self)
         other.windows = windows
-        other.blocks = -(-len(windows) // BLOCK)
         other._data = other._placed(windows)
         return other
 
