@@ -168,29 +168,26 @@ def estimate(
             given = machine, space, fit.unit, pieces, assumed, mesh, misfit
             fit = _adjusted(fit, adjust(*given))
         if rest is not None:
-            assumed = effective_noise(machine, rest, noise)
-            more = polish(machine, space, fit.unit, rest, assumed, mesh, misfit)
-            fit = replace(more, simulated=fit.simulated + more.simulated)
-        center, spread = _stated(space, fit)
-        hessian, cost, delta = fit.hessian, fit.cost, fit.delta
-        simulated = fit.simulated
-    else:
-        weight = step_weights(pieces, assumed, misfit)
-        zero = jnp.zeros((pieces.count, len(noise)))
-        paired = PairedFit(machine, space, pieces, assumed, mesh, free_starts)
-        eq = paired.normal(mean, zero, weight)
-        open_cov, seen, _ = _posterior(eq.hessian)
-        center, spread = mean, open_cov + seen @ cov @ seen.T
-        hessian, cost, delta = eq.hessian, jnp.zeros(0), eq.start_step
-        simulated = jnp.asarray(1.0 * paired.points * pieces.count * pieces.horizon)
+            given = machine, space, fit.unit, cov, rest, noise, informed, mesh, misfit
+            more = polished(*given)
+            simulated = fit.simulated + more.simulated
+            return replace(more, search_mean=mean, simulated=simulated)
+        return _of_fit(space, fit, mean, cov, assumed, informed)
+    weight = step_weights(pieces, assumed, misfit)
+    zero = jnp.zeros((pieces.count, len(noise)))
+    paired = PairedFit(machine, space, pieces, assumed, mesh, free_starts)
+    eq = paired.normal(mean, zero, weight)
+    open_cov, seen, _ = _posterior(eq.hessian)
+    spread = open_cov + seen @ cov @ seen.T
+    simulated = jnp.asarray(1.0 * paired.points * pieces.count * pieces.horizon)
     return Estimate(
-        distribution=gaussian(space, center, spread if informed else cov),
+        distribution=gaussian(space, mean, spread if informed else cov),
         search_mean=mean,
         search_cov=cov,
-        hessian=hessian,
+        hessian=eq.hessian,
         noise=assumed,
-        cost=cost,
-        delta=delta,
+        cost=jnp.zeros(0),
+        delta=eq.start_step,
         simulated=simulated,
     )
 
@@ -198,36 +195,48 @@ def estimate(
 def polished(
     machine: Machine,
     space: ParameterSpace,
-    found: Estimate,
+    center: jax.Array,
+    cov: jax.Array,
     rest: Segments,
+    noise: jax.Array,
     informed: bool = True,
     mesh: Mesh | None = None,
     misfit: jax.Array | None = None,
 ) -> Estimate:
-    """A refined estimate after `easi_jax.polish` on ``rest``; pure.
+    """The `estimate` of a fit at ``center (n,)`` after `easi_jax.polish`; pure.
 
     Args:
+        cov: of the search, ``(n, n)``.
         rest: pieces of the whole recording, R of them: cost, corrections of starts
             ``(R, 2 nv)`` and information are theirs.
-        informed, misfit: as in `estimate`.
+        noise, informed, misfit: as in `estimate`.
     """
-    center = found.distribution.mean
-    fit = polish(machine, space, center, rest, found.noise, mesh, misfit)
-    center, cov = _stated(space, fit)
-    return replace(
-        found,
-        distribution=gaussian(space, center, cov if informed else found.search_cov),
+    assumed = effective_noise(machine, rest, noise)
+    fit = polish(machine, space, center, rest, assumed, mesh, misfit)
+    return _of_fit(space, fit, center, cov, assumed, informed)
+
+
+def _of_fit(
+    space: ParameterSpace,
+    fit: RefineResult,
+    mean: jax.Array,
+    cov: jax.Array,
+    noise: jax.Array,
+    informed: bool,
+) -> Estimate:
+    """What is stated of a fit, after a search that ended at ``mean``, ``cov``."""
+    open_cov, _, shown = _posterior(fit.raised_hessian)
+    center, spread = _near_zero(space, fit.unit, fit.raised, open_cov, shown)
+    return Estimate(
+        distribution=gaussian(space, center, spread if informed else cov),
+        search_mean=mean,
+        search_cov=cov,
         hessian=fit.hessian,
+        noise=noise,
         cost=fit.cost,
         delta=fit.delta,
-        simulated=found.simulated + fit.simulated,
+        simulated=fit.simulated,
     )
-
-
-def _stated(space: ParameterSpace, fit: RefineResult) -> tuple[jax.Array, jax.Array]:
-    """Mean and covariance of a fit, unit coordinates."""
-    cov, _, shown = _posterior(fit.raised_hessian)
-    return _near_zero(space, fit.unit, fit.raised, cov, shown)
 
 
 def finish(

@@ -175,10 +175,9 @@ def _ready_finish(
         )
         return found, errors(found, pieces)
 
-    def ending(found: Any, whole: Any, misfit: Any) -> Any:
-        informed = search.config.informed_spread
-        given = machine, space, found, whole, informed, search.mesh, misfit
-        found = polished(*given)
+    def ending(center: Any, cov: Any, whole: Any, misfit: Any) -> Any:
+        how = search.config.informed_spread, search.mesh, misfit
+        found = polished(machine, space, center, cov, whole, noise, *how)
         return found, errors(found, whole)
 
     def errors(found: Any, pieces: Any) -> Any:
@@ -190,10 +189,7 @@ def _ready_finish(
     like = placed((jnp.zeros(n), jnp.eye(n), pieces, hidden, _ROBUST, False))
     fitted = jax.jit(finish).lower(*like).compile(quick_compile())
     if more:
-        out = jax.tree.map(
-            lambda x: np.zeros(x.shape, x.dtype), jax.eval_shape(finish, *like)[0]
-        )
-        like = placed((out, whole, hidden))
+        like = placed((jnp.zeros(n), jnp.eye(n), whole, hidden))
         ended = jax.jit(ending).lower(*like).compile(quick_compile())
 
     def passes(mean: Any, cov: Any) -> tuple[Any, Any]:
@@ -212,15 +208,13 @@ def _ready_finish(
             center = found.distribution.mean
             say(f"least-squares finish: pass {k + 1} of {_PASSES}")
         assumed = effective_noise(machine, whole, noise)
-        weighed, begun = whole, found.replace(noise=np.asarray(assumed))
+        weighed = whole
         for k in range(_ENDINGS if more else 0):
-            begun = replace(
-                begun, distribution=found.distribution, simulated=found.simulated
-            )
-            given = begun, weighed, misfit
+            given = center, cov, weighed, misfit
             found, error = distributed.local(ended(*placed(given)))
             misfit, weight = judged(error, weighed.weight, assumed)
             weighed = replace(whole, weight=whole.weight * weight)
+            center = found.distribution.mean
             say(f"on all of the logs: pass {k + 1} of {_ENDINGS}")
         return found.replace(search_mean=mean, search_cov=cov), weight
 
