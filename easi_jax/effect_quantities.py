@@ -271,6 +271,9 @@ EFFECT_TABLE: dict[str, EffectQuantity] = {
         for i, word in enumerate(("stiffness", "damping"))
     },
 }
+# Effects of an actuator that all may have alike, as one bus or one controller makes
+# them.
+SHARED = ("actuator_delay", "actuator_lag")
 VECTORS = ("com", "force", "tilt", "softness", "give")
 # In the readings, not in the physics.
 READINGS = ("bias", "late")

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from easi_jax import addresses as language
-from easi_jax.effect_quantities import EFFECT_TABLE, READINGS
+from easi_jax.effect_quantities import EFFECT_TABLE, READINGS, SHARED
 from easi_jax.errors import UserError
 from easi_jax.machine import Machine
 from easi_jax.parameters import Parameter, ParameterSpace
@@ -83,7 +83,9 @@ def joined(
 ) -> tuple[ParameterSpace, dict[str, float]]:
     """Parameters of a model with effects, and values that stay, by address.
 
-    A number of an effect becomes a parameter, named ``EFFECT@PLACE.NUMBER``. Its search
+    A number of an effect becomes a parameter, named ``EFFECT@PLACE.NUMBER``. Delays and
+    lags that several actuators have alike, deviations included, are one parameter, for
+    they have one cause. A parameter's search
     starts within three standard deviations of what was found, a tenth of the value at
     least; its bounds are those of physics. Parameters of ``space`` whose own values
     were refitted start about the new ones.
@@ -101,13 +103,24 @@ def joined(
     stay = dict(rest)
     for entry in found.physical:
         _check(m, entry)
-        for column, value in entry.columns.items():
-            p = _parameter(m, entry, column, value)
+    for alike in _alike(found.physical):
+        for column, value in alike[0].columns.items():
+            p = _parameter(m, alike, column, value)
             if p is None:
-                stay[entry.address(column)] = value
+                stay |= {entry.address(column): value for entry in alike}
             else:
                 new.append(p)
     return ParameterSpace((*space.parameters, *new)), stay
+
+
+def _alike(entries: Iterable[EffectEntry]) -> list[list[EffectEntry]]:
+    """Entries of one cause together, in the order of the first of each."""
+    groups: dict[object, list[EffectEntry]] = {}
+    for k, e in enumerate(entries):
+        numbers = (*sorted(e.columns.items()), *sorted(e.std.items()))
+        tied = e.effect in SHARED and e.kind == "actuator"
+        groups.setdefault((e.effect, numbers) if tied else k, []).append(e)
+    return [*groups.values()]
 
 
 def _check(m: mujoco.MjModel, entry: EffectEntry) -> None:
@@ -124,20 +137,22 @@ def _check(m: mujoco.MjModel, entry: EffectEntry) -> None:
 
 
 def _parameter(
-    m: mujoco.MjModel, entry: EffectEntry, column: str, value: float
+    m: mujoco.MjModel, alike: Sequence[EffectEntry], column: str, value: float
 ) -> Parameter | None:
     """None where nothing is uncertain."""
+    entry = alike[0]
     half = max(_STDS * entry.std.get(column, 0.0), _SHARE * abs(value))
     if column.split(".")[0] in _SHAPES or half == 0:
         return None
-    address = entry.address(column)
-    unit, (low, high) = language.describe(m, (address,))
+    addresses = tuple(e.address(column) for e in alike)
+    unit, (low, high) = language.describe(m, addresses)
     start = max(value - half, low), min(value + half, high)
     if column in ("delay", "lag"):
         high = min(high, _FARTHER * start[1])
-    place = f"@{entry.at}" if entry.at else ""
+    at = "all" if len(alike) == m.nu > 1 else "+".join(e.at for e in alike)
+    place = f"@{at}" if at else ""
     name = f"{entry.effect}{place}.{EFFECT_TABLE[column].word}"
-    return Parameter(name, (address,), value, start, (low, high), unit, log=False)
+    return Parameter(name, addresses, value, start, (low, high), unit, log=False)
 
 
 Number = tuple[str, tuple[int, ...], int]

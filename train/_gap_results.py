@@ -38,7 +38,28 @@ def sentence(found: Any) -> str:
     names = (f'"{name}"' for name in place.at.split("/"))
     pair = f" between {' and '.join(names)}" if place.kind == "geom" else ""
     said = {"at": place.at, "kind": place.kind, "pair": pair}
-    return _WORDS[place.effect].format(**said, **shown)
+    words = _WORDS[place.effect]
+    if place.shared:
+        words = words.replace('actuator "{at}"', "{at}")
+        said["at"] = _actuators(found)
+    return words.format(**said, **shown)
+
+
+def _actuators(found: Any) -> str:
+    """Where a shared effect is seen, in words."""
+    names = [p.place.at for p in found.parts]
+    return f"{len(names)} actuators alike ({', '.join(names)})"
+
+
+def _label(found: Any) -> str:
+    return f"{found.place.effect}@all" if found.parts else found.place.key
+
+
+def sites(found: Any) -> list[tuple[Any, float]]:
+    """The places that an effect is written down at, and the held-out gap with it at
+    each and those before."""
+    parts = [(p.place, p.gap_after) for p in found.parts]
+    return parts or [(found.place, found.gap_after)]
 
 
 def parameters_text(values: Any, between: str) -> str:
@@ -55,7 +76,7 @@ def effect_rows(
     rows = [
         (
             f.place.effect,
-            f.place.at or "whole model",
+            ", ".join(p.at for p, _ in sites(f)) or "whole model",
             parameters_text(f.values, between),
             f"{f.confidence:.2f}",
             ", ".join(f.indistinguishable) or none,
@@ -101,18 +122,19 @@ def gap_json(problem: Any, outcome: Any) -> dict[str, Any]:
     places = where(last.errors, last.conditions, m, c)
     listed = [
         {
-            "effect": f.place.effect,
-            "at": f.place.at,
-            "kind": f.place.kind,
+            "effect": place.effect,
+            "at": place.at,
+            "kind": place.kind,
             "parameters": {
                 k: {"value": v, "std": s, "unit": u}
                 for k, (v, s, u) in f.values.items()
             },
             "confidence": f.confidence,
             "indistinguishable": f.indistinguishable,
-            "gap_after": f.gap_after,
+            "gap_after": gap_after,
         }
         for f in outcome.found
+        for place, gap_after in sites(f)
     ]
     listed += [
         {
@@ -177,22 +199,18 @@ def write_results(
     from easi_jax.found_effects import EffectEntry
     from easi_jax.io.effects_file import write_effects
 
-    entries = []
+    entries, shown = [], []
     for f in outcome.found:
         index = analysis.selector.columns(f.place, fitted=False)
-        entries.append(
-            EffectEntry(
-                f.place.effect,
-                f.place.at,
-                f.place.kind,
-                {
-                    column_name(c): float(outcome.x[i])
-                    for c, i in zip(f.place.columns, index, strict=True)
-                },
-                {column_name(f.place.columns[k]): s for k, s in f.deviations.items()},
-            )
-        )
-    shown = [{k: v for k, (v, _, _) in f.values.items()} for f in outcome.found]
+        columns = {
+            column_name(c): float(outcome.x[i])
+            for c, i in zip(f.place.columns, index, strict=True)
+        }
+        std = {column_name(f.place.columns[k]): s for k, s in f.deviations.items()}
+        for place, _ in sites(f):
+            at = place.effect, place.at, place.kind
+            entries.append(EffectEntry(*at, columns, std))
+            shown.append({k: v for k, (v, _, _) in f.values.items()})
     for r in problem.readings:
         entries.append(EffectEntry(r.effect, r.at, "sensor", r.columns, r.std))
         shown.append({k: v for k, (v, _, _) in r.parameters.items()})
@@ -301,7 +319,7 @@ def _report(folder: Any, config: Any, problem: Any, o: Any, content: Any) -> Pat
     if "retrained" in content:
         lines.append(retrained_line(content["retrained"]))
     pictures = []
-    labels = ["as given", "refitted", *[f"+ {f.place.key}" for f in o.found]]
+    labels = ["as given", "refitted", *[f"+ {_label(f)}" for f in o.found]]
     gaps = [o.before.gap, o.refit.gap, *[f.gap_after for f in o.found]]
     low, high = o.after.interval
     pictures.append(

@@ -73,7 +73,8 @@ def effects_wanted(
     m: mujoco.MjModel, space: ParameterSpace, scales: Scales, names: Sequence[str]
 ) -> list[Place]:
     """Places of the effects with some names (none: all), less those that the model's
-    own refit covers.
+    own refit covers, and less what all actuators have alike: what tells single ones
+    apart tells that.
 
     Raises:
         UserError: an unknown name, or none that fits the model.
@@ -85,7 +86,7 @@ def effects_wanted(
     kept = [
         p
         for p in found
-        if (not names or p.effect in names) and not covered(p, space, m)
+        if (not names or p.effect in names) and not (p.shared or covered(p, space, m))
     ]
     if not kept:
         raise UserError(

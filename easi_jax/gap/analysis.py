@@ -29,7 +29,7 @@ from easi_jax.gap.journal import key_of
 from easi_jax.gap.layout import Layout
 from easi_jax.gap.models import Candidate, Model
 from easi_jax.gap.numbers import Numbers
-from easi_jax.gap.outcome import Figures, Found, Outcome
+from easi_jax.gap.outcome import Figures, Found, Outcome, Part
 from easi_jax.gap.own_steps import error_of_steps, within_a_step
 from easi_jax.gap.places import places, ripples
 from easi_jax.gap.predictor import BLOCK, Predictor
@@ -351,7 +351,72 @@ class Analysis:
             self.dropped |= {p.key for p in brief}
             model = self._rid_of(model, [p for p, _ in needless])
             model, rivals = self.exchanged(model)
+        model, rivals = self._apart(model, rivals)
         return self.measured(base, model, rivals, began, notes)
+
+    def _singles(self, place: Place) -> list[Place]:
+        """Of each actuator what a shared effect is of all."""
+        return [
+            p
+            for p in self.everywhere
+            if (p.effect, p.kind) == (place.effect, "actuator")
+        ]
+
+    def _apart(
+        self, model: Model, rivals: dict[str, list[Model]]
+    ) -> tuple[Model, dict[str, list[Model]]]:
+        """The model with what each actuator has in place of what all have, where one of
+        them differs."""
+        named = {p.key for p in model.places}
+        for place in [p for p in model.places if p.shared]:
+            singles = self._singles(place)
+            new = [p for p in singles if p.key not in named]
+            if len(new) == len(singles):
+                continue
+            x = self._each(model.fit.x, place, singles)
+            order = [q for p in model.places for q in (new if p is place else [p])]
+            model = self.selector.fit(order, x)
+            rivals = rivals | {p.key: rivals[place.key] for p in new}
+        return model, rivals
+
+    def _each(
+        self, x: np.ndarray, place: Place, singles: Sequence[Place]
+    ) -> np.ndarray:
+        """A vector in which these actuators have by themselves what all had."""
+        out, columns = x.copy(), self.selector.columns
+        shared = columns(place)
+        out[shared] = self.selector.neutral[shared]
+        for single in singles:
+            out[columns(single)] += x[shared] - out[shared]
+        return out
+
+    def _parts(self, x: np.ndarray, place: Place, whole: Figures) -> tuple[Part, ...]:
+        """The actuators that a shared effect is seen at: without it at one of them the
+        held-out data are predicted worse. What moves them most comes first.
+
+        Args:
+            x: vector with the effect.
+            whole: its figures.
+        """
+        singles = self._singles(place)
+        without = [[p for p in singles if p is not one] for one in singles]
+        squares = self._squares([self._each(x, place, kept) for kept in without])
+        mine = self._squares([x])[0]
+        scale = self.channels.scale
+        order = np.argsort(-np.asarray(measure.gap(squares.mean(1), scale)))
+        seen = [singles[i] for i in order if not self._as_good(mine, squares[i])]
+        seen = seen or [singles[i] for i in order]
+        some = [self._each(x, place, seen[:k]) for k in range(1, len(seen))]
+        gaps = [float(measure.gap(s.mean(0), scale)) for s in self._squares(some)]
+        return tuple(map(Part, seen, [*gaps, whole.gap]))
+
+    def _squares(self, vectors: Sequence[np.ndarray]) -> np.ndarray:
+        """Mean squares of each held-out window, ``(B, W, nv)``."""
+        if not vectors:
+            return np.zeros((0, len(self.held), self.m.nv))
+        x = self.selector.plain(np.stack(vectors))
+        errors = self.predictor.errors(x, self.held_blocks)[:, : len(self.held)]
+        return np.stack([measure.squares(e) for e in errors])
 
     def _needless(self, model: Model) -> list[tuple[Place, str]]:
         """Effects that were found and say nothing of the machine, with the reason."""
@@ -526,31 +591,35 @@ class Analysis:
         gap = fair[0].gap  # that the effects before it leave
         for k, place in enumerate(model.places):
             part = model.places[: k + 1]
+            x = model.fit.x
             if k + 1 == len(model.places):
                 figures, left = after, fair[1]
             else:
-                x = model.fit.x
                 for other in model.places[k + 1 :]:
                     x = self.selector.without(x, other, part)
                 x = self.selector.fit(part, x).fit.x
                 figures, left = self.figures(x), self.figures(x, judged=True)
-            mine = _last(model, place)
+            alone = _last(model, place)
             odds = 0.0
-            same = []
+            same: list[Place] = []
             for rival in rivals[place.key][:_RIVALS]:
-                p = probability(mine, rival)
+                p = probability(alone, rival)
                 odds += (1 - p) / max(p, 1e-6)
                 theirs = self.figures(rival.fit.x, judged=True)
-                if self._as_good(fair[1], theirs):
-                    same.append(rival.places[-1].key)
+                if self._as_good(fair[1].square, theirs.square):
+                    other = rival.places[-1]
+                    same += self._singles(other) if other.shared else [other]
+            parts = self._parts(x, place, figures) if place.shared else ()
+            mine = {place.key, *(p.place.key for p in parts)}
             found.append(
                 Found(
                     place,
                     numbers.values(place),
                     explained(gap, fair[1].gap, floor_gap) / (1.0 + odds),
-                    same,
+                    [k for k in dict.fromkeys(p.key for p in same) if k not in mine],
                     figures.gap,
                     numbers.deviations(place),
+                    parts,
                 )
             )
             gap = left.gap
@@ -611,15 +680,15 @@ class Analysis:
             horizon=self.predictor.steps * self.runs[0].dt,
         )
 
-    def _as_good(self, mine: Figures, theirs: Figures) -> bool:
-        """Whether the difference of two held-out gaps may be none, or is in favor."""
+    def _as_good(self, mine: np.ndarray, theirs: np.ndarray) -> bool:
+        """Whether the difference of two held-out gaps may be none, or is in favor;
+        from mean squares of each window, ``(W, nv)``."""
         scale = self.channels.scale
-        weights = measure.resampled(len(mine.square), 1)
-        d = measure.gap(weights @ theirs.square, scale) - measure.gap(
-            weights @ mine.square, scale
-        )
+        weights = measure.resampled(len(mine), 1)
+        d = measure.gap(weights @ theirs, scale) - measure.gap(weights @ mine, scale)
         # Twins differ by rounding alone.
-        return bool(np.quantile(d, 0.025) <= _ROUNDING * mine.gap)
+        gap = measure.gap(mine.mean(0), scale)
+        return bool(np.quantile(d, 0.025) <= _ROUNDING * gap)
 
 
 def _body_for_joint(old: Place, new: Place) -> bool:

@@ -35,17 +35,25 @@ class Layout:
         return np.array([self._index[(c.field, c.index)] for c in place.columns], int)
 
     def effects(self, x: jax.Array) -> Effects:
-        """The effects of a vector ``(n,)``; pure."""
+        """The effects of a vector ``(n,)``; pure.
+
+        A number without an index in a field of several is what all of them have on top
+        of their own.
+        """
         changed = {}
         by_field: dict[str, list[int]] = {}
         for i, c in enumerate(self.columns):
             by_field.setdefault(c.field, []).append(i)
         for name, rows in by_field.items():
             leaf = jnp.asarray(getattr(self._none, name), jnp.float32)
-            index = tuple(
-                np.array(k)
-                for k in zip(*(self.columns[i].index for i in rows), strict=True)
-            )
             values = x[np.array(rows)].astype(jnp.float32)
-            changed[name] = leaf.at[index].set(values) if index else values[0]
+            own = [k for k, i in enumerate(rows) if self.columns[i].index]
+            if own:
+                of_each = [self.columns[rows[k]].index for k in own]
+                index = tuple(np.array(k) for k in zip(*of_each, strict=True))
+                leaf = leaf.at[index].set(values[np.array(own)])
+            for k in {*range(len(rows))} - {*own}:
+                same = values[k] - self.columns[rows[k]].neutral
+                leaf = leaf + same if leaf.ndim else values[k]
+            changed[name] = leaf
         return self._none.replace(**changed)  # type: ignore[attr-defined]

@@ -12,6 +12,19 @@ from easi_jax.gap.window_set import WindowSet
 
 
 @dataclass(frozen=True)
+class Part:
+    """One actuator of an effect that all have.
+
+    Attributes:
+        place: the same effect there.
+        gap_after: held-out gap with the effect at it and those before it.
+    """
+
+    place: Place
+    gap_after: float
+
+
+@dataclass(frozen=True)
 class Found:
     """One effect that the model lacks.
 
@@ -24,6 +37,7 @@ class Found:
         gap_after: held-out gap with it and those before it.
         deviations: standard deviation of each of the place's columns that the fit
             moved, by its number among them.
+        parts: of a shared effect (`Place.shared`), the actuators that it is seen at.
     """
 
     place: Place
@@ -32,6 +46,7 @@ class Found:
     indistinguishable: list[str]
     gap_after: float
     deviations: dict[int, float] = field(default_factory=dict)
+    parts: tuple[Part, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,8 @@ def places(m: mujoco.MjModel, s: Scales) -> list[Place]:
             out.append(_play(m, j, s))
     for a in range(m.nu):
         out += _at_actuator(m, a, s)
+    if m.nu > 1:
+        out += _shared(s)
     moving = [b for b in range(1, m.nbody) if m.body_mass[b] > 0 and _moves(m, b)]
     for b in moving:
         out += _at_body(m, b)
@@ -258,11 +260,28 @@ def _play(m: mujoco.MjModel, j: int, s: Scales) -> Place:
     )
 
 
+def _shared(s: Scales) -> list[Place]:
+    """What all drives have alike, as one bus or one controller makes it: a number of
+    each drive would be one of dozens, and hardly help alone."""
+    return _late("", "model", (), s)
+
+
+def _late(at: str, kind: str, index: tuple[int, ...], s: Scales) -> list[Place]:
+    """Delay and lag of a command, or of all."""
+    dt = s.dt
+    delay = Column("delay", index, "delay", "s", 0.0, 0.0, s.longest, 0.25 * dt)
+    lag = Column("lag", index, "time_constant", "s", 0.0, 0.0, 0.5, 0.25 * dt)
+    delays = (0.5 * dt,), (2.0 * dt,), (0.3 * s.longest,)
+    return [
+        Place("actuator_delay", at, kind, (delay,), delays),
+        Place("actuator_lag", at, kind, (lag,), ((dt,), (0.03,), (0.1,))),
+    ]
+
+
 def _at_actuator(m: mujoco.MjModel, a: int, s: Scales) -> list[Place]:
     at = name_of(m, "actuator", a)
     command, force = max(float(s.command[a]), 1e-9), max(float(s.force[a]), 1e-9)
     peak = float(s.peak[a])
-    dt = s.dt
 
     def place(
         effect: str, *columns: Column, starts: Sequence[Sequence[float]]
@@ -277,16 +296,7 @@ def _at_actuator(m: mujoco.MjModel, a: int, s: Scales) -> list[Place]:
             Column("gain", (a,), "gain", "1", 1.0, 0.02, 10.0, 0.02),
             starts=[[1.0]],
         ),
-        place(
-            "actuator_delay",
-            Column("delay", (a,), "delay", "s", 0.0, 0.0, s.longest, 0.25 * dt),
-            starts=[[0.5 * dt], [2.0 * dt], [0.3 * s.longest]],
-        ),
-        place(
-            "actuator_lag",
-            Column("lag", (a,), "time_constant", "s", 0.0, 0.0, 0.5, 0.25 * dt),
-            starts=[[dt], [0.03], [0.1]],
-        ),
+        *_late(at, "actuator", (a,), s),
         place(
             "actuator_saturation",
             Column(

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from easi_jax import addresses as language
+from easi_jax.effect_quantities import SHARED
 from easi_jax.errors import UserError
 from easi_jax.parameters import ParameterSpace
 
@@ -104,7 +105,8 @@ class Place:
 
     Attributes:
         effect: its name.
-        at: the joint, actuator, body or pair of geoms; "" for the whole model.
+        at: the joint, actuator, body or pair of geoms; "" for the whole model, or for
+            what all actuators have alike (`shared`).
         kind: what ``at`` is.
         columns: its numbers.
         starts: values of the columns that a fit starts from, in turn.
@@ -126,6 +128,11 @@ class Place:
     def key(self) -> str:
         """``effect@at``."""
         return f"{self.effect}@{self.at}"
+
+    @property
+    def shared(self) -> bool:
+        """Whether it is one of single actuators that all have alike."""
+        return not self.at and self.effect in SHARED
 
     def unlikely(self, values: np.ndarray) -> int:
         """For how many reasons few machines have it with these values of its columns:
@@ -203,6 +210,7 @@ def does(place: Place, address: str, m: mujoco.MjModel) -> bool:
     kind, quantity = REFITTED.get(place.effect, ("", ""))
     found = language.places(m, address)
     return any(
-        (kind, quantity) == (k, q) and object_id(m, kind, place.at) == i
+        (kind, quantity) == (k, q)
+        and (not place.at or object_id(m, kind, place.at) == i)
         for k, q, i in found
     )

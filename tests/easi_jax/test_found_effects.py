@@ -303,6 +303,22 @@ def test_a_tied_parameter_gets_the_mean_of_its_places(arm: mujoco.MjModel) -> No
     assert space.nominal[0] == pytest.approx(0.02) and fixed == {}
 
 
+@pytest.mark.parametrize("other", [0.02, 0.03])
+def test_what_drives_have_alike_is_one_parameter(
+    arm: mujoco.MjModel, other: float
+) -> None:
+    late = [
+        EffectEntry("actuator_delay", at, "actuator", {"delay": x}, {"delay": 1e-3})
+        for at, x in (("m", 0.02), ("p", other))
+    ]
+    space, _ = joined(arm, ParameterSpace(()), FoundEffects(tuple(late)))
+    each = [[f"effect.delay.{at}"] for at in ("m", "p")]
+    if other == 0.02:
+        assert space.names == ("actuator_delay@all.delay",)
+        each = [sum(each, [])]
+    assert [list(p.addresses) for p in space.parameters] == each
+
+
 class Elsewhere(Cartpole):
     """Simulates with a machine of its own."""
 
