@@ -13,7 +13,7 @@ from easi_jax.information import PairedFit
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
 from easi_jax.polish import polish
-from easi_jax.refine import RefineResult, refine, step_weights
+from easi_jax.refine import RefineResult, excess, refine, step_weights
 from easi_jax.replay import motion
 from easi_jax.segments import Segments, windows
 
@@ -26,6 +26,7 @@ FLOOR = 1e-3  # of the motion: what a model is never trusted to be better than
 _RESOLVED = 1e-5  # smallest eigenvalue of a float32 correlation matrix worth its name
 _SHARP = 1.0 / 3.0  # of a value: its standard deviation where logarithms will do
 _KNOWN = 0.5  # of the initial range's top: a standard deviation that says something
+_HIDDEN = 0.1  # of what a model errs by, that a parameter takes up unseen
 _INITIAL_VARIANCE = 1.0 / 12.0  # of a uniform initial range, unit coordinates
 
 
@@ -41,6 +42,10 @@ class Estimate:
         noise: standard deviations that the information was computed with.
         cost: weighted error after each step of refinement (empty without).
         delta: corrections of the pieces' starts within their noise, ``(M, 2 nv)``.
+        fit: where the data alone lead, unit coordinates, ``(n,)``; the search's mean
+            where nothing was refined.
+        excess: weighted squared error there beyond what the noise makes, ``()``
+            (`easi_jax.refine.excess`).
         simulated: control steps simulated since the search, ``()``; a derivative
             counts as one more.
     """
@@ -52,6 +57,8 @@ class Estimate:
     noise: jax.Array
     cost: jax.Array
     delta: jax.Array
+    fit: jax.Array
+    excess: jax.Array
     simulated: jax.Array
 
 
@@ -139,7 +146,10 @@ def estimate(
     The covariance joins two sources: the search's own spread, and what the data leave
     open, ``(F + prior)^-1`` with F the Fisher information of ``pieces`` and the
     initial range as prior. A direction that the data do not show keeps the initial
-    spread, whatever the search has drifted to. Without ``informed`` it is the search's
+    spread, whatever the search has drifted to. Where the fit leaves more than the noise
+    explains, the model lacks something, and the information counts for less
+    (`_trusted`): spreads are wider, and the mean goes back towards the middle of the
+    initial range along what is then left open. Without ``informed`` it is the search's
     own covariance alone. ``misfit (2 nv,)`` is what the model itself errs by in every
     step, on top of the noise; it, ``robust``, ``free_starts`` and ``near`` go to
     `easi_jax.refine.refine`, which starts from so many draws of the search's spread as
@@ -177,7 +187,8 @@ def estimate(
     zero = jnp.zeros((pieces.count, len(noise)))
     paired = PairedFit(machine, space, pieces, assumed, mesh, free_starts)
     eq = paired.normal(mean, zero, weight)
-    open_cov, seen, _ = _posterior(eq.hessian)
+    left = excess(eq.costs, weight)
+    open_cov, seen, _ = _posterior(eq.hessian * _trusted(left))
     spread = open_cov + seen @ cov @ seen.T
     simulated = jnp.asarray(1.0 * paired.points * pieces.count * pieces.horizon)
     return Estimate(
@@ -188,6 +199,8 @@ def estimate(
         noise=assumed,
         cost=jnp.zeros(0),
         delta=eq.start_step,
+        fit=mean,
+        excess=left,
         simulated=simulated,
     )
 
@@ -225,8 +238,13 @@ def _of_fit(
     informed: bool,
 ) -> Estimate:
     """What is stated of a fit, after a search that ended at ``mean``, ``cov``."""
-    open_cov, _, shown = _posterior(fit.raised_hessian)
-    center, spread = _near_zero(space, fit.unit, fit.raised, open_cov, shown)
+    trusted = _trusted(fit.excess)
+    open_cov, _, shown = _posterior(fit.raised_hessian * trusted)
+    # Back to the initial range, along what the data do not hold it at.
+    back = (1.0 - trusted) * open_cov @ (0.5 - fit.raised) / _INITIAL_VARIANCE
+    back = jnp.where(informed, back, 0.0)
+    given = fit.unit + back, fit.raised + back
+    center, spread = _near_zero(space, *given, open_cov, shown)
     return Estimate(
         distribution=gaussian(space, center, spread if informed else cov),
         search_mean=mean,
@@ -235,6 +253,8 @@ def _of_fit(
         noise=noise,
         cost=fit.cost,
         delta=fit.delta,
+        fit=fit.unit,
+        excess=fit.excess,
         simulated=fit.simulated,
     )
 
@@ -297,6 +317,21 @@ def _adjusted(fit: RefineResult, new: Adjusted) -> RefineResult:
     return replace(found, simulated=fit.simulated + new.simulated)
 
 
+def _trusted(excess: jax.Array) -> jax.Array:
+    """Share of the information that is left where the model errs beyond the noise.
+
+    What a model lacks makes errors that no parameter takes up, and others that one
+    does: it shows as a wrong value, the same one in every piece, so that more data do
+    not help. A parameter is taken to hide a share `_HIDDEN` of what is left over.
+    """
+    return 1.0 / (1.0 + _HIDDEN * excess)
+
+
+def widened(excess: jax.Array) -> jax.Array:
+    """How many times wider spreads are for what the model errs by beyond the noise."""
+    return 1.0 / jnp.sqrt(_trusted(excess))
+
+
 def _posterior(hessian: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """``(F + prior)^-1``, the filter of directions that the data show, and the
     variance of each parameter along those alone, ``(n,)``.
@@ -352,7 +387,8 @@ def _near_zero(
     value = jnp.exp(width * (unit - raised))  # in the SI value at `raised`
     error = width * alone
     top = jnp.exp(width * (1.0 - raised))  # of the initial range
-    known = error < _KNOWN * top
+    # What lies below its range has no slope there to be known by.
+    known = (error < _KNOWN * top) | (unit < raised)
     weak = space.log & known & (error > _SHARP * value)
     mean, x_std, log_mean, log_std = _of_logarithm(raised, width, value, error)
     moved = jnp.where(weak, (mean - value) / width, 0.0)

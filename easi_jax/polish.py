@@ -15,6 +15,7 @@ from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
 from easi_jax.refine import (
     RefineResult,
+    excess,
     moved,
     newton_step,
     not_held_back,
@@ -142,5 +143,6 @@ def polish(
         delta=starts,
         raised=raised,
         raised_hessian=jnp.where((raised != unit).any(), end.seen, told.hessian),
+        excess=excess(jnp.where(end.used, told.costs, jnp.inf), weight),
         simulated=1.0 * whole * end.k,
     )

@@ -45,6 +45,7 @@ _FARTHEST = 0.8, 2.5  # jump that is tried, in initial ranges, in log ratios
 EDGE = 4.0  # of the cost, that a place beyond a plateau's edge has to be better by
 _SHALLOW = 0.1  # of what its curvature foretells, that the cost rises beyond a dip
 _INSIDE = 0.25  # initial ranges beyond the edge, where a plateau is entered
+_NOISIER = 1.2  # times the noise as it is given, that it may be
 _OUTLYING = 9.0  # times the median cost: such a piece counts half
 
 
@@ -63,6 +64,8 @@ class RefineResult:
             initial range: below it they may be as good as zero, where the logarithm has
             no slope.
         raised_hessian: information there.
+        excess: by how much the weighted squared error at ``unit`` exceeds what the
+            noise accounts for (`excess`), ``()``.
         simulated: control steps simulated, ``()``; a derivative counts as one more.
     """
 
@@ -72,6 +75,7 @@ class RefineResult:
     delta: jax.Array
     raised: jax.Array
     raised_hessian: jax.Array
+    excess: jax.Array
     simulated: jax.Array
 
 
@@ -323,7 +327,7 @@ def refine(
         start = (phase, jnp.asarray(0), jnp.zeros(iterations + 2), init)
         _, rounds, costs, carry = jax.lax.while_loop(going, round_, start)
         steps = rounds * jnp.where(item.short, short, segments.horizon)
-        u, shift, *_, hessian, up = carry
+        u, shift, *_, each, hessian, up = carry
         # A plateau is wide, and likelier than a dip that noise may have dug.
         flat = ((freed == best[0]) | (jnp.diag(hessian) < _UNSEEN)).all()
         least = best[2][-1] + jnp.where(item.freed & flat, EDGE, 0.0)
@@ -331,23 +335,25 @@ def refine(
         better &= ~item.freed | (phase != _FINISHED)
         best = jax.tree.map(
             lambda new, old: jnp.where(better, new, old),
-            (u, shift, costs, hessian),
+            (u, shift, costs, hessian, each),
             best,
         )
         return ((u, shift), best, jnp.where(item.look, up, freed)), (u, hessian, steps)
 
     starts = unit[None] if others is None else jnp.concatenate([unit[None], others])
     # As a scan, so that a stage is compiled once.
-    none = unit, unmoved, jnp.zeros(iterations + 2), jnp.zeros((n, n))
+    none = unit, unmoved, jnp.zeros(iterations + 2), jnp.zeros((n, n)), jnp.ones(count)
     stages = _stages(starts, near, robust, rounding)
     found, looked = jax.lax.scan(stage, ((unit, unmoved), none, unit), stages)
-    u, shift, costs, hessian = found[1]
+    u, shift, costs, hessian, each = found[1]
     points = whole.points + places
     if machine.by_differences:  # one simulation for both, see `swept`
         points = 2 * max(whole.points, places)
     simulated = 1.0 * points * count * looked[2].sum()
     return RefineResult(
-        u, hessian, costs, shift, looked[0][-1], looked[1][-1], simulated
+        *(u, hessian, costs, shift, looked[0][-1], looked[1][-1]),
+        excess(each, weight),
+        simulated,
     )
 
 
@@ -412,6 +418,21 @@ def jumps(space: ParameterSpace) -> tuple[np.ndarray, np.ndarray]:
         return single
     common = scaled / space.log_width
     return np.vstack([single[0], common]), np.append(single[1], _FARTHEST[1])
+
+
+def excess(costs: jax.Array, weight: jax.Array) -> jax.Array:
+    """Weighted squared error beyond what the noise makes, ``()``, with room for a noise
+    that is a fifth larger than it is thought to be.
+
+    Args:
+        costs: half the weighted squared error of each piece, ``(M,)``; those that are
+            not finite count nothing.
+        weight: of each measured number, ``(M, H, 2 nv)``.
+    """
+    told = jnp.isfinite(costs)
+    numbers = jnp.where(told, weight.sum((1, 2)), 0.0).sum()
+    error = 2.0 * jnp.where(told, costs, 0.0).sum()
+    return jnp.maximum(error - _NOISIER**2 * numbers, 0.0)
 
 
 def _data(each: jax.Array, trust: jax.Array) -> jax.Array:

@@ -12,6 +12,7 @@ _STEPS = 500_000  # physics steps in a generation that are worth their time
 _PASSES = 3  # of the finish: the model's own error is learned from the one before
 _ENDINGS = 2  # of a larger robot's, on all pieces
 _ROBUST = 12  # rounds of the first pass; later ones know which pieces fit badly
+_LACKING = 1.5  # times wider spreads, that are worth a note
 _OUTLIER = 2.5  # times the median error: windows beyond it weigh less
 
 
@@ -134,7 +135,7 @@ def _ready_finish(
     import numpy as np
 
     from easi_jax import distributed, replay
-    from easi_jax.identify import effective_noise, estimate, few, polished
+    from easi_jax.identify import effective_noise, estimate, few, polished, widened
     from easi_jax.information import shift_start
     from easi_jax.log_data import misfit_of, outlier_weights, segments_from_runs
     from easi_jax.runtime import quick_compile
@@ -181,7 +182,7 @@ def _ready_finish(
         return found, errors(found, whole)
 
     def errors(found: Any, pieces: Any) -> Any:
-        model = machine.model(space.to_si(found.distribution.mean))
+        model = machine.model(space.to_si(found.fit))
         starts = shift_start(machine, pieces, found.delta)
         return replay.errors_from(machine, model, starts, pieces)
 
@@ -205,7 +206,7 @@ def _ready_finish(
             found, error = distributed.local(fitted(*placed(given)))
             misfit, weight = judged(error, weighed.weight, assumed)
             weighed = replace(pieces, weight=pieces.weight * weight)
-            center = found.distribution.mean
+            center = found.fit
             say(f"least-squares finish: pass {k + 1} of {_PASSES}")
         assumed = effective_noise(machine, whole, noise)
         weighed = whole
@@ -214,7 +215,7 @@ def _ready_finish(
             found, error = distributed.local(ended(*placed(given)))
             misfit, weight = judged(error, weighed.weight, assumed)
             weighed = replace(whole, weight=whole.weight * weight)
-            center = found.distribution.mean
+            center = found.fit
             say(f"on all of the logs: pass {k + 1} of {_ENDINGS}")
         return found.replace(search_mean=mean, search_cov=cov), weight
 
@@ -228,6 +229,14 @@ def _ready_finish(
                 f"{odd.size} of {whole.count} pieces of {steps * machine.dt:g} s "
                 "fit much worse than the rest and weigh less than half "
                 "(a bump, a wrong reading, or motion that the model lacks)"
+            )
+        times = float(widened(results[0][0].excess))
+        if times > _LACKING:
+            notes.append(
+                "the model errs by more than the noise explains, so it lacks "
+                "something, and parameters take up part of that: their spreads are "
+                f"{times:.2g} times as wide for it. train.gap with these logs names "
+                "what is missing; then give --effects"
             )
         return [found for found, _ in results], notes
 

@@ -315,7 +315,7 @@ def test_what_drives_have_alike_is_one_parameter(
     each = [[f"effect.delay.{at}"] for at in ("m", "p")]
     if other == 0.02:
         assert space.names == ("actuator_delay@all.delay",)
-        each = [sum(each, [])]
+        each = [[*each[0], *each[1]]]
     assert [list(p.addresses) for p in space.parameters] == each
 
 
