@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from benchmarks.rival_cells import AFTER_GAP
+
 EPISODES = 100
 
 
@@ -104,7 +106,7 @@ METHODS = (
     *("UDR", "Oracle", "FineTune", "FineTune, no random actions", "GARAT"),
     *("EASI paper", "EASI default", "EASI default, not refined"),
     *("SimOpt", "CMA-ES", "DROPO", "random search"),
-    *("mujoco.sysid", "NPE"),
+    *("mujoco.sysid", "NPE", AFTER_GAP),
 )
 
 

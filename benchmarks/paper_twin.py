@@ -5,12 +5,16 @@ is a measurement on a real machine, and captions must say so.
 
 The UDR policy acts in the twin and is logged; EASI searches from these logs; a policy
 is trained under what it found; both act in the twin. ``EASI default`` is what
-``python -m train.easi --data LOG`` does with logs of a real machine. ``EASI paper`` is
-the reference's recipe, which needs the controller: it rolls it out in the simulation.
+``python -m train.easi --data LOG`` does with logs of a real machine; before ``EASI
+after train.gap``, that names what the model lacks in the same logs, and search and
+training have it. ``EASI paper`` is the reference's recipe, which needs the controller:
+it rolls it out in the simulation.
 """
 
 import dataclasses
 import re
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -18,12 +22,14 @@ from typing import Any
 import numpy as np
 
 from benchmarks.paper_cells import Cell, udr_run
+from benchmarks.rival_cells import AFTER_GAP
 
 TWIN = "twin"
 COMMAND = 1.4  # m/s, of the Go2's logs
 LOGGED = 2000  # control steps of them: 40 s
 TRIES = 20  # starts of the Go2 for its logs, if it falls
-_PRESETS = {"EASI paper": "paper", "EASI default": "default"}
+_FOUND = "gap/effects.yaml"  # in a cell's folder
+_PRESETS = {"EASI paper": "paper", "EASI default": "default", AFTER_GAP: "default"}
 
 
 def solve(cell: Cell, folder: Path) -> dict[str, Any]:
@@ -32,8 +38,9 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
     Returns:
         What `balancing` or `tracking` (and `spectra`) say of the policy in the twin;
         ``logged`` control steps; for EASI ``mean`` (SI) and unit-coordinate ``std`` of
-        the parameters, ``identify_s`` and, for the default, ``held_out`` open-loop
-        errors; ``seconds`` of this process.
+        the parameters, ``identify_s`` and, by commands alone, ``held_out`` open-loop
+        errors; ``effects`` and ``gap`` as train.gap told them, where it ran; ``seconds``
+        of this process.
 
     Raises:
         UserError: a method without a cell here.
@@ -63,7 +70,7 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
         place = folder / re.sub(r"\W+", "_", cell.key)
         place.mkdir(parents=True, exist_ok=True)
         found = identified(cell, place, env, first, twin, logs)
-        policy = trained(cell, place, env, found)
+        policy = trained(cell, place, with_effects(env, place), found)
         row |= {k: v for k, v in found.items() if k not in ("unit_mean", "unit_cov")}
     seed = 2 * cell.seed + 1  # other starts than those that were logged
     if cell.robot == "cartpole":
@@ -71,7 +78,8 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
     else:
         row |= tracking(twin, policy, seed)
         theta = None if found is None else found["mean"]
-        row["spectrum"] = spectra(walker(), first, seed, LOGGED, logs, theta)
+        walking = walker() if found is None else with_effects(walker(), place)
+        row["spectrum"] = spectra(walking, first, seed, LOGGED, logs, theta)
     return row | {"seconds": time.monotonic() - begun}
 
 
@@ -133,6 +141,7 @@ def identified(
     by = _by_command if _PRESETS[cell.method] == "default" else _by_controller
     found = by(cell, place, searched, policy, twin, logs)
     std = np.sqrt(np.diag(found["unit_cov"]))
+    searched = with_effects(searched, place)
     found |= {
         "names": searched.space.names,
         "mean": rounded(found["mean"]),
@@ -146,7 +155,8 @@ def identified(
 def _by_command(
     cell: Cell, place: Path, env: Any, policy: Any, twin: Any, logs: list[Any]
 ) -> dict[str, Any]:
-    """``train.easi --data``, as for logs of a real machine."""
+    """``train.easi --data``, as for logs of a real machine; `AFTER_GAP`: with what
+    ``train.gap`` found."""
     from benchmarks.twin_measures import rounded
     from easi_jax.io.files import read_json
     from easi_jax.io.logs import write_log
@@ -158,21 +168,29 @@ def _by_command(
     runs = [dataclasses.replace(run, name=str(i)) for i, run in enumerate(runs)]
     write_log(place / "log.csv", env.mj_model, [r for r in runs if len(r) > 1])
     write_parameter_file(place / "parameters.yaml", env.space)
-    out = place / "easi"
+    out, told = place / "easi", {}
+    given: dict[str, Any] = {
+        "data": (place / "log.csv",),
+        "parameters": place / "parameters.yaml",
+        "resume": True,
+    }
+    if cell.method == AFTER_GAP:
+        _named(cell.robot, place)
+        known = read_json(place / "gap" / "gap.json")
+        told = {k: known[k] for k in ("effects", "refitted", "gap", "verdict")}
     easi.run(
         easi.Config(
-            data=(place / "log.csv",),
             robot=cell.robot,
-            parameters=place / "parameters.yaml",
+            effects=place / _FOUND if told else None,
             set=cell.settings,
             seeds=(cell.seed,),
             out=out,
-            resume=True,
+            **given,
         )
     )
-    told = read_json(out / "distribution.json")
-    result, held = told["seeds"][str(cell.seed)], told["held_out"]
-    return {
+    distribution = read_json(out / "distribution.json")
+    result, held = distribution["seeds"][str(cell.seed)], distribution["held_out"]
+    return told | {
         "mean": result["mean"],
         "unit_mean": result["unit_mean"],
         "unit_cov": result["unit_covariance"],
@@ -183,6 +201,31 @@ def _by_command(
             "noise_floor": rounded(held["noise_floor"]),
         },
     }
+
+
+def _named(robot: str, place: Path) -> None:
+    """``train.gap``, by itself: it compiles its loops otherwise than the rest.
+
+    Raises:
+        RuntimeError: it failed; it has said why.
+    """
+    words = ["--model", robot, "--data", place / "log.csv", "--resume"]
+    words += ["--parameters", place / "parameters.yaml", "--out", place / "gap"]
+    done = subprocess.run([sys.executable, "-m", "train.gap", *map(str, words)])
+    if done.returncode:
+        raise RuntimeError(f"train.gap failed with {done.returncode}")
+
+
+def with_effects(env: Any, place: Path) -> Any:
+    """The environment with what ``train.gap`` found in ``place``, if it ran there."""
+    from easi_jax.found_effects import env_with
+    from easi_jax.io.effects_file import parsed_effects
+    from easi_jax.io.strict_yaml import read_yaml
+
+    path = place / _FOUND
+    if not path.exists():
+        return env
+    return env_with(env, parsed_effects(read_yaml(path), str(path)))
 
 
 def _by_controller(

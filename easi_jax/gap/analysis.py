@@ -60,6 +60,7 @@ _UNLIKELY = 0.3  # probability of an effect beside which a rival replaces it
 _ROUNDING = 0.005  # of the gap
 _CLEAR = 1.5  # times the floor: a gap that fits see without doubt
 _BEAM = 3  # sets of effects that are followed
+_LIKELY = 60  # of a larger robot's names, that are tried beside all but the first
 _NOTHING = 1e-3  # of the largest error: a change that shows nowhere
 _STEPS_SEEN = 0.75  # of the floor: less is lost in noise
 _WHOLE = 1.15  # of the error of steps; a finer simulation leaves some of it
@@ -500,10 +501,19 @@ class Analysis:
             found: dict[frozenset[str], Model] = {}
             # What was taken out of the best may still be in the others.
             beam = [b for b in beam if len(b.places) <= len(model.places)]
+            most = _LIKELY if self.predictor.machine.wide else None
+            likely: set[str] = set()  # to be tried beside all sets but the first
             for parent in beam:
                 if parent is not beam[0]:
                     parent = chosen.fit(parent.places, parent.fit.x)
-                for m in chosen.expanded(parent, self.candidates(parent.places)):
+                more = [
+                    c
+                    for c in self.candidates(parent.places)
+                    if not likely or c.place.key in likely
+                ]
+                models, names = chosen.expanded(parent, more)
+                likely = likely or {*names[:most], *(p.key for p in model.places)}
+                for m in models:
                     key = _keys(m)
                     if key not in found or m.loss.mean() < found[key].loss.mean():
                         found[key] = m

@@ -22,7 +22,7 @@ from easi_jax.gap.fit import (
 )
 from easi_jax.gap.journal import Arrays, Journal
 from easi_jax.gap.models import Candidate, Model
-from easi_jax.gap.predictor import Predictor
+from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.residuals import Residuals
 from easi_jax.gap.table import Place
 from easi_jax.progress import Progress, silent
@@ -83,16 +83,20 @@ class Selector:
         """Vectors without the share."""
         return x[..., : len(self.predictor.neutral)]
 
-    def errors(self, x: np.ndarray) -> np.ndarray:
-        """Errors of the fitted windows under vectors ``(B, n)``, ``(B, W, H, nv)``."""
-        found = self.predictor.errors(self.plain(x), self.blocks)[:, : self.count]
+    def errors(self, x: np.ndarray, blocks: int | None = None) -> np.ndarray:
+        """Errors of the fitted windows under vectors ``(B, n)``, ``(B, W, H, nv)``;
+        ``blocks``: of the first ones only."""
+        some = self.blocks[:blocks]
+        found = self.predictor.errors(self.plain(x), some)[:, : self.count]
         if self.steps is not None:
-            found -= x[:, -1, None, None, None] * self.steps
+            share = x[:, -1, None, None, None]
+            found -= share * self.steps[: found.shape[1]]
         return found
 
-    def simulate(self, x: np.ndarray) -> np.ndarray:
-        """Whitened errors ``(B, W, m)`` of vectors ``(B, n)``."""
-        return self.residuals.whitened(self.residuals.grouped(self.errors(x)))
+    def simulate(self, x: np.ndarray, blocks: int | None = None) -> np.ndarray:
+        """Whitened errors ``(B, W, m)`` of vectors ``(B, n)``; ``blocks`` as in
+        `errors`."""
+        return self.residuals.whitened(self.residuals.grouped(self.errors(x, blocks)))
 
     def columns(self, place: Place, fitted: bool = True) -> np.ndarray:
         """Entries of the whole vector that belong to a place."""
@@ -210,7 +214,11 @@ class Selector:
 
     def _tried(self, base: Model, candidates: Sequence[Candidate]) -> Arrays:
         """Costs, indices and ends of the candidates that predict finite numbers."""
-        x, w = base.fit.x, self.weight
+        x = base.fit.x
+        # A short list of names needs no more, and a larger robot's takes minutes.
+        blocks = 1 if self.predictor.machine.wide else None
+        seen = min(self.count, len(self.blocks[:blocks]) * BLOCK)
+        w = self.weight[:seen]
         asks, spans = [], []
         for c in candidates:
             y = self.started(x, c)
@@ -220,8 +228,8 @@ class Selector:
             moved, step = difference(y, cols, self.bounds)
             asks.append(np.concatenate([y[None], moved]))
             spans.append((cols, step))
-        got, at = self._many(np.concatenate(asks)), 0
-        known = base.fit.slope * self.bounds.size[base.fit.active]
+        got, at = self._many(np.concatenate(asks), blocks), 0
+        known = base.fit.slope[:seen] * self.bounds.size[base.fit.active]
         costs, which, ends = [], [], []
         for i, (c, ask) in enumerate(zip(candidates, asks, strict=True)):
             cols, step = spans[i]
@@ -250,11 +258,11 @@ class Selector:
         found = np.array(costs), np.array(which, int), np.reshape(ends, shape)
         return dict(zip(_TRIED, found, strict=True))
 
-    def _many(self, x: np.ndarray, most: int = 256) -> np.ndarray:
+    def _many(self, x: np.ndarray, blocks: int | None, most: int = 256) -> np.ndarray:
         got = []
         with self.progress("trying effects", len(x)) as shown:
             for i in range(0, len(x), most):
-                got.append(self.simulate(x[i : i + most]))
+                got.append(self.simulate(x[i : i + most], blocks))
                 shown.advance(len(got[-1]))
         return np.concatenate(got)
 
@@ -279,11 +287,15 @@ class Selector:
                 best[key] = (f.cost, c.place, f)
         return [self.model([*places, p], f) for _, p, f in best.values()]
 
-    def expanded(self, base: Model, candidates: Sequence[Candidate]) -> list[Model]:
-        """A model with one effect more, the most promising ones, best first."""
-        short = shortlist(self.screened(base, candidates))
-        models = self.fitted(base.places, base.fit.x, short)
-        return sorted(models, key=rank)
+    def expanded(
+        self, base: Model, candidates: Sequence[Candidate]
+    ) -> tuple[list[Model], list[str]]:
+        """A model with one effect more, the most promising ones, best first; and the
+        names of all by what they promise."""
+        screened = self.screened(base, candidates)
+        models = self.fitted(base.places, base.fit.x, shortlist(screened))
+        names = dict.fromkeys(c.place.key for _, c in screened)
+        return sorted(models, key=rank), [*names]
 
     def richer(self, model: Model, candidates: Sequence[Candidate]) -> Model:
         """The model with effects replaced by ones that contain them and do better."""
