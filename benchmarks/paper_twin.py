@@ -39,8 +39,8 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
         What `balancing` or `tracking` (and `spectra`) say of the policy in the twin;
         ``logged`` control steps; for EASI ``mean`` (SI) and unit-coordinate ``std`` of
         the parameters, ``identify_s`` and, by commands alone, ``held_out`` open-loop
-        errors; ``effects`` and ``gap`` as train.gap told them, where it ran; ``seconds``
-        of this process.
+        errors; ``effects``, ``gap`` and more of train.gap, where it ran; ``seconds`` of
+        this process.
 
     Raises:
         UserError: a method without a cell here.
