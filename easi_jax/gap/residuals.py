@@ -47,11 +47,13 @@ class Residuals:
         """Averages over groups of steps, ``(B, W, K, nv)``."""
         return np.einsum("kh,bwhc->bwkc", self.groups, errors, optimize=True)
 
-    def whitened(self, grouped: np.ndarray) -> np.ndarray:
-        """Independent numbers of size one, ``(B, W, n)``."""
+    def whitened(self, grouped: np.ndarray, at: np.ndarray | None = None) -> np.ndarray:
+        """Independent numbers of size one, ``(B, W, n)``; ``at``: which windows these
+        are, all where not given."""
         b, w = grouped.shape[:2]
         flat = grouped.reshape(b, w, -1).astype(np.float64)
-        return np.einsum("wij,bwj->bwi", self.root, flat, optimize=True)
+        root = self.root if at is None else self.root[at]
+        return np.einsum("wij,bwj->bwi", root, flat, optimize=True)
 
 
 def step_groups(steps: int) -> np.ndarray:

@@ -29,6 +29,7 @@ from easi_jax.progress import Progress, silent
 
 _SHORTLIST = 7  # names that are fitted in full at each stage
 _STARTS = 2  # of each
+_SCREENED = 2  # blocks of windows that a larger robot's effects are first tried on
 _TRIED = ("cost", "which", "end")
 _HOPELESS = 4.0  # times the best promise; beyond, only the first few are fitted
 
@@ -83,20 +84,28 @@ class Selector:
         """Vectors without the share."""
         return x[..., : len(self.predictor.neutral)]
 
-    def errors(self, x: np.ndarray, blocks: int | None = None) -> np.ndarray:
+    def errors(self, x: np.ndarray, some: np.ndarray | None = None) -> np.ndarray:
         """Errors of the fitted windows under vectors ``(B, n)``, ``(B, W, H, nv)``;
-        ``blocks``: of the first ones only."""
-        some = self.blocks[:blocks]
-        found = self.predictor.errors(self.plain(x), some)[:, : self.count]
+        ``some``: of those in some of the blocks, by their place among them."""
+        every = np.arange(len(self.blocks)) if some is None else some
+        found = self.predictor.errors(self.plain(x), self.blocks[every])
+        at = self.windows_of(every)
+        found = found[:, : len(at)]
         if self.steps is not None:
-            share = x[:, -1, None, None, None]
-            found -= share * self.steps[: found.shape[1]]
+            found -= x[:, -1, None, None, None] * self.steps[at]
         return found
 
-    def simulate(self, x: np.ndarray, blocks: int | None = None) -> np.ndarray:
-        """Whitened errors ``(B, W, m)`` of vectors ``(B, n)``; ``blocks`` as in
+    def windows_of(self, some: np.ndarray) -> np.ndarray:
+        """Fitted windows in some of the blocks; the last block may not be full."""
+        at = (BLOCK * some[:, None] + np.arange(BLOCK)).reshape(-1)
+        return at[at < self.count]
+
+    def simulate(self, x: np.ndarray, some: np.ndarray | None = None) -> np.ndarray:
+        """Whitened errors ``(B, W, m)`` of vectors ``(B, n)``; ``some`` as in
         `errors`."""
-        return self.residuals.whitened(self.residuals.grouped(self.errors(x, blocks)))
+        at = None if some is None else self.windows_of(some)
+        grouped = self.residuals.grouped(self.errors(x, some))
+        return self.residuals.whitened(grouped, at)
 
     def columns(self, place: Place, fitted: bool = True) -> np.ndarray:
         """Entries of the whole vector that belong to a place."""
@@ -215,10 +224,12 @@ class Selector:
     def _tried(self, base: Model, candidates: Sequence[Candidate]) -> Arrays:
         """Costs, indices and ends of the candidates that predict finite numbers."""
         x = base.fit.x
-        # A short list of names needs no more, and a larger robot's takes minutes.
-        blocks = 1 if self.predictor.machine.wide else None
-        seen = min(self.count, len(self.blocks[:blocks]) * BLOCK)
-        w = self.weight[:seen]
+        some = np.arange(len(self.blocks))
+        if self.predictor.machine.wide:
+            # A short list of names needs no more, and takes minutes as it is.
+            some = some[:: max(1, len(some) // _SCREENED)]
+        seen = self.windows_of(some)
+        w = self.weight[seen]
         asks, spans = [], []
         for c in candidates:
             y = self.started(x, c)
@@ -228,8 +239,8 @@ class Selector:
             moved, step = difference(y, cols, self.bounds)
             asks.append(np.concatenate([y[None], moved]))
             spans.append((cols, step))
-        got, at = self._many(np.concatenate(asks), blocks), 0
-        known = base.fit.slope[:seen] * self.bounds.size[base.fit.active]
+        got, at = self._many(np.concatenate(asks), some), 0
+        known = base.fit.slope[seen] * self.bounds.size[base.fit.active]
         costs, which, ends = [], [], []
         for i, (c, ask) in enumerate(zip(candidates, asks, strict=True)):
             cols, step = spans[i]
@@ -258,11 +269,11 @@ class Selector:
         found = np.array(costs), np.array(which, int), np.reshape(ends, shape)
         return dict(zip(_TRIED, found, strict=True))
 
-    def _many(self, x: np.ndarray, blocks: int | None, most: int = 256) -> np.ndarray:
+    def _many(self, x: np.ndarray, some: np.ndarray, most: int = 256) -> np.ndarray:
         got = []
         with self.progress("trying effects", len(x)) as shown:
             for i in range(0, len(x), most):
-                got.append(self.simulate(x[i : i + most], blocks))
+                got.append(self.simulate(x[i : i + most], some))
                 shown.advance(len(got[-1]))
         return np.concatenate(got)
 
