@@ -30,8 +30,13 @@ from easi_jax.gap.models import Candidate, Model
 from easi_jax.gap.outcome import for_people
 from easi_jax.gap.own_steps import error_of_steps, within_a_step
 from easi_jax.gap.places import places, ripples
-from easi_jax.gap.predictor import Predictor
-from easi_jax.gap.residuals import make_residuals, start_sensitivity, step_groups
+from easi_jax.gap.predictor import BLOCK, Predictor
+from easi_jax.gap.residuals import (
+    Residuals,
+    make_residuals,
+    start_sensitivity,
+    step_groups,
+)
 from easi_jax.gap.scales import scales_of
 from easi_jax.gap.selection import Selector, as_sine, shortlist
 from easi_jax.gap.table import EFFECTS, Place
@@ -369,6 +374,26 @@ def test_what_is_not_finite_loses(model: mujoco.MjModel, runs: list[Run]) -> Non
     lost = selector.model([], fit)
     assert lost.loss.shape == lost.gap.shape == (5,)
     assert np.isinf(lost.loss).all() and np.isinf(lost.gap).all()
+
+
+def test_some_blocks_are_whitened_as_among_all(predictor: Predictor) -> None:
+    count, blocks = len(predictor.windows), np.arange(predictor.blocks)
+    layout = predictor.layout
+    bounds, group = bounds_of(ParameterSpace(()), layout), np.arange(count) % 5
+    selector = Selector(predictor, blocks, count, bounds, group, ())
+    rng = np.random.default_rng(0)
+    groups = step_groups(predictor.steps)
+    root = rng.normal(size=(count, len(groups), len(groups)))
+    selector.residuals = Residuals(groups, np.ones(1), root, root)
+    selector.steps = rng.normal(size=(count, predictor.steps, 1))
+    assert count % BLOCK  # the last block is not full
+    x = np.append(predictor.neutral, 0.3)[None]
+    some = blocks[[0, -1]]
+    at = selector.windows_of(some)
+    assert len(at) == BLOCK + count % BLOCK and at[-1] == count - 1
+    np.testing.assert_allclose(
+        selector.simulate(x, some), selector.simulate(x)[:, at], rtol=1e-6, atol=1e-9
+    )
 
 
 def test_the_error_of_steps_is_what_smaller_ones_take_away(
