@@ -9,8 +9,13 @@ truth lies inside the 50 % and the 90 % regions along the directions that the da
 determine, and how large the error is beside the Cramer-Rao bound of the same data. One
 line a target is added to ``coverage.jsonl``; a run that was stopped goes on, and
 several share the work by ``--shard`` (the second of four is 2/4).
+
+With ``--late`` the targets' commands come late, which the model knows nothing of: what
+it then says of its parameters is wrong, and has to say so. Lines are in
+``coverage_late.jsonl``.
 """
 
+import copy
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -33,10 +38,13 @@ class Config:
     """Demonstration trajectories of each: 200 s."""
     generations: int = 50
     """Generations of each search."""
+    late: float = 0.0
+    """How late the targets' commands come [s]."""
     shard: str = "1/1"
     """Which part of the targets this process runs."""
-    out: Path = RESULTS / "coverage.jsonl"
-    """Where a line for each target is added."""
+    out: Path | None = None
+    """Where a line for each target is added; coverage.jsonl of the results, or
+    coverage_late.jsonl, where not given."""
 
 
 def run(config: Config) -> None:
@@ -45,20 +53,22 @@ def run(config: Config) -> None:
     from easi_jax.io.versions import versions
 
     part, parts = shard(config.shard)
+    out = config.out or RESULTS / f"coverage{'_late' * (config.late > 0)}.jsonl"
     mine = list(range(config.targets))[part - 1 :: parts]
-    done = {row["seed"] for row in read_rows(config.out)}
+    alike = (r for r in read_rows(out) if r.get("late", 0.0) == config.late)
+    done = {row["seed"] for row in alike}
     seeds = [s for s in mine if s not in done]
     if not seeds:
-        return say(f"all {len(mine)} targets are in {config.out}")
+        return say(f"all {len(mine)} targets are in {out}")
     solve = _solver(config)
     given = {"command": command_of("benchmarks.coverage", config)}
-    given |= {"versions": versions()}
+    given |= {"versions": versions(), "late": config.late}
     with progress("coverage", len(mine), len(mine) - len(seeds)) as shown:
         for seed in seeds:
             row = {"seed": seed, **solve(seed), **given}
-            add_row(config.out, row)
+            add_row(out, row)
             shown.advance(1, refined=row["refined"]["distance"] / max(row["rank"], 1))
-    say(f"written: {config.out}")
+    say(f"written: {out}")
 
 
 def _solver(config: Config) -> Any:
@@ -83,6 +93,10 @@ def _solver(config: Config) -> Any:
     env = make("cartpole")
     space = env.space.select([n for n in env.space.names if n not in WEIGHED])
     machine = Machine(env.mj_model, space, env.dt)
+    real = copy.copy(env)
+    real.machine, real.space = machine, space
+    if config.late > 0:
+        real.machine = machine.rebuilt(fixed={"effect.delay.cart": config.late})
     search = Search(
         machine, preset("default", generations=config.generations, horizon=8)
     )
@@ -91,9 +105,9 @@ def _solver(config: Config) -> Any:
     @functools.partial(jax.jit, compiler_options=fast_loops())
     def find(key: jax.Array, truth: jax.Array) -> Any:
         k_run, k_noise, k_search = jax.random.split(key, 3)
-        model = machine.model(space.to_si(truth))
+        model = real.machine.model(space.to_si(truth))
         runs = collect(
-            *(env, model, controller, k_run, config.trajectories, env.episode_length)
+            *(real, model, controller, k_run, config.trajectories, env.episode_length)
         )
         demos = measured(runs, noise, k_noise)
         data = SearchData(windows(demos, 8, 4), noise, ())

@@ -17,6 +17,47 @@ TARGETS = 100
 
 def section(folder: Path) -> list[str]:
     """Coverage of the regions, and errors beside the Cramer-Rao bound."""
+    return [*_right(folder), *_late(folder)]
+
+
+def _late(folder: Path) -> list[str]:
+    """Coverage where commands come late, which the model knows nothing of."""
+    out = ["### Where the model lacks something"]
+    rows = read_rows(folder / "coverage_late.jsonl")
+    if not rows:
+        return [*out, "Not run: `python -m benchmarks.coverage --late 0.005`."]
+    lines = []
+    for late in sorted({r["late"] for r in rows}):
+        mine = [r for r in rows if r["late"] == late]
+        plain = [{**r, "plain": {"distance": r[WAYS[-1]]["bound"]}} for r in mine]
+        lines.append(
+            (
+                f"{1000 * late:g} ms",
+                str(len(mine)),
+                *(
+                    f"{covered(found, way, q).mean():.0%}"
+                    for found, way in ((plain, "plain"), (mine, WAYS[-1]))
+                    for q in (0.5, 0.9)
+                ),
+                f"{np.median(beside_bound(mine, WAYS[-1])):.3g}",
+            )
+        )
+    head = (
+        *("late by", "targets", "50 %, information", "90 %, information"),
+        *("50 %, as stated", "90 %, as stated", "error / bound"),
+    )
+    return [
+        *out,
+        "`python -m benchmarks.coverage --late`, commits "
+        f"{commits_of(rows)}. The same Cartpoles with commands that come late, which "
+        "the model does not know: truths inside the regions of the data's information "
+        "alone, and inside those that are stated, in which what the model errs by "
+        "counts.",
+        markdown_table(head, lines),
+    ]
+
+
+def _right(folder: Path) -> list[str]:
     out = ["## What the stated spread is worth"]
     rows = read_rows(folder / "coverage.jsonl")
     if not rows:

@@ -73,3 +73,25 @@ def test_the_page_counts_what_is_inside(tmp_path: Path) -> None:
 
 def test_nothing_run_is_said(tmp_path: Path) -> None:
     assert "Not run" in coverage_summary.section(tmp_path)[-1]
+
+
+def test_late_targets_have_a_table_of_their_own(tmp_path: Path) -> None:
+    """Regions that allow for what the model errs by, beside those that do not."""
+    rng, lines = np.random.default_rng(0), []
+    for seed in range(100):
+        square = float((rng.normal(size=4) ** 2).sum())
+        row: dict = {"seed": seed, "rank": 4, "late": 0.005}
+        row |= {"versions": {"commit": "0123456789"}}
+        row[coverage.WAYS[-1]] = {"distance": square, "bound": 100.0 * square}
+        lines.append(json.dumps(row))
+    (tmp_path / "coverage_late.jsonl").write_text("\n".join(lines) + "\n")
+    said = coverage_summary.section(tmp_path)[-1].splitlines()[-1]
+    late, count, *shares, ratio = [x.strip() for x in said.strip("|").split("|")]
+    assert (late, count) == ("5 ms", "100")
+    plain, stated = (
+        [float(x[:-1]) for x in shares[:2]],
+        [float(x[:-1]) for x in shares[2:]],
+    )
+    assert max(plain) <= 2
+    assert stated == pytest.approx([50, 90], abs=12)
+    assert float(ratio) == pytest.approx(10, rel=0.2)

@@ -12,9 +12,12 @@ import pytest
 
 from benchmarks import paper, paper_twin, twin_measures
 from benchmarks.paper_cells import Cell
+from benchmarks.rival_cells import AFTER_GAP
 from benchmarks.twin import CARTPOLE, GAPS, GO2, Gap, Motor, Twin
 from benchmarks.twin_runs import commanded, play
 from easi_jax.errors import UserError
+from easi_jax.found_effects import EffectEntry
+from easi_jax.io.effects_file import write_effects
 from easi_jax.io.logs import read_logs, write_log
 from easi_jax.rl.evaluate import evaluate
 from easi_jax.rl.networks import PolicyParams, act
@@ -289,11 +292,32 @@ def test_what_was_not_searched_stays_as_under_udr() -> None:
     assert cov[0, 0] == pytest.approx(0.01)
 
 
+def test_what_the_gap_workflow_named_is_in_search_and_training(tmp_path: Path) -> None:
+    env = ENVS["go2"]
+    assert paper_twin.with_effects(env, tmp_path) is env
+    entries = [
+        EffectEntry("actuator_delay", a, "actuator", {"delay": 0.015}, {"delay": 1e-3})
+        for a in (env.mj_model.actuator(i).name for i in range(env.mj_model.nu))
+    ]
+    (tmp_path / "gap").mkdir()
+    shown = [dict(e.columns) for e in entries]
+    write_effects(tmp_path / "gap" / "effects.yaml", "go2", entries, shown, [])
+    late = paper_twin.with_effects(env, tmp_path)
+    assert late.space.names == (*env.space.names, "actuator_delay@all.delay")
+    searched = paper_twin.with_effects(paper_twin.walker(), tmp_path).space
+    n = len(searched.names)
+    found = {"names": searched.names, "unit_mean": np.arange(n), "unit_cov": np.eye(n)}
+    mean, _ = paper_twin.whole(late.space, found)
+    assert mean[-1] == n - 1 and mean[late.space.names.index("ground_friction")] == 0.5
+
+
 def test_cells_are_of_the_twins_and_named_so() -> None:
     for experiment, robot in (("table2", "cartpole"), ("fig7", "go2")):
         cells = paper.cells(paper.Config(experiment, seeds=(0, 1)))
-        assert {c.method for c in cells} == {"UDR", "EASI paper", "EASI default"}
+        assert [c.method for c in cells[:4]] == list(paper.ON_HARDWARE)
         assert all("twin" in c.key and c.robot == robot for c in cells)
+    with pytest.raises(UserError, match="of table2 and fig7"):
+        paper.cells(paper.Config("table1", methods=(AFTER_GAP,)))
     with pytest.raises(UserError, match="no GARAT in a twin"):
         paper_twin.solve(Cell("GARAT", "cartpole", "twin", 0), Path("none"))
 
@@ -310,7 +334,7 @@ def test_cells_at_their_smallest(
     monkeypatch.setattr(paper_twin, "LOGGED", 120)
     small = ("population=16", "generations=2", "rollout_steps=20")
     cell = Cell("UDR", robot, "twin", 0, 4, 10_240, settings=small)
-    for method in ("UDR", "EASI paper", "EASI default"):
+    for method in paper.ON_HARDWARE[: 4 if robot == "cartpole" else 3]:
         row = paper_twin.solve(replace(cell, method=method), tmp_path)
         assert "not" in row["stands_for"] and np.isfinite(row["return"])
         if method != "UDR":
