@@ -130,7 +130,8 @@ def motion_and_speed(
         color, style = SERIES[i % len(SERIES)], dash(i)
         for values in seeds:
             seen = [np.nan if v is None else v for v in values]
-            axis.plot(commands, seen, color=color, lw=1.2, ls=style)
+            # A single command between falls would be no line.
+            axis.plot(commands, seen, color=color, lw=1.2, ls=style, marker="o", ms=2)
         shown = Line2D([], [], color=color, lw=1.6, ls=style, label=method)
         handles.setdefault(method, shown)
     axis.set_title("speed [m/s]")
