@@ -21,6 +21,7 @@ from easi_jax import replay
 from easi_jax.machine import Machine
 from easi_jax.mesh import make_mesh, replicated, sharded_map
 from easi_jax.parameters import ParameterSpace
+from easi_jax.runtime import on_cpu
 from easi_jax.segments import Segments
 
 _WEAK = 0.5  # std of a log ratio beyond which a direction is called undetermined
@@ -221,7 +222,8 @@ class PairedFit:
         """
         mesh = self.mesh or make_mesh()
         share = -(-self.segments.count // mesh.size)
-        at_once = self.machine.batch if self.machine.wide else _LANES
+        wide = self.machine.wide or not on_cpu()
+        at_once = self.machine.batch if wide else _LANES
         wanted = at_once // points
         batch = min(share, max(1, wanted))
         rounds = -(-share // batch)

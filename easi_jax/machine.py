@@ -19,10 +19,12 @@ from easi_jax.parameters import ParameterSpace
 from easi_jax.physics import WRITTEN_OUT, Physics, at_rest, control_step
 from easi_jax.quantities import is_scalar, joint_name
 from easi_jax.recording import physics_steps
+from easi_jax.runtime import on_cpu
 
 # Small enough for XLA to run a simulation as one piece (see `runtime`).
 _BATCH = 128  # benchmarks/speed.py
 _WIDE_BATCH = 32  # benchmarks/physics.py
+_ACCELERATOR_BATCH = 16_384  # benchmarks/scaling.py
 _FORWARD_MODE = 3  # degrees of freedom: of six, written out, it compiles for minutes
 _SETTLED = 4.0  # time constants after which a lag has forgotten
 
@@ -41,7 +43,6 @@ class Machine:
         wide: whether it is too large to be written out entry by entry.
         by_differences: whether slopes of a fit are central differences, not
             forward-mode derivatives.
-        batch: simulations at once on a device; more would leave a CPU core's cache.
         fixed: values by address that are not those of ``mj_model``, effects among them.
         past_steps: commands before a measured start that its simulation has use for;
             0 where no effect lies on the way of a command.
@@ -70,7 +71,6 @@ class Machine:
         self.fixed = dict(fixed or {})
         self.wide = mj_model.nv > WRITTEN_OUT
         self.by_differences = mj_model.nv > _FORWARD_MODE
-        self.batch = _WIDE_BATCH if self.wide else _BATCH
         self.base = self._put().replace(
             sense=sense,
             sense_size=sense_size,
@@ -81,6 +81,14 @@ class Machine:
         if self.base.effects is not None and effects.remembers(self.base.present):
             settled = _SETTLED * self._longest("effect.lag.") / self.dt
             self.past_steps = self.base.delay_steps + 1 + _steps(settled)
+
+    @cached_property
+    def batch(self) -> int:
+        """Simulations at once on a device. More would leave a CPU core's cache; an
+        accelerator hides behind thousands what each step waits for."""
+        if not on_cpu():
+            return _ACCELERATOR_BATCH
+        return _WIDE_BATCH if self.wide else _BATCH
 
     def _longest(self, kind: str) -> float:
         """The largest value that effects of a kind may have [s]; 0 without any."""

@@ -46,6 +46,13 @@ def backend_started() -> bool:
     return bool(xla_bridge.backends_are_initialized())
 
 
+def on_cpu() -> bool:
+    """Whether programs run on CPU cores; starts the backend."""
+    import jax
+
+    return jax.default_backend() == "cpu"
+
+
 def _setting(name: str) -> Any:
     import jax
 

@@ -33,10 +33,11 @@ from easi_jax.model import Model, full_structure
 from easi_jax.parameters import ParameterSpace
 from easi_jax.physics import Physics, arrived_step
 from easi_jax.quantities import scalar_places
-from easi_jax.runtime import fast_loops, quick_compile
+from easi_jax.runtime import fast_loops, on_cpu, quick_compile
 
 BLOCK = 16  # windows
-_ITEMS = 4  # that a device works on together: many requests ask for few
+_ITEMS = 4  # that a core works on together: many requests ask for few
+_ACCELERATOR_ITEMS = 256
 _ROW = 0.01  # s of it at a time
 
 
@@ -104,6 +105,7 @@ class Predictor:
                 self.wrapped[m.jnt_dofadr[j]] = True
         self._scalar = scalar_places(m).T
         self._mesh = make_mesh()
+        self._items = _ITEMS if on_cpu() else _ACCELERATOR_ITEMS
         # By powers of two, so that the program of one log often serves the next.
         self._room = 1 << (self.blocks - 1).bit_length()
         self._data = self._placed(windows)
@@ -216,7 +218,7 @@ class Predictor:
     def _program(self, play: bool) -> Any:
         """One of the two, compiled: for an arm each takes a minute, so side by side."""
         if not self._compiled:
-            batch = _ITEMS * self._mesh.size
+            batch = self._items * self._mesh.size
             like = (
                 np.zeros((batch, len(self.neutral)), np.float32),
                 np.zeros(batch, np.int32),
@@ -380,7 +382,7 @@ class Predictor:
 
     def _batches(self, chosen: np.ndarray) -> list[np.ndarray]:
         """Items by batches of one size; the last item fills the last of them."""
-        batch = _ITEMS * self._mesh.size
+        batch = self._items * self._mesh.size
         pad = -len(chosen) % batch
         filled = np.concatenate([chosen, np.repeat(chosen[-1:], pad)])
         return list(filled.reshape(-1, batch))
