@@ -9,6 +9,7 @@ import pytest
 from easi_jax.errors import UserError
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace, declare
+from envs import make
 
 XML = """<mujoco><option timestep="0.004"/><worldbody>
 <body name="base" pos="0 0 1"><freejoint name="root"/><geom size="0.1" mass="1"/>
@@ -79,3 +80,13 @@ def test_no_difference_is_zero_with_a_finite_slope() -> None:
     np.testing.assert_array_equal(jax.jit(m.difference)(q, v, q, v), 0.0)
     slope = jax.jit(jax.jacfwd(lambda t: m.difference(q, v, m.move(q, t), v)[:10]))(v)
     np.testing.assert_allclose(slope, np.eye(10), atol=1e-4)
+
+
+@pytest.mark.parametrize("cpu", [True, False])
+def test_a_device_works_on_as_many_as_suit_it(
+    cpu: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A core on what its cache holds, an accelerator on thousands."""
+    monkeypatch.setattr("easi_jax.machine.on_cpu", lambda: cpu)
+    env = make("cartpole")
+    assert (Machine(env.mj_model, env.space, env.dt).batch >= 4096) != cpu
