@@ -1,6 +1,7 @@
 """From the end of a search to an honest distribution over parameters."""
 
 from dataclasses import replace
+from typing import Any
 
 import flax.struct
 import jax
@@ -148,8 +149,7 @@ def estimate(
     initial range as prior. A direction that the data do not show keeps the initial
     spread, whatever the search has drifted to. Where the fit leaves more than the noise
     explains, the model lacks something, and the information counts for less
-    (`_trusted`): spreads are wider, and the mean goes back towards the middle of the
-    initial range along what is then left open. Without ``informed`` it is the search's
+    (`_trusted`). Without ``informed`` it is the search's
     own covariance alone. ``misfit (2 nv,)`` is what the model itself errs by in every
     step, on top of the noise; it, ``robust``, ``free_starts`` and ``near`` go to
     `easi_jax.refine.refine`, which starts from so many draws of the search's spread as
@@ -238,13 +238,13 @@ def _of_fit(
     informed: bool,
 ) -> Estimate:
     """What is stated of a fit, after a search that ended at ``mean``, ``cov``."""
-    trusted = _trusted(fit.excess)
-    open_cov, _, shown = _posterior(fit.raised_hessian * trusted)
-    # Back to the initial range, along what the data do not hold it at.
-    back = (1.0 - trusted) * open_cov @ (0.5 - fit.raised) / _INITIAL_VARIANCE
-    back = jnp.where(informed, back, 0.0)
-    given = fit.unit + back, fit.raised + back
-    center, spread = _near_zero(space, *given, open_cov, shown)
+
+    def said(trusted: Any) -> tuple[jax.Array, jax.Array]:
+        open_cov, _, shown = _posterior(fit.raised_hessian * trusted)
+        return _near_zero(space, fit.unit, fit.raised, open_cov, shown)
+
+    center = said(1.0)[0]  # what predicts best, whatever it stands in for
+    spread = said(_trusted(fit.excess))[1]
     return Estimate(
         distribution=gaussian(space, center, spread if informed else cov),
         search_mean=mean,
