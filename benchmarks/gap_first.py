@@ -3,7 +3,7 @@
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import jax
@@ -38,12 +38,19 @@ class GapFirst:
     """The model, MJCF."""
     time_limit: float = 14400.0
     """Of train.gap [s]."""
+    told: list[str] = field(default_factory=list, compare=False)
+    """What it named last, with the fitted numbers."""
 
     def fit(
         self, task: Task, demonstrations: Segments, budget: Budget, key: jax.Array
     ) -> Identified:
         """EASI's result, in the coordinates of the task's own parameters."""
         effects = self.named(task, demonstrations)
+        self.told[:] = [
+            f"{e.effect}@{e.at}: {k} {v:.3g}"
+            for e in effects.entries
+            for k, v in e.columns.items()
+        ]
         machine = machine_with(task.machine, effects)
         found = Easi(refine=True).fit(
             replace(task, machine=machine), demonstrations, budget, key

@@ -102,7 +102,7 @@ def solve(cell: Cell) -> dict[str, Any]:
         ``covered``: whether the truth is in the found 90 % region of these directions;
         ``log_ratio`` and unit-coordinate ``std`` of each parameter; ``seconds``;
         control steps ``simulated`` and, of the real machine beyond the recording,
-        ``measured``.
+        ``measured``; what train.gap has ``named``, where it came first.
     """
     import jax
     import jax.numpy as jnp
@@ -129,7 +129,8 @@ def solve(cell: Cell) -> dict[str, Any]:
     )
     information = fisher(task, demos, space.to_unit(theta))
     begun = time.monotonic()
-    found = method_of(cell, rig.xml).fit(task, demos, Budget(cell.budget), k_fit)
+    method = method_of(cell, rig.xml)
+    found = method.fit(task, demos, Budget(cell.budget), k_fit)
     found = jax.block_until_ready(found)
     seconds = time.monotonic() - begun
     mean, cov = np.asarray(found.distribution.mean), covariance(found.distribution)
@@ -144,6 +145,7 @@ def solve(cell: Cell) -> dict[str, Any]:
         "seconds": seconds,
         "simulated": found.simulated,
         "measured": found.measured,
+        **({"named": list(method.told)} if cell.method == AFTER_GAP else {}),
     }
 
 
