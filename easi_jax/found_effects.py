@@ -158,7 +158,8 @@ def _parameter(
 Number = tuple[str, tuple[int, ...], int]
 
 
-def _numbers(m: mujoco.MjModel, addresses: Iterable[str]) -> list[Number]:
+def numbers_of(m: mujoco.MjModel, addresses: Iterable[str]) -> list[Number]:
+    """The numbers of the model that addresses set: field, index and sign of each."""
     writers = language.resolve(m, (tuple(addresses),))
     return [(e.field, e.index, e.sign) for w in writers for e in w.entries]
 
@@ -170,18 +171,18 @@ def _renewed(
 
     Where a parameter sets several places, it gets their mean.
     """
-    values = {n: v for a, v in own.items() for n in _numbers(m, (a,))}
+    values = {n: v for a, v in own.items() for n in numbers_of(m, (a,))}
     owners: set[Number] = set()
     out = []
     for p in space.parameters:
-        places = _numbers(m, p.addresses)
+        places = numbers_of(m, p.addresses)
         if not any(n in values for n in places):
             out.append(p)
             continue
         owners.update(places)
         nominal = float(np.mean([values.get(n, p.nominal) for n in places]))
         out.append(_about(p, nominal))
-    rest = {a: v for a, v in own.items() if not owners & set(_numbers(m, (a,)))}
+    rest = {a: v for a, v in own.items() if not owners & set(numbers_of(m, (a,)))}
     return ParameterSpace(tuple(out)), rest
 
 

@@ -59,6 +59,19 @@ class GapProblem:
     readings: list[Any]
     notes: list[str]
 
+    @property
+    def fixed(self) -> dict[str, float]:
+        """What the model has and MJCF cannot say, where no parameter sets it."""
+        from easi_jax.found_effects import numbers_of
+
+        m = self.model.mj_model
+        free = {n for p in self.space.parameters for n in numbers_of(m, p.addresses)}
+        return {
+            address: value
+            for address, value in self.model.fixed.items()
+            if not free & set(numbers_of(m, (address,)))
+        }
+
 
 def read_gap_problem(config: Any) -> GapProblem:
     """Reads and checks everything; nothing is written yet.

@@ -85,7 +85,7 @@ def run(config: Config) -> None:
         problem.noise,
         config.horizon,
         tell=say,
-        fixed=problem.model.fixed,
+        fixed=problem.fixed,
         progress=partial(progress, patience=_PATIENCE),
     )
     with RunFolder.open(

@@ -21,7 +21,7 @@ from envs import make
 from tests.gap_cases import Effect, make_case
 from train import gap
 from train._command import main
-from train._gap_problem import beyond_mjcf
+from train._gap_problem import GapProblem, beyond_mjcf, read_model
 
 
 def run(*args: object) -> None:
@@ -277,3 +277,15 @@ def test_a_built_in_robot_keeps_what_its_xml_cannot_say() -> None:
     machine = Machine(env.mj_model, ParameterSpace(()), env.dt, fixed=fixed)
     model = machine.model(jnp.zeros(0))
     np.testing.assert_allclose(model.speed_limit, env.model().speed_limit)
+
+
+def test_what_a_parameter_sets_is_not_fixed_beside_it() -> None:
+    """A built-in robot's speed limit is its own value, or that of a refit."""
+    model = read_model("cartpole")
+    space = make("cartpole").space
+    some = space.select([n for n in space.names if n != "cart_speed_limit"])
+    (address,) = space.parameters[space.index("cart_speed_limit")].addresses
+    for own, left in ((some, {address}), (space, set())):
+        problem = GapProblem(model, own, [], [], "", [], None, [], [])
+        assert problem.fixed.keys() == left
+        Machine(model.mj_model, own, 0.02, fixed=problem.fixed)
