@@ -48,7 +48,7 @@ def _late(folder: Path) -> list[str]:
     )
     return [
         *out,
-        "`python -m benchmarks.coverage --late`, commits "
+        "`python -m benchmarks.coverage --late 0.005 --targets 12`, commits "
         f"{commits_of(rows)}. The same Cartpoles with commands that come late, which "
         "the model does not know: truths inside the regions of the data's information "
         "alone, and inside those that are stated, in which what the model errs by "
