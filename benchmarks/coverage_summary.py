@@ -22,7 +22,7 @@ def section(folder: Path) -> list[str]:
 
 def _late(folder: Path) -> list[str]:
     """Coverage where commands come late, which the model knows nothing of."""
-    out = ["### Where the model lacks something"]
+    out = ["### Spreads where the model falls short"]
     rows = read_rows(folder / "coverage_late.jsonl")
     if not rows:
         return [*out, "Not run: `python -m benchmarks.coverage --late 0.005`."]
