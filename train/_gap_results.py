@@ -39,7 +39,7 @@ def sentence(found: Any) -> str:
     pair = f" between {' and '.join(names)}" if place.kind == "geom" else ""
     said = {"at": place.at, "kind": place.kind, "pair": pair}
     words = _WORDS[place.effect]
-    if place.shared:
+    if found.parts:
         words = words.replace('actuator "{at}"', "{at}")
         said["at"] = _actuators(found)
     return words.format(**said, **shown)

@@ -184,9 +184,9 @@ def test_a_stopped_analysis_goes_on(
 
 
 def counted(method: Any, calls: list[int]) -> Any:
-    def counting(self: Any, x: Any) -> Any:
+    def counting(self: Any, x: Any, *some: Any) -> Any:
         calls.append(len(x))
-        return method(self, x)
+        return method(self, x, *some)
 
     return counting
 

@@ -23,6 +23,7 @@ def outcome() -> Any:
     """One effect at a joint, a run that disagrees, a channel left out."""
     figures = SimpleNamespace(gap=0.2, interval=(0.1, 0.3), si=np.ones(1))
     found = SimpleNamespace(
+        parts=(),
         place=SimpleNamespace(
             effect="coulomb_friction", at=EVIL, kind="joint", key=f"friction@{EVIL}"
         ),
