@@ -158,10 +158,17 @@ def _parameter(
 Number = tuple[str, tuple[int, ...], int]
 
 
-def numbers_of(m: mujoco.MjModel, addresses: Iterable[str]) -> list[Number]:
-    """The numbers of the model that addresses set: field, index and sign of each."""
+def _numbers(m: mujoco.MjModel, addresses: Iterable[str]) -> list[Number]:
     writers = language.resolve(m, (tuple(addresses),))
     return [(e.field, e.index, e.sign) for w in writers for e in w.entries]
+
+
+def set_by_none(
+    m: mujoco.MjModel, space: ParameterSpace, values: Mapping[str, float]
+) -> dict[str, float]:
+    """Those values, by address, that no parameter sets."""
+    free = {n for p in space.parameters for n in _numbers(m, p.addresses)}
+    return {a: v for a, v in values.items() if not free & set(_numbers(m, (a,)))}
 
 
 def _renewed(
@@ -171,19 +178,16 @@ def _renewed(
 
     Where a parameter sets several places, it gets their mean.
     """
-    values = {n: v for a, v in own.items() for n in numbers_of(m, (a,))}
-    owners: set[Number] = set()
+    values = {n: v for a, v in own.items() for n in _numbers(m, (a,))}
     out = []
     for p in space.parameters:
-        places = numbers_of(m, p.addresses)
+        places = _numbers(m, p.addresses)
         if not any(n in values for n in places):
             out.append(p)
             continue
-        owners.update(places)
         nominal = float(np.mean([values.get(n, p.nominal) for n in places]))
         out.append(_about(p, nominal))
-    rest = {a: v for a, v in own.items() if not owners & set(numbers_of(m, (a,)))}
-    return ParameterSpace(tuple(out)), rest
+    return ParameterSpace(tuple(out)), set_by_none(m, space, own)
 
 
 def _about(p: Parameter, nominal: float) -> Parameter:

@@ -62,15 +62,9 @@ class GapProblem:
     @property
     def fixed(self) -> dict[str, float]:
         """What the model has and MJCF cannot say, where no parameter sets it."""
-        from easi_jax.found_effects import numbers_of
+        from easi_jax.found_effects import set_by_none
 
-        m = self.model.mj_model
-        free = {n for p in self.space.parameters for n in numbers_of(m, p.addresses)}
-        return {
-            address: value
-            for address, value in self.model.fixed.items()
-            if not free & set(numbers_of(m, (address,)))
-        }
+        return set_by_none(self.model.mj_model, self.space, self.model.fixed)
 
 
 def read_gap_problem(config: Any) -> GapProblem:
