@@ -209,9 +209,12 @@ def _named(robot: str, place: Path) -> None:
     Raises:
         RuntimeError: it failed; it has said why.
     """
+    from benchmarks.gap_first import GapFirst
+
     words = ["--model", robot, "--data", place / "log.csv", "--resume"]
     words += ["--parameters", place / "parameters.yaml", "--out", place / "gap"]
-    done = subprocess.run([sys.executable, "-m", "train.gap", *map(str, words)])
+    command = [sys.executable, "-m", "train.gap", *map(str, words)]
+    done = subprocess.run(command, timeout=GapFirst.time_limit)
     if done.returncode:
         raise RuntimeError(f"train.gap failed with {done.returncode}")
 
