@@ -4,10 +4,12 @@ A run that was stopped goes on, and several processes or batch jobs share the wo
 ``--shard`` (the second of four is 2/4) or ``--only``.
 """
 
+import contextlib
 import dataclasses
 import fcntl
 import json
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,12 +48,15 @@ def run_cells(
         every = [c for c in every if c.key == share.only]
         if not every:
             raise UserError(f'no cell "{share.only}": see --list')
+    if not every:
+        raise UserError("no cells: none of these methods can run here")
     part, parts = shard(share.shard)
-    done = {row["key"] for row in read_rows(share.out)}
+    done = {row["key"] for row in read_rows(share.out, ("key",))}
     if share.list:
         for c in every:
             say(f"{'done' if c.key in done else 'open'}  {c.key}")
         return
+    check_out(share.out)
     for c in every[part - 1 :: parts]:
         if c.key in done:
             continue
@@ -75,16 +80,86 @@ def shard(text: str) -> tuple[int, int]:
     return int(part), int(parts)
 
 
-def read_rows(path: Path) -> list[dict[str, Any]]:
-    """One a cell; none where the file is missing."""
-    if not path.is_file():
+def check_out(path: Path) -> None:
+    """Before hours of work: whether lines can be added.
+
+    Raises:
+        UserError: they cannot.
+    """
+    with _appending(path):
+        pass
+
+
+def read_rows(path: Path, names: Sequence[str] = ()) -> list[dict[str, Any]]:
+    """One a cell; none where the file is missing.
+
+    What a killed process left of its last line is no row; `add_row` takes it away.
+
+    Args:
+        names: what every line must have.
+
+    Raises:
+        UserError: the file cannot be read, or a line is not one of ours.
+    """
+    from easi_jax.errors import UserError
+    from easi_jax.io.files import os_reason, regular_file
+
+    try:
+        regular_file(path)
+        whole, end, _ = path.read_bytes().rpartition(b"\n")
+    except FileNotFoundError:
         return []
-    return [json.loads(line) for line in path.read_text().splitlines()]
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {os_reason(error)}") from error
+    rows = []
+    for number, line in enumerate(whole.split(b"\n") if end else (), 1):
+        try:
+            row = json.loads(line)
+        except (ValueError, RecursionError):
+            row = None
+        if not isinstance(row, dict) or not all(n in row for n in names):
+            raise UserError(
+                f"{path}, line {number}: not a line of this benchmark; take it out, "
+                "or name another --out"
+            )
+        rows.append(row)
+    return rows
 
 
 def add_row(path: Path, row: dict[str, Any]) -> None:
-    """Adds a line; several processes may do so at once."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        file.write(json.dumps(row) + "\n")
+    """Adds a line; several processes may do so at once.
+
+    Raises:
+        UserError: it cannot be written; the lines before are kept.
+    """
+    with _appending(path) as file:
+        _cut_torn_line(file)
+        file.write(json.dumps(row).encode() + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextlib.contextmanager
+def _appending(path: Path) -> Iterator[Any]:
+    """The file, for this process alone."""
+    from easi_jax.errors import UserError
+    from easi_jax.io.files import os_reason
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a+b") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield file
+    except OSError as error:
+        raise UserError(
+            f"cannot write {path}: {os_reason(error)}; free the disk or choose "
+            "another --out"
+        ) from error
+
+
+def _cut_torn_line(file: Any) -> None:
+    """Of a process that was killed, or of a full disk, as it wrote."""
+    file.seek(0)
+    whole, end, torn = file.read().rpartition(b"\n")
+    if torn:
+        file.truncate(len(whole) + len(end))

@@ -20,7 +20,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from benchmarks._cells import add_row, read_rows, shard
+from benchmarks._cells import add_row, check_out, read_rows, shard
 from benchmarks._common import RESULTS
 from benchmarks.recovery import NOISE, WEIGHED, controller
 from train._command import main, progress, say
@@ -50,16 +50,24 @@ class Config:
 def run(config: Config) -> None:
     """Runs the targets that are not there yet."""
     from benchmarks._common import command_of
+    from easi_jax.errors import UserError
     from easi_jax.io.versions import versions
 
+    for name in ("targets", "trajectories", "generations"):
+        if getattr(config, name) < 1:
+            raise UserError(f"--{name} {getattr(config, name)}: give at least 1")
+    if not 0 <= config.late < 1:
+        raise UserError(f"--late {config.late}: seconds, 0 or more and below 1")
     part, parts = shard(config.shard)
     out = config.out or RESULTS / f"coverage{'_late' * (config.late > 0)}.jsonl"
     mine = list(range(config.targets))[part - 1 :: parts]
-    alike = (r for r in read_rows(out) if r.get("late", 0.0) == config.late)
+    rows = read_rows(out, ("seed",))
+    alike = (r for r in rows if r.get("late", 0.0) == config.late)
     done = {row["seed"] for row in alike}
     seeds = [s for s in mine if s not in done]
     if not seeds:
         return say(f"all {len(mine)} targets are in {out}")
+    check_out(out)
     solve = _solver(config)
     given = {"command": command_of("benchmarks.coverage", config)}
     given |= {"versions": versions(), "late": config.late}

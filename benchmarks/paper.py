@@ -94,10 +94,15 @@ def cells(config: Config) -> list[Cell]:
     """The cells of an experiment, in the order in which they are run.
 
     Raises:
-        UserError: no such experiment, robot or method.
+        UserError: no such experiment, robot or method, or a number that makes no
+            sense.
     """
     from easi_jax.errors import UserError, nearest
+    from train._robots import check_seeds
 
+    check_seeds(config.seeds)
+    if config.env_steps is not None and config.env_steps < 1:
+        raise UserError(f"--env-steps {config.env_steps}: give at least 1")
     if config.experiment not in EXPERIMENTS:
         known = ", ".join(EXPERIMENTS)
         hint = nearest(config.experiment, EXPERIMENTS)

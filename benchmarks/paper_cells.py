@@ -388,15 +388,18 @@ def _trace(found: Any, truth: Any) -> list[list[list[float]]]:
 
 
 def udr_run(cell: Cell, folder: Path) -> Path:
-    """The run folder of a cell's UDR training, trained where it is not there yet."""
+    """The run folder of a cell's UDR training, trained where it is not there yet.
+
+    Raises:
+        UserError: nothing can be written there.
+    """
     from train import udr
 
     steps = "" if cell.env_steps is None else f"_{cell.env_steps}"
     words = "_".join(["udr", cell.robot, *cell.options]) + steps
     out = folder / f"{words}_{cell.seed}"
-    folder.mkdir(parents=True, exist_ok=True)
     # Another process may be at it: its result will do.
-    with (folder / f"{out.name}.lock").open("w") as lock:
+    with _opened(folder / f"{out.name}.lock") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if (out / "results.json").exists():
             return out
@@ -411,3 +414,17 @@ def udr_run(cell: Cell, folder: Path) -> Path:
             )
         )
     return out
+
+
+def _opened(path: Path) -> Any:
+    """A file to lock."""
+    from easi_jax.errors import UserError
+    from easi_jax.io.files import os_reason
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path.open("w")
+    except OSError as error:
+        raise UserError(
+            f"cannot write {path}: {os_reason(error)}; name another --folder"
+        ) from error

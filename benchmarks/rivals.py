@@ -82,10 +82,18 @@ def cells(config: Config) -> list[Cell]:
     """The cells, in the order in which they are run.
 
     Raises:
-        UserError: no such robot, setting or method.
+        UserError: no such robot, setting or method, or a number that makes no sense.
     """
     from easi_jax.errors import UserError, nearest
+    from train._robots import check_seeds
 
+    check_seeds(config.seeds)
+    for flag, value in (
+        ("trajectories", config.trajectories),
+        ("budget", config.budget),
+    ):
+        if value is not None and value < 1:
+            raise UserError(f"--{flag} {value}: give at least 1")
     for flag, given, known in (
         ("robots", config.robots, ROBOTS),
         ("settings", config.settings, SETTINGS),

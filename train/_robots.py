@@ -58,12 +58,15 @@ def _value(setting: str, text: str, like: Any) -> Any:
 
 
 def check_seeds(seeds: tuple[int, ...]) -> None:
-    """Raises UserError for an empty list, negative or repeated seeds."""
+    """Raises UserError for an empty list and for seeds that are repeated, negative or
+    too large: jax takes 32 bits of them."""
     from easi_jax.errors import UserError
 
-    if not seeds or len(set(seeds)) != len(seeds) or min(seeds) < 0:
+    most = 2**32 - 1
+    good = seeds and len(set(seeds)) == len(seeds) and min(seeds) >= 0
+    if not good or max(seeds) > most:
         raise UserError(
-            f"seeds are {list(seeds)}: give at least one, each 0 or more and once"
+            f"seeds are {list(seeds)}: give at least one, each 0 to {most} and once"
         )
 
 

@@ -48,8 +48,9 @@ def run(config: Config) -> None:
     from easi_jax.io.video import check_video, render, write_video
     from easi_jax.pipeline import Pipeline, PipelineConfig, target_parameters
     from train._effects import effect_notes, read_given
-    from train._robots import load_policies
+    from train._robots import check_seeds, load_policies
 
+    check_seeds((config.seed,))
     if config.episodes < 1:
         raise UserError(f"--episodes is {config.episodes}: give at least 1")
     if config.render is not None:

@@ -81,7 +81,9 @@ def run(config: Config) -> None:
     """Reads and checks, simulates, chooses, writes."""
     from train._excite_problem import read_excite_problem
     from train._excite_results import results, show, write_results
+    from train._robots import check_seeds
 
+    check_seeds((config.seed,))
     problem = read_excite_problem(config)
     for note in problem.notes:
         say(f"note: {note}")
