@@ -26,8 +26,14 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str
 
 
 def commits_of(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Commits that lines or results were made with, short."""
-    return ", ".join(sorted({(r["versions"]["commit"] or "unknown")[:7] for r in rows}))
+    """Commits that lines or results were made with, short; + is kept, which says that
+    there were changes beside."""
+    return ", ".join(sorted({short(r["versions"]["commit"]) for r in rows}))
+
+
+def short(commit: str | None) -> str:
+    """A commit as `easi_jax.io.versions` has it, in 7 characters and its +."""
+    return commit[:7] + "+" * commit.endswith("+") if commit else "unknown"
 
 
 def command_of(module: str, config: Any) -> str:

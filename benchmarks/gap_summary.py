@@ -5,7 +5,7 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks._cells import read_rows
-from benchmarks._common import markdown_table
+from benchmarks._common import markdown_table, short
 from benchmarks.gap_real import MACHINES
 from benchmarks.gap_score import (
     GOALS,
@@ -37,7 +37,7 @@ def generated(folder: Path) -> list[str]:
     out = [
         "## Hidden effects",
         f"{len(rows)} generated cases (`python -m benchmarks.gap`), commits "
-        f"{', '.join(sorted({r['commit'][:7] for r in rows}))}.",
+        f"{', '.join(sorted({short(r['commit']) for r in rows}))}.",
     ]
     lines = []
     for name, (hits, count) in shares(rows).items():

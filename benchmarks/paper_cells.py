@@ -126,7 +126,8 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
         ``return`` in the target (mean of `EPISODES` episodes) where there is a policy;
         ``log_ratio`` of each parameter to the truth and unit-coordinate ``std`` where a
         distribution was found, and without a policy ``error``, the ratios' RMS along
-        the directions that the demonstrations determine; what was ``simulated`` and
+        the directions that the demonstrations determine, and ``start_error``, that of
+        the middle of where the search starts; what was ``simulated`` and
         ``measured``, ``seconds``.
         With ``cell.curves``: ``curve`` (control steps, returns in the target) of the
         last training, ``trace`` (mean, below, above) of each parameter by generation,
@@ -266,7 +267,10 @@ class _Bench:
         if cell.curves and found.trace is not None:
             row["trace"] = _trace(found, truth)
         if not cell.policy:
-            return self.policy, row | {"error": self._determined().error(off)}
+            known = self._determined()
+            begun = self._off(found.space.to_si(np.full(found.space.size, 0.5)))
+            row |= {"error": known.error(off), "start_error": known.error(begun)}
+            return self.policy, row
         learned = train(found.space, found.distribution, self.keys["final"])
         if cell.curves:
             row["curve"] = self._curve(curve[-1])

@@ -10,6 +10,7 @@ from pathlib import Path
 from statistics import mean, median, stdev
 from typing import Any
 
+from benchmarks import paper_matrix
 from benchmarks._cells import read_rows
 from benchmarks._common import markdown_table
 from benchmarks.paper import CHANGED, MUST, ON_HARDWARE, SEARCHES, STARTS
@@ -19,6 +20,7 @@ from benchmarks.paper_twin import TWIN
 from benchmarks.twin_measures import COMMANDS, EPISODES, TRACKED
 
 FLAT = 3.0  # times the best setting's error: no setting of the default is worse
+OURS = "EASI default"
 GOAL = 0.9  # share of the way from UDR to Oracle
 # Two a robot, as in the paper's Fig. 4: those that demonstrations determine best.
 SHOWN = {
@@ -28,9 +30,14 @@ SHOWN = {
     "go2": ("thigh_kp", "base_mass"),
 }
 _NOT_RUN = "not run"
+_EXACT = 1e-3  # log ratios below it train the same policy, but for chance
 _NO_HARDWARE = (
     "**A twin, not hardware**: MuJoCo C at 0.5 ms with effects that the model lacks "
     "(`benchmarks.twin`) stands for the paper's real"
+)
+_ERROR = (
+    "RMS of the log ratio to the truth along the directions that the demonstrations "
+    "determine."
 )
 _LENGTHS = (
     "Oracle and EASI train anew, by as many steps as UDR. FineTune and GARAT go on "
@@ -47,9 +54,11 @@ def sections(folder: Path) -> list[str]:
     out = ["## The paper's tables and figures"]
     if not rows:
         return [*out, "Not run: `python -m benchmarks.paper table1`."]
-    commits = sorted({r["versions"]["commit"][:7] for r in rows})
-    out.append(f"`python -m benchmarks.paper NAME`, commits {', '.join(commits)}.")
-    for part in (_table1, _table2, _table3, _table4, _table5, _fig6, _fig7, _runtime):
+    out += paper_matrix.section(rows)
+    for part in (
+        *(_table1, _table2, _table3, _table4, _table5),
+        *(_fig4, _fig6, _fig7, _runtime),
+    ):
         out += part(rows)
     pictures = figures(folder)
     for name in sorted(pictures):
@@ -142,7 +151,7 @@ def _table1(rows: Sequence[Row]) -> list[str]:
                 mine = found.get(method, {})
                 cells.append(told([mine[s] for s in sorted(mine)]))
                 ends = (found.get("UDR", {}), found.get("Oracle", {}))
-                cells.append(_share(mine, *ends))
+                cells.append(_judged(method, _share(mine, *ends)))
             lines.append((method, *cells))
         if all(c in (_NOT_RUN, "") for line in lines for c in line[1:]):
             out.append(f"Not run: `python -m benchmarks.paper table1 --robot {robot}`.")
@@ -153,8 +162,47 @@ def _table1(rows: Sequence[Row]) -> list[str]:
             f"{robot}: mean ± standard deviation (every seed); share of the way from "
             f"UDR to Oracle, goal of EASI default {GOAL}:",
             markdown_table(head, lines),
+            *_first(robot, by_target, rows),
         ]
     return out
+
+
+def _judged(method: str, share: str) -> str:
+    if method != OURS or not share:
+        return share
+    return f"{share}, met" if float(share) >= GOAL else f"{share}, **missed**"
+
+
+def _first(
+    robot: str, by_target: dict[float, dict[str, dict[int, float]]], rows: Sequence[Row]
+) -> list[str]:
+    """Whether EASI is ahead of all that do not train in the target, as it should be."""
+    said = []
+    for factor, found in by_target.items():
+        target = f"{CHANGED[robot]}*{factor:g}"
+        means = {m: mean(v.values()) for m, v in found.items() if m != "Oracle"}
+        if OURS not in means or len(means) < 3:
+            continue
+        first = max(means, key=lambda m: means[m])
+        place = f"{OURS} first beside Oracle"
+        if first != OURS:
+            place = f"**{first} ahead of {OURS}**"
+        off = [
+            abs(x)
+            for r in rows
+            if (r["robot"], r["target"], r["trajectories"]) == (robot, target, 200)
+            and r["method"] == OURS
+            and not (r["settings"] or r["curves"])
+            for x in r.get("log_ratio", ())
+        ]
+        if off and max(off) < _EXACT:
+            place += (
+                "; its parameters are the truth's in every seed (largest log ratio "
+                f"{max(off):.0e}): it trains where Oracle does, and what is between "
+                "them is a training's chance"
+            )
+        said.append(f"- {target}: {place}")
+    return ["\n".join(said)] if said else []
 
 
 def _table2(rows: Sequence[Row]) -> list[str]:
@@ -293,6 +341,7 @@ def _swept(
     out, lines = [f"### {title}: parameter error by {shown}"], []
     for robot in CHANGED:
         found: dict[str, dict[float, list[float]]] = {m: {} for m in SEARCHES}
+        begun: dict[str, list[float]] = defaultdict(list)
         for r in sorted(rows, key=lambda r: r["seed"]):
             if r["robot"] != robot or r["method"] not in found:
                 continue
@@ -301,6 +350,8 @@ def _swept(
                 if name == setting:
                     errors = found[r["method"]].setdefault(float(value), [])
                     errors.append(r["error"])
+                    if "start_error" in r:
+                        begun[r["method"]].append(r["start_error"])
         for method, by_value in found.items():
             if not by_value:
                 continue
@@ -313,21 +364,61 @@ def _swept(
                 f"{v:g}: {middle[v]:.3f} ({', '.join(f'{e:.3f}' for e in by_value[v])})"
                 for v in sorted(by_value)
             )
-            lines.append((robot, method, cells, verdict))
+            start = f"{median(begun[method]):.3f}" if begun[method] else ""
+            lines.append((robot, method, start, cells, verdict))
     if not lines:
         return [*out, f"Not run: `python -m benchmarks.paper {command}`."]
     head = (
         "robot",
         "search",
+        "start",
         "median error (every seed)",
         f"worst/best (goal {FLAT:g})",
     )
     return [
         *out,
-        "RMS of the log ratio to the truth along the directions that the "
-        "demonstrations determine.",
+        f"{_ERROR} `start`: of the middle of where the search starts.",
         markdown_table(head, lines),
     ]
+
+
+def _fig4(rows: Sequence[Row]) -> list[str]:
+    """What the pictures of Fig. 4 end with."""
+    out, lines = ["### Fig. 4: parameter error after the search, by where it starts"], []
+    for robot in CHANGED:
+        mine = [r for r in rows if _traced(r) and r["robot"] == robot]
+        for method in SEARCHES:
+            cells = []
+            for start in STARTS:
+                some = sorted(
+                    (r for r in mine if r["method"] == method and _start(r) == start),
+                    key=lambda r: r["seed"],
+                )
+                cells.append(_from_start(some))
+            if any(c != _NOT_RUN for c in cells):
+                lines.append((robot, method, *cells))
+    if not lines:
+        return [*out, "Not run: `python -m benchmarks.paper fig4`."]
+    return [
+        *out,
+        f"{_ERROR} Median (every seed), and after it of the middle of where the search "
+        "starts. Starts are factors on the nominal values, of which the target has one "
+        "halved.",
+        markdown_table(("robot", "search", *map(_from, STARTS)), lines),
+    ]
+
+
+def _traced(row: Row) -> bool:
+    return "trace" in row and not row["policy"] and not row["options"]
+
+
+def _from_start(rows: Sequence[Row]) -> str:
+    if not rows:
+        return _NOT_RUN
+    errors = [r["error"] for r in rows]
+    text = f"{median(errors):.3f} ({', '.join(f'{e:.3f}' for e in errors)})"
+    begun = [r["start_error"] for r in rows if "start_error" in r]
+    return f"{text}; {median(begun):.3f}" if begun else text
 
 
 def _fig6(rows: Sequence[Row]) -> list[str]:
@@ -363,7 +454,7 @@ def _runtime(rows: Sequence[Row]) -> list[str]:
 def _drawn_fig4(rows: Sequence[Row]) -> str:
     from benchmarks.paper_figures import ratios_by_generation
 
-    traced = [r for r in rows if "trace" in r and not r["policy"]]
+    traced = [r for r in rows if _traced(r)]
     if not traced:
         return ""
     names = traced[0]["parameters"]

@@ -65,8 +65,13 @@ def test_the_page_counts_what_is_inside(tmp_path: Path) -> None:
     rows = {
         w: next(x for x in text.splitlines() if f"| {w} |" in x) for w in coverage.WAYS
     }
-    assert ", met | 1." in rows["refined"] and rows["refined"].endswith(", met |")
-    assert "| 100% [" in rows["search"]
+    assert ", met | 1." in rows["refined"]
+    middle, most = (x.strip() for x in rows["refined"].strip("|").split("|")[-2:])
+    assert middle.endswith(", met")
+    # 1.5 times a chi with four degrees of freedom over its root.
+    assert float(most) == pytest.approx(1.5 * (9.49 / 4) ** 0.5, rel=0.1)
+    assert "| 100% [" in rows["search"] and "], **missed** |" in rows["search"]
+    assert "missed" not in rows["search, own spread"]
     inside = coverage_summary.covered([json.loads(x) for x in lines], "refined", 0.5)
     assert inside.mean() == pytest.approx(0.5, abs=0.08)
 

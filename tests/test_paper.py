@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks import paper, paper_tables
 from benchmarks.paper import Config, cells
+from benchmarks.paper_cells import Cell
 from envs import make
 from train._command import main
 
@@ -64,9 +65,11 @@ def test_mistakes_are_one_line(words: list[str], said: str, capsys: Any) -> None
 def row(method: str, target: str, seed: int, **values: Any) -> dict[str, Any]:
     given = {"trajectories": 200, "env_steps": None, "start": None, "settings": []}
     given |= {"policy": True, "curves": False, "options": []}
+    given |= {"method": method, "robot": "cartpole", "target": target, "seed": seed}
+    named = {k: values.get(k, v) for k, v in given.items()}
     return {
         **given,
-        **{"method": method, "robot": "cartpole", "target": target, "seed": seed},
+        "key": Cell(**named).key,
         **values,
         "versions": VERSIONS,
     }
@@ -88,9 +91,74 @@ def test_table_1_shows_every_seed_and_the_share_of_the_way(tmp_path: Path) -> No
     trial = row("GARAT", "cart_kp*0.25", 0, env_steps=3000, **{"return": 55.0})
     text = page(tmp_path, *rows, trial)
     line = next(x for x in text.splitlines() if x.startswith("| EASI default |"))
-    assert line.split(" | ")[1:4] == ["177.0 ± 7.1 (172.0, 182.0)", "0.90", "not run"]
+    shown = ["177.0 ± 7.1 (172.0, 182.0)", "0.90, met", "not run"]
+    assert line.split(" | ")[1:4] == shown
     assert next(x for x in text.splitlines() if "| GARAT" in x).count("not run") == 2
     assert "table1 --robot ant" in text
+
+
+def test_who_is_ahead_is_said(tmp_path: Path) -> None:
+    """And, where the parameters are the truth's, that only chance is left."""
+    values = {"UDR": 100.0, "Oracle": 180.0, "EASI default": 170.0, "GARAT": 175.0}
+    rows = [
+        row(m, "cart_kp*0.5", 0, **{"return": x, "log_ratio": [1e-5, -1e-4]})
+        for m, x in values.items()
+    ]
+    text = page(tmp_path, *rows)
+    assert "0.88, **missed** |" in text
+    (said,) = (x for x in text.splitlines() if x.startswith("- cart_kp*0.5"))
+    assert "**GARAT ahead of EASI default**" in said and "1e-04): it trains" in said
+    rows[3]["return"] = 169.0
+    rows[2]["log_ratio"] = [0.3, 0.0]
+    (said,) = (x for x in page(tmp_path, *rows).splitlines() if x.startswith("- cart"))
+    assert said == "- cart_kp*0.5: EASI default first beside Oracle"
+
+
+def test_what_was_run_is_a_table(tmp_path: Path) -> None:
+    rows = [
+        row(m, f"cart_kp*{x:g}", 0, **{"return": 100.0})
+        for x in (0.25, 0.5)
+        for m in paper.MUST
+    ]
+    rows.append(row("UDR", "cart_kp*0.5", 1, **{"return": 90.0}))
+    rows[-1]["versions"] = {
+        "commit": "abcdef0123+",
+        "runtime": {"device_kind": "NVIDIA"},
+    }
+    lines = page(tmp_path, *rows).splitlines()
+    (line,) = (x for x in lines if x.startswith("| table1 | cartpole"))
+    assert [x.strip() for x in line.strip("|").split("|")[2:]] == [
+        *("15 of 70", "0", "? (14), NVIDIA (1)", "0123456, abcdef0+"),
+    ]
+    none = next(x for x in lines if x.startswith("Not run: ") and "appendix_a" in x)
+    for name in ("appendix_a of go2", "fig5 of cartpole", "table5 of ant"):
+        assert name in none
+    assert "table1 of cartpole" not in none
+    (idle,) = (x for x in lines if x.startswith("Not run in any of them"))
+    assert "SimOpt" in idle and "GARAT" not in idle and "not refined" not in idle
+
+
+def test_figure_4_has_its_errors_beside_those_of_the_start(tmp_path: Path) -> None:
+    trace = [[[1.5, 1.0]], [[1.2, 0.9]], [[1.9, 1.1]]]
+    rows = [
+        row(
+            *(paper.SEARCHES[1], "cart_kp*0.5", s),
+            start=(1.0, 2.0),
+            policy=False,
+            curves=True,
+            trace=trace,
+            error=0.1 + 0.2 * s,
+            start_error=0.4,
+            parameters=[*paper_tables.SHOWN["cartpole"]],
+        )
+        for s in (0, 1, 2)
+    ]
+    line = next(
+        x
+        for x in page(tmp_path, *rows).splitlines()
+        if x.startswith(f"| cartpole | {paper.SEARCHES[1]}")
+    )
+    assert line.endswith("| not run | 0.300 (0.100, 0.300, 0.500); 0.400 |")
 
 
 @pytest.mark.parametrize(("worst", "verdict"), [(0.29, "met"), (0.31, "**missed**")])
@@ -115,6 +183,7 @@ def test_pictures_come_from_the_rows_alone(tmp_path: Path) -> None:
     trace = [[[1.5, 0.7, 1.0]] * 4, [[1.2, 0.6, 0.9]] * 4, [[1.9, 0.8, 1.1]] * 4]
     rows = [
         row(m, "", 0, start=s, policy=False, curves=True, trace=trace, parameters=names)
+        | {"error": 0.1}
         for m in paper.SEARCHES
         for s in paper.STARTS
     ]

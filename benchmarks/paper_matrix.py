@@ -1,0 +1,64 @@
+"""Which cells of the paper's experiments were run, where, and by which code."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from benchmarks._common import commits_of, markdown_table
+from benchmarks.paper import CHANGED, EXPERIMENTS, MUST, Config, cells
+from benchmarks.paper_cells import METHODS
+
+# Of one robot, whatever --robot says.
+_OF_ONE = {"table2": "cartpole", "fig7": "go2", "appendix_a": "go2"}
+_OF_OTHERS = ("EASI default, not refined", "EASI after train.gap")
+
+Row = Mapping[str, Any]
+
+
+def section(rows: Iterable[Row]) -> list[str]:
+    """A line for each experiment and robot of which a cell was run; then all others."""
+    have = {r["key"]: r for r in rows}
+    lines, none = [], []
+    for name in EXPERIMENTS:
+        for robot in (_OF_ONE[name],) if name in _OF_ONE else CHANGED:
+            every = cells(Config(name, robot=robot))
+            mine = [have[c.key] for c in every if c.key in have]
+            if not mine:
+                none.append(f"{name} of {robot}")
+                continue
+            whole = [
+                s
+                for s in Config(name).seeds
+                if all(c.key in have for c in every if c.seed == s)
+            ]
+            lines.append(
+                (
+                    *(name, robot, f"{len(mine)} of {len(every)}"),
+                    ", ".join(map(str, whole)) or "none",
+                    *(devices(mine), commits_of(mine)),
+                )
+            )
+    tried = {r["method"] for r in have.values()}
+    idle = [m for m in METHODS if m not in (*MUST, *tried, *_OF_OTHERS)]
+    head = ("experiment", "robot", "cells run", "seeds complete", "on", "commits")
+    out = [
+        "### What was run",
+        "`python -m benchmarks.paper NAME --robot ROBOT`; a commit with + had changes "
+        "that were not committed.",
+        markdown_table(head, lines),
+    ]
+    if none:
+        out.append(f"Not run: {', '.join(none)}.")
+    if idle:
+        out.append(
+            f"Not run in any of them: {', '.join(idle)} (`--methods`). What these "
+            "identify is [further down](#identification-beside-rivals-and-todays-tools)"
+            "."
+        )
+    return out
+
+
+def devices(rows: Iterable[Row]) -> str:
+    """How many of the rows were made on what."""
+    kinds = [r["versions"].get("runtime", {}).get("device_kind", "?") for r in rows]
+    counted = sorted({k: kinds.count(k) for k in kinds}.items(), key=lambda x: -x[1])
+    return ", ".join(k if len(counted) == 1 else f"{k} ({n})" for k, n in counted)
