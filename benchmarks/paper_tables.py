@@ -384,7 +384,8 @@ def _swept(
 
 def _fig4(rows: Sequence[Row]) -> list[str]:
     """What the pictures of Fig. 4 end with."""
-    out, lines = ["### Fig. 4: parameter error after the search, by where it starts"], []
+    lines = []
+    out = ["### Fig. 4: parameter error after the search, by where it starts"]
     for robot in CHANGED:
         mine = [r for r in rows if _traced(r) and r["robot"] == robot]
         for method in SEARCHES:

@@ -33,9 +33,9 @@ def section(folder: Path) -> list[str]:
         "transitions of an unknown controller. `stochastic`: a controller with "
         "exploration noise. `effect`: the same, but commands arrive 30 ms late, which "
         "no model has; there EASI also goes with what `train.gap` names. SimOpt asks "
-        "for more trajectories of the real machine, which explore in every setting, and "
-        "knows their starts exactly; the controller stays the same, for none of these "
-        "machines has a task."
+        "for more trajectories of the real machine, which explore in every setting, "
+        "and knows their starts exactly; the controller stays the same, for none of "
+        "these machines has a task."
     )
     out.append(
         "To read with it: CMA-ES, random search, `mujoco.sysid` and NPE replay pieces "
@@ -43,9 +43,9 @@ def section(folder: Path) -> list[str]:
         "their authors do; EASI's finish fits the starts as well. Parameters of which "
         "the data say little, such as small frictions, can be off by many times, and "
         "logarithms count that in full. The bound is that of estimates without any "
-        "prior knowledge: along a direction that is hardly seen, a method that keeps to "
-        "the middle of its start may be nearer by chance, so that a verdict of one seed "
-        "says little where errors are beyond a tenth of a percent."
+        "prior knowledge: along a direction that is hardly seen, a method that keeps "
+        "to the middle of its start may be nearer by chance, so that a verdict of one "
+        "seed says little where errors are beyond a tenth of a percent."
     )
     for robot in ROBOTS:
         mine = [r for r in rows if r["robot"] == robot]
