@@ -26,7 +26,9 @@ from easi_jax.segments import Segments
 from easi_jax.strategies import make_strategy
 
 _USUAL_UPDATES = 20  # of the discriminator in a generation
-_CLIP = 4.0  # innovations beyond this many spreads say no more than "far"
+_CLIP = 4.0  # innovations beyond this many spreads are outliers
+# Inputs that are larger teach the discriminator "far" before "on which side".
+_WIDER = 2.0**0.5
 
 
 @flax.struct.dataclass
@@ -441,10 +443,13 @@ class Search:
         """Outcomes in units of order one."""
         c = self.config
         if c.innovation_inputs:
-            # The population's own spread, anew each generation: the discriminator
-            # sees differences of order one however narrow the population is.
+            # The spread of both, anew each generation: inputs stay in range however
+            # narrow the population is, and however far from what was measured. In
+            # units of its own spread, what is measured far away is out of range on
+            # either side and says no more than "far".
             square = (fake**2 * weight[..., None]).sum((0, 1))
-            spread = jnp.sqrt(square / jnp.maximum(weight.sum(), 1.0))
+            mean_square = square / jnp.maximum(weight.sum(), 1.0)
+            spread = _WIDER * jnp.sqrt(mean_square + (real**2).mean(0))
             spread = jnp.where(spread > 0, spread, 1.0)
             return (
                 jnp.clip(real / spread, -_CLIP, _CLIP),

@@ -44,7 +44,7 @@ class SearchConfig:
 
     innovation_inputs: bool = True
     """Show the discriminator s' minus the mean model's prediction, in units of the
-    population's own spread, instead of s'."""
+    spread of what is measured and simulated, instead of s'."""
     delta_inputs: bool = True
     """Show s' - s instead of s' (where innovation_inputs is off)."""
     standardize_inputs: bool = True

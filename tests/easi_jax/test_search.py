@@ -295,6 +295,24 @@ def test_the_servo_is_found(source: str) -> None:
         assert info.std[-1, 0] < 0.5 * info.std[0, 0]
 
 
+@pytest.mark.parametrize("start", [(2.0, 4.0), (0.1, 0.15)])
+def test_the_servo_is_found_from_far_away(start: tuple[float, float]) -> None:
+    """All that is measured is then beyond the population's own spread."""
+    space = ParameterSpace(
+        tuple(
+            dataclasses.replace(p, initial=tuple(x * p.nominal for x in start))
+            for p in servo_space().parameters
+        )
+    )
+    config = SearchConfig(population=64, segments=60, real_batch=960)
+    search = make(config, servo(space=space))
+    run = jax.jit(lambda s: search.run(s, data(), 40)[0])
+    for seed in range(3):
+        state = run(search.init(jax.random.key(seed), data()))
+        found = np.asarray(search.space.to_si(state.mean))
+        assert found[0] == pytest.approx(TRUTH[0], rel=0.1)
+
+
 @pytest.mark.fault("a discriminator that has won, or has no opinion")
 def test_a_discriminator_that_wins_at_once() -> None:
     """Many large steps, against simulations that start far from the truth; the
