@@ -75,7 +75,9 @@ def identifiers() -> dict[str, Callable[[Cell], Any]]:
     from train._robots import search_config
 
     def easi(preset: str, refine: bool) -> Callable[[Cell], Any]:
-        return lambda cell: Easi(search_config(preset, cell.settings), refine)
+        return lambda cell: Easi(
+            search_config(preset, cell.settings, cell.robot), refine
+        )
 
     return {
         "EASI paper": easi("paper", False),

@@ -316,6 +316,17 @@ def _table3(rows: Sequence[Row]) -> list[str]:
     if lines:
         head = ("target", "UDR", "1", "50", "100", "200")
         out.append(markdown_table(head, lines))
+    found = _returns(rows, "cartpole", "cart_kp*0.5")
+    one = _returns(rows, "cartpole", "cart_kp*0.5", 1).get(OURS, {})
+    shares = [
+        _share(of, found.get("UDR", {}), found.get("Oracle", {}))
+        for of in (one, found.get(OURS, {}))
+    ]
+    if all(shares):
+        out.append(
+            f"With one demonstration, {OURS} goes {shares[0]} of Cartpole's way from "
+            f"UDR to Oracle, with 200 {shares[1]}."
+        )
     return out
 
 
@@ -449,7 +460,23 @@ def _runtime(rows: Sequence[Row]) -> list[str]:
         *("chain", "as", "seconds in all", "of them compiling"),
         *("programs compiled", "transfers to the host", "return"),
     )
-    return [*out, markdown_table(head, lines)]
+    both: dict[tuple[str, int], dict[str, Row]] = defaultdict(dict)
+    for r in rows:
+        if r["method"] in WAYS:
+            both[r["robot"], r["seed"]][r["method"]] = r
+    pairs = [[b[w] for w in WAYS] for b in both.values() if len(b) == len(WAYS)]
+    told = []
+    if pairs:
+        times, moved = (
+            median(one[k] / other[k] for one, other in pairs)
+            for k in ("seconds", "bytes")
+        )
+        told.append(
+            f"In one program it takes {times:.2f} times as long and moves "
+            f"{moved:.2g} times the bytes (medians of {len(pairs)} seeds). The "
+            "programs compiled beside it are small ones, which prepare and report."
+        )
+    return [*out, markdown_table(head, lines), *told]
 
 
 def _drawn_fig4(rows: Sequence[Row]) -> str:

@@ -257,7 +257,7 @@ def _by_controller(
         policy=policy,
     )
     key = stage_keys(seed_keys([cell.seed]))["search"][0]
-    config = search_config("paper", cell.settings)
+    config = search_config("paper", cell.settings, cell.robot)
     found = Easi(config).fit(task, demos, Budget(), key)
     dist = found.distribution
     return {
@@ -287,7 +287,7 @@ def trained(cell: Cell, place: Path, env: Any, found: dict[str, Any]) -> Any:
     from train._stages import jit_chunks, run_stage
 
     training = quiet(training_config(env, cell.env_steps))
-    search = search_config(_PRESETS[cell.method], cell.settings)
+    search = search_config(_PRESETS[cell.method], cell.settings, cell.robot)
     pipe = Pipeline(env, PipelineConfig(search=search, training=training))
     mean, cov = whole(pipe.space, found)
     dist = pipe.spread(distribution.gaussian(pipe.space, mean, cov), 1)

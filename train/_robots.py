@@ -19,8 +19,16 @@ def training_config(
     return config if env_steps is None else replace(config, env_steps=env_steps)
 
 
-def search_config(preset: str, settings: tuple[str, ...], **changes: Any) -> Any:
-    """A search preset with ``NAME=VALUE`` settings and keyword changes (not None).
+# Gradient steps of the discriminator in a generation, where the reference's recipe has
+# other than the preset, which is Cartpole's.
+_PAPER_UPDATES = {"ant": 20, "ballbalance": 20}
+
+
+def search_config(
+    preset: str, settings: tuple[str, ...], robot: str = "", **changes: Any
+) -> Any:
+    """A search preset with ``NAME=VALUE`` settings and keyword changes (not None); the
+    preset `paper` is that of the ``robot``.
 
     Raises:
         UserError: unknown preset or name, or a value of the wrong kind.
@@ -31,6 +39,8 @@ def search_config(preset: str, settings: tuple[str, ...], **changes: Any) -> Any
     base = make(preset)
     known = asdict(base)
     chosen = {k: v for k, v in changes.items() if v is not None}
+    if preset == "paper" and robot in _PAPER_UPDATES:
+        chosen["discriminator_updates"] = _PAPER_UPDATES[robot]
     for setting in settings:
         name, sign, text = setting.partition("=")
         if not sign or name not in known:

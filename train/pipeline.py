@@ -117,6 +117,7 @@ def run(config: Config) -> None:
     search = search_config(
         config.preset,
         config.set,
+        env.name,
         strategy=config.strategy,
         generations=config.generations,
         population=config.population,

@@ -10,6 +10,7 @@ import pytest
 
 from easi_jax.rollout import policy_rollout
 from tests.envs.robots import CASES, c_rollout, converged
+from train._robots import search_config
 
 CHANGE = 1.4  # of a parameter, against C
 CORNERS = 12
@@ -156,3 +157,17 @@ def test_no_transition_crosses_a_reset(episodes: Any) -> None:
     # A state moves no further in a step than its speed can take it.
     nq = rows.qpos.shape[-1]
     assert np.abs(rows.next_qpos[:, :, 0] - rows.qpos)[on].max() < 50 * env.dt * nq
+
+
+def test_the_paper_preset_is_that_of_the_robot() -> None:
+    updates = {
+        robot: search_config("paper", (), robot).discriminator_updates
+        for robot in ("", "cartpole", "ant", "ballbalance", "go2")
+    }
+    assert updates == {
+        **dict.fromkeys(("", "cartpole", "go2"), 10),
+        **dict.fromkeys(("ant", "ballbalance"), 20),
+    }
+    set_by_hand = search_config("paper", ("discriminator_updates=5",), "ant")
+    assert set_by_hand.discriminator_updates == 5
+    assert search_config("default", (), "ant") == search_config("default", ())
