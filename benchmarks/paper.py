@@ -37,8 +37,9 @@ CHANGED = {
 MUST = METHODS[:7]
 ON_HARDWARE = ("UDR", "EASI paper", "EASI default", AFTER_GAP)
 SEARCHES = ("EASI paper", "EASI default, not refined")
-# Where searches start: as UDR trains, then too low and too high, as factors on the
-# nominal values. The paper's low start reaches down to 0, which no model can have.
+# Where searches start: as UDR trains, for a target with one value halved; then, for one
+# at its nominal values, too low and too high, as factors on these. The paper's low
+# start reaches down to 0, which no model can have.
 STARTS = (None, (0.05, 1.0), (1.0, 2.0))
 
 
@@ -183,7 +184,7 @@ def _traced(
 ) -> list[Cell]:
     return [
         Cell(
-            *(m, config.robot, target, seed),
+            *(m, config.robot, "" if start else target, seed),
             start=start,
             policy=False,
             curves=True,

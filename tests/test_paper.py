@@ -91,8 +91,9 @@ def test_table_1_shows_every_seed_and_the_share_of_the_way(tmp_path: Path) -> No
     trial = row("GARAT", "cart_kp*0.25", 0, env_steps=3000, **{"return": 55.0})
     text = page(tmp_path, *rows, trial)
     line = next(x for x in text.splitlines() if x.startswith("| EASI default |"))
-    shown = ["177.0 ± 7.1 (172.0, 182.0)", "0.90, met", "not run"]
-    assert line.split(" | ")[1:4] == shown
+    shown = ["177.0 ± 7.1 (172.0, 182.0)", "0.90, met", "", "not run"]
+    assert line.split(" | ")[1:5] == shown
+    assert " 116.8 ± 13.0 " in next(x for x in text.splitlines() if "| UDR" in x)
     assert next(x for x in text.splitlines() if "| GARAT" in x).count("not run") == 2
     assert "table1 --robot ant" in text
 

@@ -2,7 +2,7 @@
 
 Each is a frozen dataclass of its settings; the published ones and their source are in
 its docstring. A `Method` finds a distribution over parameters: ``fit(task,
-demonstrations, budget, key)``. A `PolicyMethod` (Oracle, FineTune, GARAT) learns a
+demonstrations, budget, key)``. A `PolicyMethod` (UDR, Oracle, FineTune, GARAT) learns a
 policy: ``fit(practice, demonstrations, key)``; its settings are its budget.
 """
 
@@ -11,7 +11,14 @@ from easi_jax.methods.easi import Easi
 from easi_jax.methods.garat import Garat
 from easi_jax.methods.npe import NeuralPosterior
 from easi_jax.methods.paired import PairedCmaEs, RandomSearch
-from easi_jax.methods.policies import FineTune, Learned, Oracle, PolicyMethod, Practice
+from easi_jax.methods.policies import (
+    FineTune,
+    Learned,
+    Oracle,
+    PolicyMethod,
+    Practice,
+    Udr,
+)
 from easi_jax.methods.simopt import SimOpt
 from easi_jax.methods.sysid import MujocoSysid
 from easi_jax.methods.task import Budget, Identified, Method, Task
@@ -34,4 +41,5 @@ __all__ = [
     "RandomSearch",
     "SimOpt",
     "Task",
+    "Udr",
 ]

@@ -11,7 +11,7 @@ import pytest
 
 from easi_jax.env import EnvState, advance, start
 from easi_jax.errors import UserError
-from easi_jax.methods import FineTune, Garat, Oracle, Practice
+from easi_jax.methods import FineTune, Garat, Oracle, Practice, Udr
 from easi_jax.methods.garat import inputs
 from easi_jax.methods.policies import trained_at
 from easi_jax.rl.config import PpoConfig, SacConfig
@@ -105,6 +105,19 @@ def test_training_in_the_target_mends_a_poor_policy(
     assert got.simulated == 0
     assert got.measured == (3_000 if isinstance(method, Oracle) else 2_000)
     assert mean_return(poor, got.policy) > mean_return(poor, poor.policy) + 2.0
+
+
+def test_a_range_that_holds_the_target_mends_a_poor_policy(poor: Practice) -> None:
+    none: Any = None
+    got = Udr(2.0).fit(poor, none, jax.random.key(1))
+    assert (got.simulated, got.measured) == (3_000, 0)
+    assert mean_return(poor, got.policy) > mean_return(poor, poor.policy) + 2.0
+    fixed = Udr(1.0).fit(poor, none, jax.random.key(1))
+    same = trained_at(poor.env, TRAINING, poor.theta, jax.random.key(1))
+    for a, b in zip(jax.tree.leaves(fixed.policy), jax.tree.leaves(same), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+    with pytest.raises(UserError, match="at least 1"):
+        Udr(0.5).fit(poor, none, jax.random.key(1))
 
 
 def test_random_actions_are_for_sac_alone(practice: Practice) -> None:
