@@ -22,6 +22,8 @@ from benchmarks import paper
 from benchmarks._cells import add_row, read_rows
 from benchmarks._common import markdown_table
 from benchmarks.paper_cells import METHODS, solve
+from benchmarks.paper_tables import PUBLISHED
+from benchmarks.paper_tables import told as shown
 from easi_jax.io.versions import versions
 from easi_jax.pipeline import target_parameters
 from envs import make
@@ -40,9 +42,10 @@ OUT = Path("results/reproduce_a_table")
 #
 # An experiment is a list of cells, so that it can be stopped, resumed, and split over
 # machines. All methods of a seed start from the same UDR training and are given the
-# same demonstrations and the same budget of simulated steps; each settings' source is
-# in the method's docstring (`easi_jax/methods`). `EASI paper` is the reference's
-# recipe, defects included; `EASI default` mends them.
+# same demonstrations; Oracle and EASI train anew for as many steps, FineTune and GARAT
+# go on from UDR's policy. Each method's settings and their source are in its docstring
+# (`easi_jax/methods`). `EASI paper` is the reference's recipe, defects included;
+# `EASI default` mends them.
 
 # %%
 asked = paper.Config(
@@ -87,16 +90,6 @@ for cell in cells:
 # episodes, 200 at best. Beside it the paper's figures, which have no Oracle.
 
 # %%
-PUBLISHED = {
-    ("UDR", "cart_kp*0.25"): "116.8 ± 13.0",
-    ("FineTune", "cart_kp*0.25"): "135.1 ± 7.8",
-    ("GARAT", "cart_kp*0.25"): "144.4 ± 1.2",
-    ("EASI", "cart_kp*0.25"): "164.4 ± 4.6",
-    ("UDR", "cart_kp*0.5"): "157.0 ± 10.5",
-    ("FineTune", "cart_kp*0.5"): "171.2 ± 8.4",
-    ("GARAT", "cart_kp*0.5"): "161.6 ± 4.5",
-    ("EASI", "cart_kp*0.5"): "182.9 ± 2.2",
-}
 keys = {cell.key for cell in cells}
 rows = [row for row in read_rows(asked.out) if row["key"] in keys]
 targets = list(dict.fromkeys(row["target"] for row in rows))
@@ -114,8 +107,7 @@ for target in targets:
     head += [target, f"{target}, paper"]
     for line in body:
         got = returns[line[0], target]
-        told = PUBLISHED.get((line[0].split()[0], target), "-")
-        line += [f"{np.mean(got):.1f} ± {np.std(got):.1f}", told]
+        line += [shown(got), PUBLISHED.get(target, {}).get(line[0].split()[0], "-")]
 table = markdown_table(head, body)
 print(table)
 
