@@ -233,7 +233,7 @@ class _Bench:
         import numpy as np
 
         from easi_jax import distribution
-        from easi_jax.methods import Budget
+        from easi_jax.methods import Budget, Easi
         from easi_jax.methods.policies import watched
 
         cell, curve = self.cell, []
@@ -266,6 +266,8 @@ class _Bench:
             "log_ratio": off.tolist(),
             "std": spread.tolist(),
         }
+        if isinstance(method, Easi):
+            row["discriminator_updates"] = method.search.discriminator_updates
         if cell.curves and found.trace is not None:
             row["trace"] = _trace(found, truth)
         if not cell.policy:

@@ -198,8 +198,32 @@ def _table1(rows: Sequence[Row]) -> list[str]:
             "in another simulator:",
             markdown_table(head, lines),
             *_first(robot, by_target, rows),
+            *_other_recipe(robot, rows),
         ]
     return out
+
+
+def _other_recipe(robot: str, rows: Sequence[Row]) -> list[str]:
+    """Cells of the paper's recipe that are older than that the preset knows robots."""
+    from train._robots import search_config
+
+    theirs = search_config("paper", (), robot).discriminator_updates
+    before = search_config("paper", ()).discriminator_updates
+    mine = [
+        r["target"]
+        for r in rows
+        if r["robot"] == robot
+        and r["method"] == SEARCHES[0]
+        and r["policy"]
+        and not r["settings"]
+        and r.get("discriminator_updates", before) != theirs
+    ]
+    if not mine:
+        return []
+    return [
+        f"{SEARCHES[0]} ran with {before} discriminator steps a generation in "
+        f"{len(mine)} cells here; the reference has {theirs} for {robot}."
+    ]
 
 
 def _judged(method: str, share: str) -> str:
