@@ -75,7 +75,8 @@ def test_done_cells_are_skipped_and_failures_told(tmp_path: Path) -> None:
     (tmp_path / "udr").write_text("a file in the way")
     done = call(tmp_path, *CELLS, "--jobs", 2)
     assert done.returncode == 2
-    assert "part 1 failed: FileExistsError" in done.stdout and "logs" in done.stdout
+    assert "part 1 failed: " in done.stdout and "logs" in done.stdout
+    assert "cannot write" in done.stdout and "another --folder" in done.stdout
     assert done.stderr.startswith("error: 2 of 2 jobs failed")
 
 
