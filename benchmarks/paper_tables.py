@@ -65,7 +65,10 @@ _NO_HARDWARE = (
 )
 _ERROR = (
     "RMS of the log ratio to the truth along the directions that the demonstrations "
-    "determine."
+    "determine, as least squares could: of these the discriminator sees the strongest "
+    "only, by which the prediction errors of [Recovery]"
+    "(#recovery-of-known-cartpole-parameters) fall; the finish, which these searches "
+    "are without, finds the others."
 )
 _LENGTHS = (
     "Oracle and EASI train anew, by as many steps as UDR. FineTune and GARAT go on "
@@ -478,7 +481,8 @@ def _fig4(rows: Sequence[Row]) -> list[str]:
         f"{_ERROR} Median (every seed), and after it of the middle of where the search "
         "starts. From UDR's range, the target has one value halved (a target in the "
         "middle of the range would be found before the search); from the others, whose "
-        "factors are on its values, none.",
+        "factors are on its values, none: there forces and masses start off by one factor, "
+        "of which motion says nothing.",
         markdown_table(("robot", "search", *map(_from, STARTS)), lines),
     ]
 
