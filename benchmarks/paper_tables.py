@@ -481,8 +481,8 @@ def _fig4(rows: Sequence[Row]) -> list[str]:
         f"{_ERROR} Median (every seed), and after it of the middle of where the search "
         "starts. From UDR's range, the target has one value halved (a target in the "
         "middle of the range would be found before the search); from the others, whose "
-        "factors are on its values, none: there forces and masses start off by one factor, "
-        "of which motion says nothing.",
+        "factors are on its values, none: there forces and masses start off by one "
+        "factor, of which motion says nothing.",
         markdown_table(("robot", "search", *map(_from, STARTS)), lines),
     ]
 
