@@ -36,6 +36,17 @@ def short(commit: str | None) -> str:
     return commit[:7] + "+" * commit.endswith("+") if commit else "unknown"
 
 
+def at_least_one(config: Any, *names: str) -> None:
+    """UserError for numbers of ``config`` below one; those not given pass."""
+    from easi_jax.errors import UserError
+
+    for name in names:
+        value = getattr(config, name)
+        if value is not None and value < 1:
+            flag = name.replace("_", "-")
+            raise UserError(f"--{flag} {value}: give at least 1")
+
+
 def command_of(module: str, config: Any) -> str:
     """The command that makes ``config``: every field that is not its default."""
     words = [f"python -m {module}"]

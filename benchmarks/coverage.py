@@ -49,13 +49,11 @@ class Config:
 
 def run(config: Config) -> None:
     """Runs the targets that are not there yet."""
-    from benchmarks._common import command_of
+    from benchmarks._common import at_least_one, command_of
     from easi_jax.errors import UserError
     from easi_jax.io.versions import versions
 
-    for name in ("targets", "trajectories", "generations"):
-        if getattr(config, name) < 1:
-            raise UserError(f"--{name} {getattr(config, name)}: give at least 1")
+    at_least_one(config, "targets", "trajectories", "generations")
     if not 0 <= config.late < 1:
         raise UserError(f"--late {config.late}: seconds, 0 or more and below 1")
     part, parts = shard(config.shard)

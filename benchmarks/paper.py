@@ -20,6 +20,7 @@ import tyro
 
 from benchmarks import paper_twin
 from benchmarks._cells import Share, run_cells
+from benchmarks._common import at_least_one
 from benchmarks.paper_cells import METHODS, Cell
 from benchmarks.paper_runtime import WAYS
 from benchmarks.rival_cells import AFTER_GAP
@@ -102,8 +103,7 @@ def cells(config: Config) -> list[Cell]:
     from train._robots import check_seeds
 
     check_seeds(config.seeds)
-    if config.env_steps is not None and config.env_steps < 1:
-        raise UserError(f"--env-steps {config.env_steps}: give at least 1")
+    at_least_one(config, "env_steps")
     if config.experiment not in EXPERIMENTS:
         known = ", ".join(EXPERIMENTS)
         hint = nearest(config.experiment, EXPERIMENTS)

@@ -22,8 +22,8 @@ from benchmarks.twin_measures import COMMANDS, EPISODES, TRACKED
 FLAT = 3.0  # times the best setting's error: no setting of the default is worse
 OURS = "EASI default"
 GOAL = 0.9  # share of the way from UDR to Oracle
-# What the paper states (Tables 1 to 3): another simulator and other rewards' scale, so
-# that places and shares compare, not values.
+# What the paper states (Tables 1 and 3), of another simulator: places and shares
+# compare, not values.
 PUBLISHED = {
     target: dict(zip(("UDR", "FineTune", "GARAT", "EASI"), told, strict=True))
     for target, told in {
@@ -437,8 +437,7 @@ def _swept(
             if method != SEARCHES[0]:
                 verdict += ", met" if ratio <= FLAT else ", **missed**"
             cells = "; ".join(
-                f"{v:g}: {middle[v]:.3f} ({', '.join(f'{e:.3f}' for e in by_value[v])})"
-                for v in sorted(by_value)
+                f"{v:g}: {_middle(by_value[v])}" for v in sorted(by_value)
             )
             start = f"{median(begun[method]):.3f}" if begun[method] else ""
             lines.append((robot, method, start, cells, verdict))
@@ -491,11 +490,16 @@ def _traced(row: Row) -> bool:
     return "trace" in row and not row["policy"] and not row["options"]
 
 
+def _middle(errors: Sequence[float]) -> str:
+    """Median, and every seed."""
+    return f"{median(errors):.3f} ({', '.join(f'{e:.3f}' for e in errors)})"
+
+
 def _from_start(rows: Sequence[Row]) -> str:
     if not rows:
         return _NOT_RUN
     errors = [r["error"] for r in rows]
-    text = f"{median(errors):.3f} ({', '.join(f'{e:.3f}' for e in errors)})"
+    text = _middle(errors)
     begun = [r["start_error"] for r in rows if "start_error" in r]
     return f"{text}; {median(begun):.3f}" if begun else text
 

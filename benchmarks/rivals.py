@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks._cells import Share, run_cells
+from benchmarks._common import at_least_one
 from benchmarks.rival_cells import BUDGETS, METHODS, ROBOTS, SETTINGS, Cell, solve
 from train._command import main
 
@@ -88,12 +89,7 @@ def cells(config: Config) -> list[Cell]:
     from train._robots import check_seeds
 
     check_seeds(config.seeds)
-    for flag, value in (
-        ("trajectories", config.trajectories),
-        ("budget", config.budget),
-    ):
-        if value is not None and value < 1:
-            raise UserError(f"--{flag} {value}: give at least 1")
+    at_least_one(config, "trajectories", "budget")
     for flag, given, known in (
         ("robots", config.robots, ROBOTS),
         ("settings", config.settings, SETTINGS),
