@@ -284,7 +284,7 @@ class _Bench:
         """The policy of a method that ends with one."""
         import jax.numpy as jnp
 
-        from easi_jax.methods import Practice
+        from easi_jax.methods import Budget, Practice
         from easi_jax.methods.policies import watched
 
         cell, env = self.cell, self.env
@@ -300,7 +300,8 @@ class _Bench:
         practice = Practice(
             env, nominal, env, self.target, self.training, self.state, self.policy
         )
-        got = learners()[cell.method](cell).fit(practice, self.demos, key)
+        method = learners()[cell.method](cell)
+        got = method.fit(practice, self.demos, Budget(), key)
         return got.policy, {"simulated": got.simulated, "measured": got.measured}
 
     def first_curve(self) -> list[list[float]]:

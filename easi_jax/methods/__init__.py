@@ -3,7 +3,7 @@
 Each is a frozen dataclass of its settings; the published ones and their source are in
 its docstring. A `Method` finds a distribution over parameters: ``fit(task,
 demonstrations, budget, key)``. A `PolicyMethod` (UDR, Oracle, FineTune, GARAT) learns a
-policy: ``fit(practice, demonstrations, key)``; its settings are its budget.
+policy: ``fit(practice, demonstrations, budget, key)``.
 """
 
 from easi_jax.methods.dropo import Dropo

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 
 from easi_jax import discriminator as critic
 from easi_jax.env import EnvState
-from easi_jax.methods.policies import Learned, Practice, quiet, trained_at
+from easi_jax.methods.policies import Learned, Practice, budgeted, trained_at
+from easi_jax.methods.task import Budget
 from easi_jax.rl.config import PpoConfig
 from easi_jax.rl.networks import PolicyParams, act
 from easi_jax.rl.ppo import Ppo
@@ -51,7 +52,8 @@ class Garat:
     grounding_steps: int = 5
     """Times ``iterations``."""
     iterations: int = 50
-    """Of discriminator and transformer in a grounding step."""
+    """Of discriminator and transformer in a grounding step; fewer in all where the
+    budget does not pay for them."""
     transitions: int = 5_000
     """Real and simulated ones in each iteration."""
     discriminator_updates: int = 5
@@ -68,12 +70,16 @@ class Garat:
     """PPO's."""
 
     def fit(
-        self, practice: Practice, demonstrations: Segments, key: jax.Array
+        self,
+        practice: Practice,
+        demonstrations: Segments,
+        budget: Budget,
+        key: jax.Array,
     ) -> Learned:
         """Grounds the simulation, and trains the agent in it."""
         k_ground, k_train = jax.random.split(key)
-        transformer, simulated = self.ground(practice, demonstrations, k_ground)
-        training = quiet(practice.training)
+        transformer, simulated = self.ground(practice, demonstrations, budget, k_ground)
+        training = budgeted(practice.training, budget)
         policy = trained_at(
             GroundedEnv(practice.env),
             training,
@@ -84,12 +90,22 @@ class Garat:
         return Learned(policy, simulated + training.env_steps)
 
     def ground(
-        self, practice: Practice, demonstrations: Segments, key: jax.Array
+        self,
+        practice: Practice,
+        demonstrations: Segments,
+        budget: Budget,
+        key: jax.Array,
     ) -> tuple[PolicyParams, int]:
-        """The transformer, and how many control steps it took."""
+        """The transformer, and how many control steps it took.
+
+        Raises:
+            UserError: the budget does not pay for one iteration.
+        """
         env = TransformerEnv(practice.env)
         unroll = max(1, self.transitions // _ENVS)
-        rounds = self.grounding_steps * self.iterations
+        runs = math.ceil(self.transitions / env.episode_length)
+        each = _ENVS * unroll + runs * env.episode_length
+        rounds = min(self.grounding_steps * self.iterations, budget.rounds(each))
         trainer = Ppo(
             env,
             PpoConfig(
@@ -121,7 +137,6 @@ class Garat:
         mid = (w * real).sum(0)
         std = jnp.sqrt((w * (real - mid) ** 2).sum(0))
         std = jnp.where(std > 1e-9, std, 1.0)
-        runs = math.ceil(self.transitions / env.episode_length)
 
         def iteration(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
             state, grounding = carry
@@ -166,7 +181,6 @@ class Garat:
             return trainer.policy(state)
 
         transformer = jax.jit(run)(key, practice.theta, practice.policy)
-        each = _ENVS * unroll + runs * env.episode_length
         return transformer, rounds * each
 
 

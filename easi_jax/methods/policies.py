@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from easi_jax.errors import UserError
+from easi_jax.methods.task import Budget
 from easi_jax.rl.config import SacConfig
 from easi_jax.rl.networks import PolicyParams
 from easi_jax.rl.seeds import init_seeds, run_seeds
@@ -24,7 +25,8 @@ class Practice:
         theta: of the simulation, SI units ``(n,)``.
         real: the machine that the policy is for, as an environment.
         target: its parameters, ``(m,)``.
-        training: settings and budget of a whole training.
+        training: settings of a whole training, and its control steps where the budget
+            says nothing.
         state: of the training that the policy comes from.
         policy: the policy, which recorded the demonstrations.
     """
@@ -57,7 +59,11 @@ class PolicyMethod(Protocol):
     """A way from demonstrations to a policy."""
 
     def fit(
-        self, practice: Practice, demonstrations: Segments, key: jax.Array
+        self,
+        practice: Practice,
+        demonstrations: Segments,
+        budget: Budget,
+        key: jax.Array,
     ) -> Learned:
         """Learns; ``demonstrations`` are trajectories ``(B, T, 1, ...)``."""
         ...
@@ -76,7 +82,11 @@ class Udr:
     """Largest factor between a parameter and what is assumed, either way."""
 
     def fit(
-        self, practice: Practice, demonstrations: Segments, key: jax.Array
+        self,
+        practice: Practice,
+        demonstrations: Segments,
+        budget: Budget,
+        key: jax.Array,
     ) -> Learned:
         """Trains from scratch in the simulation; nothing is learned from the target.
 
@@ -86,7 +96,7 @@ class Udr:
         del demonstrations
         if not self.factor >= 1.0:
             raise UserError(f"the range's factor is {self.factor}: give at least 1")
-        training, k = quiet(practice.training), self.factor
+        training, k = budgeted(practice.training, budget), self.factor
 
         def draw(theta: jax.Array, key: jax.Array) -> jax.Array:
             return theta * jax.random.uniform(key, theta.shape, minval=1 / k, maxval=k)
@@ -100,11 +110,15 @@ class Oracle:
     """A whole training in the target itself: what knowing everything would bring."""
 
     def fit(
-        self, practice: Practice, demonstrations: Segments, key: jax.Array
+        self,
+        practice: Practice,
+        demonstrations: Segments,
+        budget: Budget,
+        key: jax.Array,
     ) -> Learned:
         """Trains from scratch in the target."""
         del demonstrations
-        training = quiet(practice.training)
+        training = budgeted(practice.training, budget)
         policy = trained_at(practice.real, training, practice.target, key)
         return Learned(policy, 0, training.env_steps)
 
@@ -119,16 +133,29 @@ class FineTune:
     """
 
     env_steps: int = 40_000
-    """Control steps in the target."""
+    """Control steps in the target; fewer where the budget does not pay for them."""
     random_steps: int = 10_000
     """Of them, with random actions (SAC)."""
 
     def fit(
-        self, practice: Practice, demonstrations: Segments, key: jax.Array
+        self,
+        practice: Practice,
+        demonstrations: Segments,
+        budget: Budget,
+        key: jax.Array,
     ) -> Learned:
-        """Goes on from the networks of the policy's training."""
+        """Goes on from the networks of the policy's training.
+
+        Raises:
+            UserError: random actions with PPO, or more of them than steps.
+        """
         del demonstrations
-        training = replace(quiet(practice.training), env_steps=self.env_steps)
+        steps = min(self.env_steps, budget.trained or self.env_steps)
+        if self.random_steps > steps:
+            raise UserError(
+                f"{self.random_steps} random actions do not go into {steps} steps"
+            )
+        training = replace(quiet(practice.training), env_steps=steps)
         if isinstance(training, SacConfig):
             training = replace(training, random_steps=self.random_steps)
         elif self.random_steps:
@@ -138,7 +165,12 @@ class FineTune:
         policy = trained_at(
             practice.real, training, practice.target, key, practice.state
         )
-        return Learned(policy, 0, self.env_steps)
+        return Learned(policy, 0, steps)
+
+
+def budgeted(training: TrainingConfig, budget: Budget) -> TrainingConfig:
+    """A training of as many steps as the budget says, without evaluations."""
+    return replace(quiet(training), env_steps=budget.trained or training.env_steps)
 
 
 def quiet(training: TrainingConfig) -> TrainingConfig:

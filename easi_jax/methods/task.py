@@ -21,19 +21,24 @@ Act = Callable[[Any, jax.Array, jax.Array], jax.Array]
 
 @dataclass(frozen=True)
 class Budget:
-    """What identification may spend, the same for all methods.
+    """What may be spent, the same for all methods.
 
     Attributes:
-        simulated: control steps that may be simulated; what EASI's 50 generations of
-            300 individuals and 200 steps take where not given.
+        simulated: control steps that may be simulated to identify the machine, or for
+            GARAT to imitate it; what EASI's 50 generations of 300 individuals and 200
+            steps take where not given.
+        trained: control steps that a training of a policy may take; those of the
+            training's own settings where not given.
     """
 
     simulated: int = 3_000_000
+    trained: int | None = None
 
     def __post_init__(self) -> None:
         """Raises UserError for a budget that buys nothing."""
-        if self.simulated < 1:
-            raise UserError(f"a budget of {self.simulated} control steps buys nothing")
+        for steps in (self.simulated, self.trained):
+            if steps is not None and steps < 1:
+                raise UserError(f"a budget of {steps} control steps buys nothing")
 
     def rounds(self, steps: int) -> int:
         """How many rounds of ``steps`` control steps it pays for.

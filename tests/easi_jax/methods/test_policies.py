@@ -11,7 +11,7 @@ import pytest
 
 from easi_jax.env import EnvState, advance, start
 from easi_jax.errors import UserError
-from easi_jax.methods import FineTune, Garat, Oracle, Practice, Udr
+from easi_jax.methods import Budget, FineTune, Garat, Oracle, Practice, Udr
 from easi_jax.methods.garat import inputs
 from easi_jax.methods.policies import trained_at
 from easi_jax.rl.config import PpoConfig, SacConfig
@@ -101,7 +101,7 @@ def test_training_in_the_target_mends_a_poor_policy(
     method: Any, poor: Practice
 ) -> None:
     none: Any = None
-    got = method.fit(poor, none, jax.random.key(1))
+    got = method.fit(poor, none, Budget(), jax.random.key(1))
     assert got.simulated == 0
     assert got.measured == (3_000 if isinstance(method, Oracle) else 2_000)
     assert mean_return(poor, got.policy) > mean_return(poor, poor.policy) + 2.0
@@ -109,22 +109,51 @@ def test_training_in_the_target_mends_a_poor_policy(
 
 def test_a_range_that_holds_the_target_mends_a_poor_policy(poor: Practice) -> None:
     none: Any = None
-    got = Udr(2.0).fit(poor, none, jax.random.key(1))
+    got = Udr(2.0).fit(poor, none, Budget(), jax.random.key(1))
     assert (got.simulated, got.measured) == (3_000, 0)
     assert mean_return(poor, got.policy) > mean_return(poor, poor.policy) + 2.0
-    fixed = Udr(1.0).fit(poor, none, jax.random.key(1))
+    fixed = Udr(1.0).fit(poor, none, Budget(), jax.random.key(1))
     same = trained_at(poor.env, TRAINING, poor.theta, jax.random.key(1))
     for a, b in zip(jax.tree.leaves(fixed.policy), jax.tree.leaves(same), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
     with pytest.raises(UserError, match="at least 1"):
-        Udr(0.5).fit(poor, none, jax.random.key(1))
+        Udr(0.5).fit(poor, none, Budget(), jax.random.key(1))
+
+
+@pytest.mark.parametrize("method", [Udr(), Oracle(), FineTune(2_000, 200)])
+def test_a_training_takes_what_the_budget_says(method: Any, poor: Practice) -> None:
+    none: Any = None
+    got = method.fit(poor, none, Budget(trained=600), jax.random.key(1))
+    spent = (600, 0) if isinstance(method, Udr) else (0, 600)
+    assert (got.simulated, got.measured) == spent
+    # As if its own settings said so.
+    cut = replace(poor, training=replace(TRAINING, env_steps=600))
+    if isinstance(method, FineTune):
+        method = replace(method, env_steps=600)
+    same = method.fit(cut, none, Budget(), jax.random.key(1))
+    jax.tree.map(np.testing.assert_array_equal, got.policy, same.policy)
+
+
+def test_a_fine_tuning_takes_no_more_than_its_own_steps(poor: Practice) -> None:
+    none: Any = None
+    method = FineTune(400, 200)
+    got = method.fit(poor, none, Budget(trained=600), jax.random.key(1))
+    assert (got.simulated, got.measured) == (0, 400)
+    with pytest.raises(UserError, match="200 random actions do not go into 100 steps"):
+        method.fit(poor, none, Budget(trained=100), jax.random.key(1))
+
+
+@pytest.mark.parametrize("budget", [{"simulated": 0}, {"trained": 0}])
+def test_a_budget_that_buys_nothing_is_refused(budget: dict[str, int]) -> None:
+    with pytest.raises(UserError, match="0 control steps buys nothing"):
+        Budget(**budget)
 
 
 def test_random_actions_are_for_sac_alone(practice: Practice) -> None:
     none: Any = None
     ppo = replace(practice, training=PpoConfig(env_steps=1_000))
     with pytest.raises(UserError, match="random_steps=0"):
-        FineTune().fit(ppo, none, jax.random.key(1))
+        FineTune().fit(ppo, none, Budget(), jax.random.key(1))
 
 
 def test_garat_learns_what_the_drive_does(practice: Practice) -> None:
@@ -142,7 +171,14 @@ def test_garat_learns_what_the_drive_does(practice: Practice) -> None:
     method = Garat(
         grounding_steps=1, iterations=100, transitions=5_000, learning_rate=1e-3
     )
-    transformer, simulated = method.ground(practice, demonstrations, jax.random.key(3))
+    with pytest.raises(UserError, match="one round of 10000"):
+        method.ground(practice, demonstrations, Budget(9_999), jax.random.key(3))
+    # One step short of a hundred iterations and one.
+    budget = Budget(101 * (5_000 + 5_000) - 1)
+    method = replace(method, iterations=200)
+    transformer, simulated = method.ground(
+        practice, demonstrations, budget, jax.random.key(3)
+    )
     assert simulated == 100 * (5_000 + 5_000)
     rows, weight = inputs(demonstrations)
     assert (np.asarray(weight) == 1).all()
