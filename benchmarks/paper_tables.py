@@ -1,7 +1,7 @@
 """The paper's tables and figures from the cells that were run, as Markdown and SVG.
 
-Cells that were not run are shown as not run; trials with fewer steps than the robot's
-preset (``--env-steps``) are left out.
+Cells that were not run are shown as not run; trials with other training steps than the
+experiment has (``--env-steps``) are left out.
 """
 
 from collections import defaultdict
@@ -13,7 +13,14 @@ from typing import Any
 from benchmarks import paper_matrix
 from benchmarks._cells import read_rows
 from benchmarks._common import markdown_table
-from benchmarks.paper import CHANGED, MUST, ON_HARDWARE, SEARCHES, STARTS
+from benchmarks.paper import (
+    CHANGED,
+    MUST,
+    ON_HARDWARE,
+    RECORDING_STEPS,
+    SEARCHES,
+    STARTS,
+)
 from benchmarks.paper_cells import METHODS
 from benchmarks.paper_runtime import WAYS
 from benchmarks.paper_twin import TWIN
@@ -88,7 +95,7 @@ def sections(folder: Path) -> list[str]:
     out += paper_matrix.section(rows)
     for part in (
         *(_table1, _table2, _table3, _table4, _table5),
-        *(_fig4, _fig6, _fig7, _runtime),
+        *(_fig4, _fig6, _fig7, _appendix_a, _runtime),
     ):
         out += part(rows)
     pictures = figures(folder)
@@ -121,7 +128,9 @@ def figures(folder: Path) -> dict[str, str]:
 
 def whole(rows: Iterable[Row]) -> list[Row]:
     """Rows of whole trainings, not of trials."""
-    return [r for r in rows if r["env_steps"] is None]
+    return [
+        r for r in rows if r["env_steps"] == (RECORDING_STEPS if r["options"] else None)
+    ]
 
 
 def _title(name: str) -> str:
@@ -463,16 +472,7 @@ def _fig4(rows: Sequence[Row]) -> list[str]:
     out = ["### Fig. 4: parameter error after the search, by where it starts"]
     for robot in CHANGED:
         mine = [r for r in rows if _traced(r) and r["robot"] == robot]
-        for method in SEARCHES:
-            cells = []
-            for start in STARTS:
-                some = sorted(
-                    (r for r in mine if r["method"] == method and _start(r) == start),
-                    key=lambda r: r["seed"],
-                )
-                cells.append(_from_start(some))
-            if any(c != _NOT_RUN for c in cells):
-                lines.append((robot, method, *cells))
+        lines += [(robot, *line) for line in _by_start(mine)]
     if not lines:
         return [*out, "Not run: `python -m benchmarks.paper fig4`."]
     return [
@@ -484,6 +484,33 @@ def _fig4(rows: Sequence[Row]) -> list[str]:
         "factor, of which motion says nothing.",
         markdown_table(("robot", "search", *map(_from, STARTS)), lines),
     ]
+
+
+def _appendix_a(rows: Sequence[Row]) -> list[str]:
+    """What its picture ends with."""
+    out = ["### Appendix A: error of Go2's 25 parameters, by where the search starts"]
+    lines = _by_start([r for r in rows if r["options"]])
+    if not lines:
+        return [*out, "Not run: `python -m benchmarks.paper appendix_a`."]
+    return [
+        *out,
+        "As Fig. 4; the target has one leg's thigh drive at half its stiffness. The "
+        f"UDR policy, which only records, was trained for {RECORDING_STEPS:,} control "
+        "steps.",
+        markdown_table(("search", *map(_from, STARTS)), lines),
+    ]
+
+
+def _by_start(rows: Sequence[Row]) -> list[tuple[str, ...]]:
+    """Errors of each search by its start, seeds in order; none that was not run."""
+    rows = sorted(rows, key=lambda r: r["seed"])
+    lines = []
+    for method in SEARCHES:
+        mine = [r for r in rows if r["method"] == method]
+        cells = [_from_start([r for r in mine if _start(r) == s]) for s in STARTS]
+        if mine:
+            lines.append((method, *cells))
+    return lines
 
 
 def _traced(row: Row) -> bool:
