@@ -42,8 +42,6 @@ SEARCHES = ("EASI paper", "EASI default, not refined")
 # at its nominal values, too low and too high, as factors on these. The paper's low
 # start reaches down to 0, which no model can have.
 STARTS = (None, (0.05, 1.0), (1.0, 2.0))
-# Of Appendix A's UDR, an eighth of Go2's preset: there the policy only records.
-RECORDING_STEPS = 1_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,8 +59,7 @@ class Config:
     methods: tuple[str, ...] = ()
     """Methods; those of the experiment where not given."""
     env_steps: int | None = None
-    """Control steps of each training; where not given, the robot's preset, for
-    appendix_a, whose policy only records, 1,000,000."""
+    """Control steps of each training; the robot's preset where not given."""
     shard: str = "1/1"
     """Which part of the cells this process runs."""
     only: str = ""
@@ -122,9 +119,7 @@ def cells(config: Config) -> list[Cell]:
         for c in EXPERIMENTS[config.experiment](config, seed):
             if c.method == AFTER_GAP and c.target != paper_twin.TWIN:
                 raise UserError(f"{AFTER_GAP}: of table2 and fig7, where logs are all")
-            if config.env_steps is not None:
-                c = dataclasses.replace(c, env_steps=config.env_steps)
-            found.append(c)
+            found.append(dataclasses.replace(c, env_steps=config.env_steps))
     return found
 
 
@@ -176,8 +171,7 @@ def _fig4(config: Config, seed: int) -> list[Cell]:
 
 def _appendix_a(config: Config, seed: int) -> list[Cell]:
     config = dataclasses.replace(config, robot="go2")
-    found = _traced(config, seed, "FR_thigh_kp*0.5", ("parameters=full",))
-    return [dataclasses.replace(c, env_steps=RECORDING_STEPS) for c in found]
+    return _traced(config, seed, "FR_thigh_kp*0.5", ("parameters=full",))
 
 
 def _halved(config: Config) -> str:

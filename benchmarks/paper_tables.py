@@ -1,7 +1,7 @@
 """The paper's tables and figures from the cells that were run, as Markdown and SVG.
 
-Cells that were not run are shown as not run; trials with other training steps than the
-experiment has (``--env-steps``) are left out.
+Cells that were not run are shown as not run; trials with fewer steps than the robot's
+preset (``--env-steps``) are left out.
 """
 
 from collections import defaultdict
@@ -13,14 +13,7 @@ from typing import Any
 from benchmarks import paper_matrix
 from benchmarks._cells import read_rows
 from benchmarks._common import markdown_table
-from benchmarks.paper import (
-    CHANGED,
-    MUST,
-    ON_HARDWARE,
-    RECORDING_STEPS,
-    SEARCHES,
-    STARTS,
-)
+from benchmarks.paper import CHANGED, MUST, ON_HARDWARE, SEARCHES, STARTS
 from benchmarks.paper_cells import METHODS
 from benchmarks.paper_runtime import WAYS
 from benchmarks.paper_twin import TWIN
@@ -128,9 +121,7 @@ def figures(folder: Path) -> dict[str, str]:
 
 def whole(rows: Iterable[Row]) -> list[Row]:
     """Rows of whole trainings, not of trials."""
-    return [
-        r for r in rows if r["env_steps"] == (RECORDING_STEPS if r["options"] else None)
-    ]
+    return [r for r in rows if r["env_steps"] is None]
 
 
 def _title(name: str) -> str:
@@ -494,9 +485,7 @@ def _appendix_a(rows: Sequence[Row]) -> list[str]:
         return [*out, "Not run: `python -m benchmarks.paper appendix_a`."]
     return [
         *out,
-        "As Fig. 4; the target has one leg's thigh drive at half its stiffness. The "
-        f"UDR policy, which only records, was trained for {RECORDING_STEPS:,} control "
-        "steps.",
+        "As Fig. 4; the target has one leg's thigh drive at half its stiffness.",
         markdown_table(("search", *map(_from, STARTS)), lines),
     ]
 

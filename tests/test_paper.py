@@ -201,10 +201,8 @@ def test_pictures_come_from_the_rows_alone(tmp_path: Path) -> None:
     ]
     big = row("EASI paper", "", 0, curves=True, trace=trace, parameters=names)
     big |= {"robot": "go2", "options": ["parameters=full"], "policy": False}
-    assert "Not run: `python -m benchmarks.paper appendix_a`" in page(
-        tmp_path, *rows, big
-    )
-    big |= {"env_steps": paper.RECORDING_STEPS, "error": 0.25, "start_error": 0.5}
+    assert "Not run: `python -m benchmarks.paper appendix_a`" in page(tmp_path, *rows)
+    big |= {"error": 0.25, "start_error": 0.5}
     text = page(tmp_path, *rows, big)
     assert "| EASI paper | 0.250 (0.250); 0.500 | not run | not run |" in text
     drawn = paper_tables.figures(tmp_path)
