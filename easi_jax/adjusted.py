@@ -8,7 +8,9 @@ parameters of Neyman and Scott, 1948). The cure is the adjusted profile score of
 McCullagh and Tibshirani (1990): at each parameter vector, what the score would be on
 average if the model with the fitted starts were the truth is simulated, and taken off.
 What is left is zero at the result. The noise of the simulated average is small, since
-the same draws also give the score at their true starts, whose average is zero.
+the same draws also give the score at their true starts, whose average is zero. In a
+direction where it is not, or where scores with fitted starts scatter more than their
+information says, the result is as much less sure (Godambe, 1960).
 """
 
 from dataclasses import replace
@@ -44,6 +46,7 @@ _SHORT = 0.2  # a step which still loses what was known: it stays as it is
 _SHORTEST = 0.02
 _SHALLOW = 0.1  # of what its information foretells, that the cost rises beyond a dip
 _LOST = 0.2  # of what was known of a parameter: less must not be left by a step
+_RESOLVED = 1e-5  # smallest eigenvalue of a float32 correlation matrix worth its name
 _SETTLED = 1e-2  # half the squared score that is left, in its standard deviations
 _NOISE, _FIRST, _MOVING, _RAISED, _DONE = range(5)
 
@@ -56,6 +59,7 @@ class Score:
         hessian: information, ``(n, n)``.
         gradient: of the cost with fitted starts, ``(n,)``.
         bias: what it is on average, ``(n,)``.
+        scatter: covariance of their difference, as the draws show it, ``(n, n)``.
         cost, expected: half the weighted squared error, and its average, ``()``.
         delta: fitted shifts of the starts, ``(M, 2 nv)``.
     """
@@ -63,6 +67,7 @@ class Score:
     hessian: jax.Array
     gradient: jax.Array
     bias: jax.Array
+    scatter: jax.Array
     cost: jax.Array
     expected: jax.Array
     delta: jax.Array
@@ -79,7 +84,8 @@ class Adjusted:
 
     Attributes:
         unit: parameters, unit coordinates, ``(n,)``.
-        hessian: information at them, ``(n, n)``.
+        hessian: information at them, less what their score scatters beyond it,
+            ``(n, n)``.
         delta: shifts of the starts, ``(M, 2 nv)``.
         raised: ``unit``, logarithmic parameters raised to the low end of their range.
         raised_hessian: information there.
@@ -162,24 +168,29 @@ class ProfileFit(PairedFit):
                 fine = jnp.isfinite(parts[2]) & (parts[2] > 0)
                 over = jnp.where(fine, parts[1] - known, 0.0)
                 real = jax.tree.map(lambda x, y: jnp.where(k, x, y), real, tuple(found))
-                return real, (*parts[:3], over)
+                return real, (*parts[:3], over, known)
 
             none = jax.eval_shape(lambda: fitted(s)[:3])
             none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), none)
             drawn = jnp.arange(1 + len(e)) > 0
             e = jnp.concatenate([0.0 * e[:1], e])
-            real, (hess, grad, cost, over) = jax.lax.scan(draw, none, (drawn, e))
+            real, (hess, *rest) = jax.lax.scan(draw, none, (drawn, e))
+            grad, cost, over, known = rest
             bias, expected = over[1:].mean(0), cost[1:].mean()
-            return hess[0], grad[0], bias, cost[0], expected, real[0]
+            scatter = _scatter(over[1:] + known[1:]) + _scatter(over[1:]) / len(
+                over[1:]
+            )
+            return hess[0], grad[0], bias, scatter, cost[0], expected, real[0]
 
         most = _FARTHEST * self.noise
-        hess, grad, bias, cost, expected, delta = self._each(
+        hess, grad, bias, scatter, cost, expected, delta = self._each(
             one, 1 + self._directions, weight, draws
         )
         return Score(
             hessian=hess.sum(0),
             gradient=grad.sum(0),
             bias=bias.sum(0),
+            scatter=scatter.sum(0),
             cost=cost.sum(),
             expected=expected.sum(),
             delta=delta,
@@ -194,6 +205,33 @@ class ProfileFit(PairedFit):
             next_qpos=move(s.next_qpos, error[:, :nv]),
             next_qvel=s.next_qvel + error[:, nv:],
         )
+
+
+def less_scatter(hessian: jax.Array, scatter: jax.Array, count: int) -> jax.Array:
+    """Information ``(n, n)`` of a score that scatters more than its ``hessian``.
+
+    ``H S^-1 H``, where ``scatter`` S exceeds H by more than its own noise makes of
+    ``count`` pieces (the largest eigenvalue of a Wishart matrix); H elsewhere.
+    """
+    size = jnp.sqrt(jnp.maximum(jnp.diag(hessian), 1e-30))
+    scaled, spread = (
+        0.5 * (x + x.T) / size[:, None] / size for x in (hessian, scatter)
+    )
+    values, vectors = jnp.linalg.eigh(scaled)
+    seen = values > _RESOLVED
+    white = jnp.where(seen, vectors / jnp.sqrt(jnp.where(seen, values, 1.0)), 0.0)
+    times, axes = jnp.linalg.eigh(white.T @ spread @ white)
+    noise = (1.0 + jnp.sqrt(len(size) / count)) ** 2
+    over = jnp.maximum(times / noise, 1.0)
+    along = scaled @ white @ axes
+    rest = scaled - (along * (1.0 - 1.0 / over)) @ along.T
+    return jnp.where(jnp.isfinite(rest).all(), rest, scaled) * size[:, None] * size
+
+
+def _scatter(x: jax.Array) -> jax.Array:
+    """Covariance of one of the draws ``x (K, n)``, ``(n, n)``."""
+    off = x - x.mean(0)
+    return off.T @ off / (len(x) - 1)
 
 
 def adjust(
@@ -230,6 +268,9 @@ def adjust(
         step = newton_step(s.hessian + _PULL * jnp.eye(space.size), a, free)
         left = -0.5 * a @ step
         return step, jnp.where(jnp.isfinite(left), left, jnp.inf)
+
+    def worth(s: Score) -> jax.Array:
+        return less_scatter(s.hessian, s.scatter, segments.count)
 
     def told(u: jax.Array, hessian: jax.Array) -> jax.Array:
         """Information of each parameter, of a logarithm by its SI value, ``(n,)``."""
@@ -296,7 +337,7 @@ def adjust(
                 c.left,
                 jnp.where(c.phase == _FIRST, rest, c.left.at[1].set(rest)),
             ),
-            seen=s.hessian,
+            seen=worth(s),
         )
 
     begin = raised_to_range(space, unit)
@@ -343,7 +384,7 @@ def adjust(
     points += len(rounds) * space.size  # of `in_dip`
     return Adjusted(
         unit=u,
-        hessian=found.hessian,
+        hessian=worth(found),
         delta=found.delta,
         raised=raised_to_range(space, u),
         raised_hessian=end.seen,

@@ -9,9 +9,11 @@ better there is put back onto the plateau, where nothing is known of it. The com
 scale of all masses and forces jumps as well. In the first rounds pieces that fit far
 worse than most count less. A first stage fits only the beginning of each piece: over
 few milliseconds errors are nearly linear in the parameters, while over contacts and
-stick-slip they have many minima. Starting at the found mean, it is the natural last
-step where commands and states were logged together; it says nothing about unpaired data
-or about distributions.
+stick-slip they have many minima. A limit that few pieces meet is missed where all other
+parameters have been bent to those pieces: after several starts, what fits far worse is
+left out, and what met no limit then begins at the limit that the rest would meet.
+Starting at the found mean, it is the natural last step where commands and states were
+logged together; it says nothing about unpaired data or about distributions.
 """
 
 import functools
@@ -47,6 +49,8 @@ _SHALLOW = 0.1  # of what its curvature foretells, that the cost rises beyond a 
 _INSIDE = 0.25  # initial ranges beyond the edge, where a plateau is entered
 _NOISIER = 1.2  # times the noise as it is given, that it may be
 _OUTLYING = 9.0  # times the median cost: such a piece counts half
+_APART = 4.0  # standard deviations of a typical piece's cost: what fits far worse
+_HELD = 8  # rounds in which limits move alone
 
 
 @flax.struct.dataclass
@@ -145,6 +149,7 @@ def refine(
         moving: jax.Array,
         trusting: jax.Array,
         again: jax.Array,
+        loose: jax.Array,
         item: _Stage,
     ) -> Any:
         u, shift, damp, unchanged, raised, pieces, *_ = carry
@@ -157,6 +162,8 @@ def refine(
             for x, y in zip(fresh, (unchanged, raised), strict=True)
         )
         trust = jnp.where(trusting, 1.0, _trust(pieces, segments.weight > 0))
+        left_out = moving & item.dropping & _far_worse(pieces, weight)
+        trust = jnp.where(left_out, 0.0, trust)
         trusted = weight * trust[:, None, None]
         # Bisection, per parameter and side, between where a change has left the cost
         # as it was and where it has raised it: at the edge of a plateau it may fall.
@@ -164,10 +171,10 @@ def refine(
         hops = jnp.clip(u + (reach * sides)[..., None] * ways, low, high)
         if machine.by_differences:
             at = u, shift, damp, hops, item.begun
-            eq, units, shifts, each = swept(paired, *at, weight, trusted)
+            eq, units, shifts, each = swept(paired, *at, loose, weight, trusted)
         else:
             eq = paired.normal(u, shift, trusted)
-            units, shifts = trials(u, shift, damp, hops, item.begun, eq)
+            units, shifts = trials(u, shift, damp, hops, item.begun, loose, eq)
             each = paired.costs(units, shifts, weight)
         here = _data(each[:1], trust)
         units, shifts, each = best_starts(units, shifts, each)
@@ -178,12 +185,16 @@ def refine(
         entering = jnp.tile(EDGE * jnp.append(flat, False)[: len(ways)], 2)
         costs = costs.at[hopped].add(jnp.where(moving, entering, 0.0))
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
-        home = len(costs) - 1
-        best = jnp.where(first & (costs[home] < costs[0]), home, 0)
-        best = jnp.where(moving, jnp.argmin(costs), best)
         damped = costs[1 : 1 + len(_DAMPING)]
         damp = damp * jnp.asarray(_DAMPING)[jnp.argmin(damped)]
         damp = jnp.where(damped.min() < costs[0], damp, 100.0 * damp)
+        home = len(costs) - 1
+        at = jnp.arange(home + 1)
+        # Where the fit began is where it was led astray.
+        barred = (at >= hopped.start) & ~loose.all() | (at == home) & (item.held > 0)
+        costs = jnp.where(barred, jnp.inf, costs)
+        best = jnp.where(first & (costs[home] < costs[0]), home, 0)
+        best = jnp.where(moving, jnp.argmin(costs), best)
         level = data[hopped].reshape(2, -1)
         same, worse = level == here, ~(level <= here)
         chosen = (jnp.arange(level.size) == best - hopped.start).reshape(level.shape)
@@ -210,13 +221,15 @@ def refine(
         told = jnp.where(first, home, 0)
         return new, each[told].sum() + prior(units[told])
 
-    def trials(u: Any, shift: Any, damp: Any, hops: Any, begun: Any, eq: Normal) -> Any:
-        """Where the cost is tried: here, Newton steps, jumps of single parameters, and
-        where the fit began."""
+    def trials(
+        u: Any, shift: Any, damp: Any, hops: Any, begun: Any, loose: Any, eq: Normal
+    ) -> Any:
+        """Where the cost is tried: here, Newton steps of what is ``loose``, jumps of
+        single parameters, and where the fit began."""
         slope = jax.jvp(away, (u,), (jnp.ones(n),))[1]
         grad = eq.gradient + pull * slope * away(u)
         hess = eq.hessian + jnp.diag(pull * slope**2 + _TINY)
-        free = not_held_back(space, u, grad)
+        free = not_held_back(space, u, grad) & loose
 
         def trial(damp: jax.Array) -> tuple[jax.Array, jax.Array]:
             du = newton_step(hess, grad, free, damp)
@@ -257,6 +270,7 @@ def refine(
         damp: Any,
         hops: Any,
         begun: Any,
+        loose: Any,
         weight: Any,
         trusted: Any,
     ) -> Any:
@@ -270,7 +284,7 @@ def refine(
 
         def turn(points: Any, weights: jax.Array) -> Any:
             eq, each = paired.sweep(points[0], points[1], weights)
-            told = trials(u, shift, damp, hops, begun, eq)
+            told = trials(u, shift, damp, hops, begun, loose, eq)
             return jax.tree.map(padded, told), (eq, told, each[:places])
 
         points = jax.tree.map(padded, points)
@@ -282,13 +296,17 @@ def refine(
 
     def stage(found: Any, item: Any) -> Any:
         """From parameters and shifts ``found``, or ``item.begun``, to a best fit."""
-        (u, shift), best, freed = found
+        (u, shift), best, freed, limits = found
         u = jnp.where(item.restart, item.begun, u)
         shift = jnp.where(item.restart, unmoved, shift)
-        u = jnp.where(item.look, best[0], jnp.where(item.freed, freed, u))
+        again = item.look | item.dropping
+        u = jnp.where(again, best[0], jnp.where(item.freed, freed, u))
         u = jnp.where(item.raised, raised_to_range(space, u), u)
-        shift = jnp.where(item.look | item.freed, best[1], shift)
+        shift = jnp.where(again | item.freed, best[1], shift)
         phase = jnp.where(item.freed & (freed == best[0]).all(), _FINISHED, item.phase)
+        even = ~_far_worse(best[4], weight).any()
+        after = item.dropping | (item.held > 0)
+        phase = jnp.where(after & even, _FINISHED, phase)
         used = jnp.where(item.short, weight * begin[:, None], weight)
         init = (
             *(u, shift, jnp.asarray(1e-3), *fresh),
@@ -306,16 +324,19 @@ def refine(
             fitting = phase == _MOVING
             moving = fitting & (k > 0)
             trusting = ~moving | (k > item.robust)
-            # A jump that did not help then may help now.
-            again = k % _BISECTED == 0
             first = fitting & (k == 0)
-            carry, cost = step(carry, used, first, moving, trusting, again, item)
-            costs = jnp.where(jnp.arange(iterations + 2) >= k, cost, costs)
+            done = jnp.maximum(k - item.held, 0)
+            loose = limits | (k > item.held) | (item.held == 0)
+            # A jump that did not help then may help now.
+            again = (done % _BISECTED == 0) & ~(item.dropping & (k > 0))
+            now = trusting, again, loose
+            carry, cost = step(carry, used, first, moving, *now, item)
+            costs = jnp.where(jnp.arange(iterations + 2) >= done, cost, costs)
             # By less than this the data cannot tell two results apart.
             told_apart = _TOLD_APART + item.rough * cost
-            settled = costs[jnp.maximum(k - item.patience, 0)] - cost < told_apart
-            settled &= k > item.least
-            over = settled | (k >= iterations)
+            settled = costs[jnp.maximum(done - item.patience, 0)] - cost < told_apart
+            settled &= done > item.least
+            over = settled | (done >= iterations)
             phase = jnp.where(fitting, jnp.where(over, _LOOKING, _MOVING), _FINISHED)
             # From here it goes to where an earlier start has led.
             off = at - best[0]
@@ -327,24 +348,34 @@ def refine(
         start = (phase, jnp.asarray(0), jnp.zeros(iterations + 2), init)
         _, rounds, costs, carry = jax.lax.while_loop(going, round_, start)
         steps = rounds * jnp.where(item.short, short, segments.horizon)
-        u, shift, *_, each, hessian, up = carry
+        u, shift, _, _, raised, each, hessian, up = carry
         # A plateau is wide, and likelier than a dip that noise may have dug.
         flat = ((freed == best[0]) | (jnp.diag(hessian) < _UNSEEN)).all()
         least = best[2][-1] + jnp.where(item.freed & flat, EDGE, 0.0)
         better = item.whole & (item.first | (costs[-1] < least))
-        better &= ~item.freed | (phase != _FINISHED)
+        better &= phase != _FINISHED
         best = jax.tree.map(
             lambda new, old: jnp.where(better, new, old),
             (u, shift, costs, hessian, each),
             best,
         )
-        return ((u, shift), best, jnp.where(item.look, up, freed)), (u, hessian, steps)
+        # What met no limit: to where the first piece would. And starts that were bent,
+        # so that none had to be met: as measured.
+        bent = item.dropping & _far_worse(each, weight)
+        shift = jnp.where(bent[:, None], unmoved, shift)
+        unmet = jnp.diag(hessian) < _UNSEEN
+        down = jnp.clip(u - raised[1, :n], low, high)
+        u = jnp.where(item.dropping & unmet, down, u)
+        limits = jnp.where(item.dropping, unmet, limits)
+        out = (u, shift), best, jnp.where(item.look, up, freed), limits
+        return out, (u, hessian, steps)
 
     starts = unit[None] if others is None else jnp.concatenate([unit[None], others])
     # As a scan, so that a stage is compiled once.
     none = unit, unmoved, jnp.zeros(iterations + 2), jnp.zeros((n, n)), jnp.ones(count)
-    stages = _stages(starts, near, robust, rounding)
-    found, looked = jax.lax.scan(stage, ((unit, unmoved), none, unit), stages)
+    stages = _stages(starts, near, robust, rounding, others is not None)
+    begun = (unit, unmoved), none, unit, jnp.zeros(n, bool)
+    found, looked = jax.lax.scan(stage, begun, stages)
     u, shift, costs, hessian, each = found[1]
     points = whole.points + places
     if machine.by_differences:  # one simulation for both, see `swept`
@@ -367,6 +398,8 @@ class _Stage:
     short: jax.Array
     whole: jax.Array
     first: jax.Array
+    dropping: jax.Array
+    held: jax.Array  # rounds in which limits move alone
     look: jax.Array
     freed: jax.Array
     raised: jax.Array
@@ -376,17 +409,23 @@ class _Stage:
     rough: jax.Array
 
 
-def _stages(starts: jax.Array, near: Any, robust: Any, rounding: float) -> _Stage:
-    """The beginnings of the pieces, then all of them, from each start ``(K, n)``; then
-    a look at the result, a fit of what may not be at a plateau's edge, and a look at
-    what is raised."""
-    fits = 2 * len(starts)
+def _stages(
+    starts: jax.Array, near: Any, robust: Any, rounding: float, apart: bool
+) -> _Stage:
+    """The beginnings of the pieces, then all of them, from each start ``(K, n)``; with
+    ``apart``, a fit without what fits far worse, and one of all from there; then a look
+    at the result, a fit of what may not be at a plateau's edge, and a look at what is
+    raised."""
+    begun, fits = 2 * len(starts), 2 * (len(starts) + apart)
     at = jnp.arange(fits + 3)
     look, freed = (at == fits) | (at == fits + 2), at == fits + 1
-    short = (at < fits) & (at % 2 == 0)
+    after = (at >= begun) & (at < fits)
+    dropping = after & (at % 2 == 0)
+    held = jnp.where(after & ~dropping, _HELD, 0)
+    short = (at < begun) & (at % 2 == 0)
     wanted = jnp.where(near, at == 1, True) | freed
     near |= freed
-    robust = jnp.where(short, 0, robust)
+    robust = jnp.where(short | after, 0, robust)
     patience = jnp.where(short | near, *_PATIENCE)
     bisected = jnp.where(short | near, 0, _BISECTED)
     return _Stage(
@@ -394,8 +433,10 @@ def _stages(starts: jax.Array, near: Any, robust: Any, rounding: float) -> _Stag
         phase=jnp.where(look, _LOOKING, jnp.where(wanted, _MOVING, _FINISHED)),
         restart=short,
         short=short,
-        whole=~short & ~look & wanted,
+        whole=~short & ~look & ~dropping & wanted,
         first=at == 1,
+        dropping=dropping,
+        held=held,
         look=look,
         freed=freed,
         raised=at == fits + 2,
@@ -451,6 +492,19 @@ def _trust(pieces: jax.Array, used: jax.Array) -> jax.Array:
     typical = jnp.nan_to_num(typical)  # where there is none
     ratio = pieces / jnp.maximum(_OUTLYING * typical, 1e-30)
     return jnp.where(jnp.isfinite(ratio), 1.0 / (1.0 + ratio), 0.0)
+
+
+def _far_worse(costs: jax.Array, weight: jax.Array) -> jax.Array:
+    """Pieces that fit far worse than typical ones, by their ``costs (M,)``, ``(M,)``.
+
+    Args:
+        weight: of each measured number, ``(M, H, 2 nv)``.
+    """
+    numbers = weight.sum((1, 2))
+    share = costs / jnp.maximum(0.5 * numbers, 1e-30)
+    typical = jnp.nanmedian(jnp.where(numbers > 0, share, jnp.nan))
+    spread = jnp.sqrt(2.0 / jnp.maximum(numbers, 1e-30))
+    return (numbers > 0) & ~(share <= typical * (1.0 + _APART * spread))
 
 
 def _distance(space: ParameterSpace, anchor: jax.Array, unit: jax.Array) -> jax.Array:

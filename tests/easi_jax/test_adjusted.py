@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from easi_jax.adjusted import Adjusted, adjust
+from easi_jax.adjusted import Adjusted, adjust, less_scatter
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace, declare
 from easi_jax.refine import RefineResult, refine
@@ -110,6 +110,30 @@ def test_noise_assumed_too_high_is_seen_in_the_cost(fits: Any, slow: Any) -> Non
 def test_what_is_linear_stays_as_it_is(fits: Any) -> None:
     fit, adjusted, _ = fits(spread=5.0)
     assert np.abs(fit - adjusted).max() < 0.3
+
+
+def test_what_scatters_more_than_its_information_is_less_sure() -> None:
+    """Along that direction alone, whatever the units; its own noise is no reason."""
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(5, 5)) * 10.0 ** rng.uniform(-3, 3, (5, 1))
+    hessian = root @ root.T
+    draws = root @ rng.normal(size=(5, 400))
+    same = less_scatter(jnp.asarray(hessian), jnp.asarray(draws @ draws.T / 400), 400)
+    np.testing.assert_allclose(same, hessian, rtol=1e-4, atol=1e-5 * hessian.max())
+
+    odd = root[:, :1]
+    scatter = hessian + 9.0 * odd @ odd.T
+    found = less_scatter(jnp.asarray(hessian), jnp.asarray(scatter), 400)
+    inverse = np.linalg.inv(root)  # to where the information is the identity
+    values = np.linalg.eigvalsh(inverse @ np.asarray(found, float) @ inverse.T)
+    noise = (1.0 + np.sqrt(5 / 400)) ** 2
+    np.testing.assert_allclose(values, [noise / 10.0, 1, 1, 1, 1], rtol=5e-3)
+
+    # A parameter that nothing is known of.
+    none = jnp.pad(jnp.asarray(hessian), (0, 1))
+    wide = less_scatter(none, jnp.pad(jnp.asarray(scatter), (0, 1)), 400)
+    assert np.isfinite(wide).all()
+    np.testing.assert_allclose(wide[5], 0.0, atol=1e-20)
 
 
 @pytest.mark.parametrize("limit", [10.0, 1.5])

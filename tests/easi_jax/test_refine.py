@@ -184,6 +184,42 @@ def test_a_limit_that_nothing_meets_is_found_from_a_narrow_start(
     assert float(far.to_si(out.unit)[i]) == pytest.approx(far.nominal[i], rel=0.02)
 
 
+def test_a_limit_that_few_pieces_meet_is_found(
+    cartpole: Cartpole, space: ParameterSpace
+) -> None:
+    """Where a search's fit ended: damping and friction were bent to two fast pieces,
+    which then met no limit; the fit with several starts leaves them out and returns."""
+    key, rest = jax.random.split(jax.random.key(75))
+    truth = jax.random.uniform(key, (space.size,))
+    bent = jnp.array([0.739, 0.789, 0.531, -0.362, 0.812, 0.212, 0.87, 0.86])
+    machine = Machine(cartpole.mj_model, space, cartpole.dt)
+
+    @jax.jit
+    def record(key: jax.Array) -> Segments:
+        k_run, k_noise, _ = jax.random.split(key, 3)
+        model = machine.model(space.to_si(truth))
+        runs = rollout.collect(
+            *(cartpole, model, controller, k_run, 50, cartpole.episode_length)
+        )
+        seen = rollout.measured(runs, NOISE, k_noise)
+        few = jnp.append(jnp.arange(14), 43)  # the fastest of fifty among them
+        return windows(jax.tree.map(lambda x: x[few], seen), 25, 26)
+
+    @jax.jit
+    def fit(pieces: Segments, start: jax.Array, others: jax.Array) -> Any:
+        return refine(
+            *(machine, space, start, pieces, NOISE), iterations=15, others=others
+        )
+
+    pieces = record(rest)
+    best = fit(pieces, truth, truth[None])
+    out = fit(pieces, bent, bent[None])
+    assert float(out.cost[-1]) == pytest.approx(float(best.cost[-1]), abs=1.0)
+    limit = space.index("cart_speed_limit")
+    off = (out.unit - truth)[limit] * float(space.log_width[limit])
+    assert abs(float(off)) < 0.01
+
+
 @pytest.mark.slow
 def test_few_pieces_do_not_hold_up_the_rest(
     cartpole: Cartpole, space: ParameterSpace
