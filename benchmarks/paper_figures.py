@@ -23,6 +23,7 @@ from easi_jax.io.figure_style import (
 def ratios_by_generation(
     panels: Mapping[str, Mapping[str, Sequence[Sequence[Sequence[float]]]]],
     columns: int,
+    whole: bool = False,
 ) -> str:
     """Ratios to the truth by generation, a panel each, as the paper's Fig. 4.
 
@@ -30,6 +31,7 @@ def ratios_by_generation(
         panels: by title and method, for each seed the middle, the lower and the upper
             edge by generation. Bands are of the first seed.
         columns: panels side by side.
+        whole: whether axes reach as far as the bands, or as the lines.
     """
     figure, axes = grid(len(panels), columns, height=1.9)
     methods = list(next(iter(panels.values())))
@@ -44,7 +46,8 @@ def ratios_by_generation(
                         generation, low, high, color=color, alpha=0.2, lw=0
                     )
                 axis.plot(generation, middle, color=color, lw=1.2, ls=dash(i))
-                seen += [np.asarray(middle, float)]
+                shown = (middle, low, high) if whole and k == 0 else (middle,)
+                seen += [np.asarray(x, float) for x in shown]
         axis.axhline(1.0, **DASHED)
         fit(axis, np.clip(np.concatenate(seen), 0.05, 20.0), log=True)
         axis.set_title(title)

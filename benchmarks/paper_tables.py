@@ -649,4 +649,4 @@ def _drawn_appendix_a(rows: Sequence[Row]) -> str:
         }
         for start in STARTS
     }
-    return ratios_by_generation(panels, columns=len(STARTS))
+    return ratios_by_generation(panels, columns=len(STARTS), whole=True)
