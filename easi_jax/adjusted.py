@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from easi_jax.information import PairedFit, shift_start
+from easi_jax.information import RESOLVED, PairedFit, shift_start
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
 from easi_jax.refine import (
@@ -46,7 +46,6 @@ _SHORT = 0.2  # a step which still loses what was known: it stays as it is
 _SHORTEST = 0.02
 _SHALLOW = 0.1  # of what its information foretells, that the cost rises beyond a dip
 _LOST = 0.2  # of what was known of a parameter: less must not be left by a step
-_RESOLVED = 1e-5  # smallest eigenvalue of a float32 correlation matrix worth its name
 _SETTLED = 1e-2  # half the squared score that is left, in its standard deviations
 _NOISE, _FIRST, _MOVING, _RAISED, _DONE = range(5)
 
@@ -218,7 +217,7 @@ def less_scatter(hessian: jax.Array, scatter: jax.Array, count: int) -> jax.Arra
         0.5 * (x + x.T) / size[:, None] / size for x in (hessian, scatter)
     )
     values, vectors = jnp.linalg.eigh(scaled)
-    seen = values > _RESOLVED
+    seen = values > RESOLVED
     white = jnp.where(seen, vectors / jnp.sqrt(jnp.where(seen, values, 1.0)), 0.0)
     times, axes = jnp.linalg.eigh(white.T @ spread @ white)
     noise = (1.0 + jnp.sqrt(len(size) / count)) ** 2

@@ -10,7 +10,7 @@ from jax.sharding import Mesh
 
 from easi_jax.adjusted import Adjusted, adjust
 from easi_jax.distribution import Distribution, gaussian
-from easi_jax.information import PairedFit
+from easi_jax.information import RESOLVED, PairedFit
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
 from easi_jax.polish import polish
@@ -24,7 +24,6 @@ _WIDE_SECONDS = 0.25  # of a piece there for larger robots, whose motion is stif
 _WIDE_PIECES = 64  # and how many of them
 _REST = 10  # times as many that the finish ends on
 FLOOR = 1e-3  # of the motion: what a model is never trusted to be better than
-_RESOLVED = 1e-5  # smallest eigenvalue of a float32 correlation matrix worth its name
 _SHARP = 1.0 / 3.0  # of a value: its standard deviation where logarithms will do
 _KNOWN = 0.5  # of the initial range's top: a standard deviation that says something
 _HIDDEN = 0.1  # of what a model errs by, that a parameter takes up unseen
@@ -338,12 +337,12 @@ def _posterior(hessian: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
 
     F spans ten decades, and single precision leaves noise where it should be zero that
     a plain inverse would take for knowledge. So F is scaled to a unit diagonal, what is
-    below `_RESOLVED` there counts as not seen, and seen and unseen are inverted apart.
+    below `RESOLVED` there counts as not seen, and seen and unseen are inverted apart.
     """
     size = jnp.sqrt(jnp.maximum(jnp.diag(hessian), 1.0 / _INITIAL_VARIANCE))
     scaled = hessian / size[:, None] / size
     values, vectors = jnp.linalg.eigh(0.5 * (scaled + scaled.T))
-    seen = values > _RESOLVED
+    seen = values > RESOLVED
     prior = vectors.T @ (vectors / (_INITIAL_VARIANCE * size**2)[:, None])
     total = jnp.where(seen[:, None] == seen, prior, 0.0)
     total = total + jnp.diag(jnp.where(seen, values, 0.0))
@@ -410,7 +409,7 @@ def _inverse(cov: jax.Array, std: jax.Array) -> jax.Array:
     """``cov^-1`` in the directions that single precision tells from none: what the
     data know by its sum alone may be one direction short."""
     values, vectors = jnp.linalg.eigh(cov / std[:, None] / std)
-    inverse = jnp.where(values > _RESOLVED, 1.0 / values, 0.0)
+    inverse = jnp.where(values > RESOLVED, 1.0 / values, 0.0)
     return (vectors * inverse) @ vectors.T / std[:, None] / std
 
 

@@ -24,6 +24,7 @@ from easi_jax.parameters import ParameterSpace
 from easi_jax.runtime import on_cpu
 from easi_jax.segments import Segments
 
+RESOLVED = 1e-5  # smallest eigenvalue of a float32 correlation matrix worth its name
 _WEAK = 0.5  # std of a log ratio beyond which a direction is called undetermined
 _ALONE = 0.998  # of a parameter's own direction unseen: it leaves no trace
 _LANES = 64  # simulations at once of a smaller robot, whose loop is one piece then
