@@ -328,7 +328,7 @@ def refine(
             done = jnp.maximum(k - item.held, 0)
             loose = limits | (k > item.held) | (item.held == 0)
             # A jump that did not help then may help now.
-            again = (done % _BISECTED == 0) & ~(item.dropping & (k > 0))
+            again = done % _BISECTED == 0
             now = trusting, again, loose
             carry, cost = step(carry, used, first, moving, *now, item)
             costs = jnp.where(jnp.arange(iterations + 2) >= done, cost, costs)
@@ -442,7 +442,8 @@ def _stages(
         raised=at == fits + 2,
         robust=robust,
         patience=patience,
-        least=jnp.maximum(robust + patience, bisected),
+        # Without what fits far worse, limits are looked for once the rest has settled.
+        least=jnp.maximum(robust + patience, bisected) + dropping * _BISECTED,
         rough=jnp.where(short, _NEAR_ENOUGH, rounding),
     )
 
