@@ -496,7 +496,8 @@ def _trust(pieces: jax.Array, used: jax.Array) -> jax.Array:
 
 
 def _far_worse(costs: jax.Array, weight: jax.Array) -> jax.Array:
-    """Pieces that fit far worse than typical ones, by their ``costs (M,)``, ``(M,)``.
+    """Pieces that fit far worse than typical ones, and than the noise makes them, by
+    their ``costs (M,)``, ``(M,)``.
 
     Args:
         weight: of each measured number, ``(M, H, 2 nv)``.
@@ -504,6 +505,7 @@ def _far_worse(costs: jax.Array, weight: jax.Array) -> jax.Array:
     numbers = weight.sum((1, 2))
     share = costs / jnp.maximum(0.5 * numbers, 1e-30)
     typical = jnp.nanmedian(jnp.where(numbers > 0, share, jnp.nan))
+    typical = jnp.maximum(typical, 1.0)
     spread = jnp.sqrt(2.0 / jnp.maximum(numbers, 1e-30))
     return (numbers > 0) & ~(share <= typical * (1.0 + _APART * spread))
 
