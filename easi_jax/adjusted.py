@@ -114,7 +114,7 @@ class _Carry:
     held: jax.Array  # what stays as it is
     length: jax.Array
     left: jax.Array
-    seen: jax.Array  # information at the place looked at last
+    seen: Any  # the score at the place looked at last
 
 
 class ProfileFit(PairedFit):
@@ -175,10 +175,9 @@ class ProfileFit(PairedFit):
             e = jnp.concatenate([0.0 * e[:1], e])
             real, (hess, *rest) = jax.lax.scan(draw, none, (drawn, e))
             grad, cost, over, known = rest
-            bias, expected = over[1:].mean(0), cost[1:].mean()
-            scatter = _scatter(over[1:] + known[1:]) + _scatter(over[1:]) / len(
-                over[1:]
-            )
+            over, known = over[1:], known[1:]
+            bias, expected = over.mean(0), cost[1:].mean()
+            scatter = _scatter(over + known) + _scatter(over) / len(over)
             return hess[0], grad[0], bias, scatter, cost[0], expected, real[0]
 
         most = _FARTHEST * self.noise
@@ -336,7 +335,7 @@ def adjust(
                 c.left,
                 jnp.where(c.phase == _FIRST, rest, c.left.at[1].set(rest)),
             ),
-            seen=worth(s),
+            seen=s,
         )
 
     begin = raised_to_range(space, unit)
@@ -375,7 +374,7 @@ def adjust(
         held=jnp.zeros(space.size, bool),
         length=jnp.asarray(1.0),
         left=jnp.full(2, jnp.inf),
-        seen=none.hessian,
+        seen=none,
     )
     end, rounds = jax.lax.scan(search, nothing, jnp.array([False, True]))
     u, found = end.here
@@ -386,7 +385,7 @@ def adjust(
         hessian=worth(found),
         delta=found.delta,
         raised=raised_to_range(space, u),
-        raised_hessian=end.seen,
+        raised_hessian=worth(end.seen),
         left=end.left,
         simulated=1.0 * segments.count * segments.horizon * points,
     )

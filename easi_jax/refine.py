@@ -189,10 +189,9 @@ def refine(
         damp = damp * jnp.asarray(_DAMPING)[jnp.argmin(damped)]
         damp = jnp.where(damped.min() < costs[0], damp, 100.0 * damp)
         home = len(costs) - 1
-        at = jnp.arange(home + 1)
+        costs = costs.at[hopped].add(jnp.where(loose.all(), 0.0, jnp.inf))
         # Where the fit began is where it was led astray.
-        barred = (at >= hopped.start) & ~loose.all() | (at == home) & (item.held > 0)
-        costs = jnp.where(barred, jnp.inf, costs)
+        costs = costs.at[home].add(jnp.where(item.held > 0, jnp.inf, 0.0))
         best = jnp.where(first & (costs[home] < costs[0]), home, 0)
         best = jnp.where(moving, jnp.argmin(costs), best)
         level = data[hopped].reshape(2, -1)
@@ -299,10 +298,10 @@ def refine(
         (u, shift), best, freed, limits = found
         u = jnp.where(item.restart, item.begun, u)
         shift = jnp.where(item.restart, unmoved, shift)
-        again = item.look | item.dropping
-        u = jnp.where(again, best[0], jnp.where(item.freed, freed, u))
+        from_best = item.look | item.dropping
+        u = jnp.where(from_best, best[0], jnp.where(item.freed, freed, u))
         u = jnp.where(item.raised, raised_to_range(space, u), u)
-        shift = jnp.where(again | item.freed, best[1], shift)
+        shift = jnp.where(from_best | item.freed, best[1], shift)
         phase = jnp.where(item.freed & (freed == best[0]).all(), _FINISHED, item.phase)
         even = ~_far_worse(best[4], weight).any()
         after = item.dropping | (item.held > 0)
