@@ -248,7 +248,7 @@ def _first(
         first = max(means, key=lambda m: means[m])
         place = f"{OURS} first beside Oracle"
         if first != OURS:
-            place = f"**{first} ahead of {OURS}**"
+            place = f"**{first} ahead of {OURS}**{_by(found[first], found[OURS])}"
         off = [
             abs(x)
             for r in rows
@@ -265,6 +265,15 @@ def _first(
             )
         said.append(f"- {target}: {place}")
     return ["\n".join(said)] if said else []
+
+
+def _by(first: dict[int, float], second: dict[int, float]) -> str:
+    """By how much on the seeds that both have, and how sure that is."""
+    ahead = [first[s] - second[s] for s in first.keys() & second.keys()]
+    if len(ahead) < 2:
+        return ""
+    error = stdev(ahead) / len(ahead) ** 0.5
+    return f" by {mean(ahead):.1f} (standard error {error:.1f}, same seeds)"
 
 
 def _table2(rows: Sequence[Row]) -> list[str]:

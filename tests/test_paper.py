@@ -109,6 +109,12 @@ def test_who_is_ahead_is_said(tmp_path: Path) -> None:
     assert "0.88, **missed** |" in text
     (said,) = (x for x in text.splitlines() if x.startswith("- cart_kp*0.5"))
     assert "**GARAT ahead of EASI default**" in said and "1e-04): it trains" in said
+    assert " by " not in said  # of one seed nobody knows how sure that is
+    again = [row(r["method"], "cart_kp*0.5", 1, **{"return": 172.0}) for r in rows[2:]]
+    (said,) = (
+        x for x in page(tmp_path, *rows, *again).splitlines() if x.startswith("- cart")
+    )
+    assert "default** by 2.5 (standard error 2.5, same seeds)" in said
     rows[3]["return"] = 169.0
     rows[2]["log_ratio"] = [0.3, 0.0]
     (said,) = (x for x in page(tmp_path, *rows).splitlines() if x.startswith("- cart"))
