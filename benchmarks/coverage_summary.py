@@ -14,6 +14,7 @@ REGION = (0.85, 0.95)  # share of truths inside the 90 % region
 MEANT = WAYS[1:]  # spreads that commands state
 BOUND = 2.0  # times the Cramer-Rao bound
 TARGETS = 100
+_NINETY, _FAR = 1.645, 3.0  # standard deviations
 
 
 def section(folder: Path) -> list[str]:
@@ -91,6 +92,29 @@ def _right(folder: Path) -> list[str]:
         markdown_table(
             ("", "50 % region", "90 % region", "error / bound", "of 95 %"), lines
         ),
+        *_unseen(rows),
+    ]
+
+
+def _unseen(rows: list[dict[str, Any]]) -> list[str]:
+    """Whether something is stated of what data do not show; no region counts that."""
+    far = [
+        abs(off) / std
+        for r in rows
+        for off, std, seen in zip(
+            *(r[WAYS[-1]].get(k, ()) for k in ("off", "std")),
+            r.get("determined", ()),
+            strict=True,
+        )
+        if not seen
+    ]
+    if not far:
+        return []
+    beyond = [sum(x > times for x in far) for times in (_NINETY, _FAR)]
+    return [
+        f"Of {len(far)} parameters that the data do not determine by themselves, "
+        f"{beyond[0]} are outside what is stated of each after refinement with 90 %, "
+        f"{beyond[1]} of them farther than {_FAR:g} standard deviations."
     ]
 
 

@@ -25,6 +25,7 @@ from easi_jax.information import RESOLVED, PairedFit, shift_start
 from easi_jax.machine import Machine
 from easi_jax.parameters import ParameterSpace
 from easi_jax.refine import (
+    DUG,
     EDGE,
     beyond_edge,
     jumps,
@@ -284,7 +285,8 @@ def adjust(
         rise = fit.costs(hops, starts, weight).sum(1) - found.cost
         told = jnp.diag(found.hessian)
         foretold = 0.5 * told * (up - u) ** 2
-        return (told > _PULL) & (rise < _SHALLOW * foretold)
+        shallow = (rise < _SHALLOW * foretold) & (rise < DUG)
+        return (told > _PULL) & shallow
 
     def over(left: jax.Array, k: jax.Array, length: jax.Array) -> jax.Array:
         return (left < _SETTLED) | (k > _ROUNDS) | (length < _SHORTEST)

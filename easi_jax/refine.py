@@ -46,7 +46,8 @@ _MOVING, _LOOKING, _FINISHED = range(3)
 _FARTHEST = 0.8, 2.5  # jump that is tried, in initial ranges, in log ratios
 EDGE = 4.0  # of the cost, that a place beyond a plateau's edge has to be better by
 _SHALLOW = 0.1  # of what its curvature foretells, that the cost rises beyond a dip
-_INSIDE = 0.25  # initial ranges beyond the edge, where a plateau is entered
+DUG = 50 * EDGE  # of the cost, starts as they are: more than that noise does not dig
+_INSIDE = 0.4  # initial ranges beyond the edge, where a plateau is entered
 _NOISIER = 1.2  # times the noise as it is given, that it may be
 _OUTLYING = 9.0  # times the median cost: such a piece counts half
 _APART = 4.0  # standard deviations of a typical piece's cost: what fits far worse
@@ -170,18 +171,18 @@ def refine(
         reach = 0.5 * (unchanged + raised)
         hops = jnp.clip(u + (reach * sides)[..., None] * ways, low, high)
         if machine.by_differences:
-            at = u, shift, damp, hops, item.begun
+            at = u, shift, damp, hops, item
             eq, units, shifts, each = swept(paired, *at, loose, weight, trusted)
         else:
             eq = paired.normal(u, shift, trusted)
-            units, shifts = trials(u, shift, damp, hops, item.begun, loose, eq)
+            units, shifts = trials(u, shift, damp, hops, item, loose, eq)
             each = paired.costs(units, shifts, weight)
         here = _data(each[:1], trust)
         units, shifts, each = best_starts(units, shifts, each)
         data = _data(each, trust)
         costs = data + prior(units)
         # What was put onto a plateau does not leave it for a dip.
-        flat = item.freed & (jnp.diag(eq.hessian) < _UNSEEN)
+        flat = on_plateau(item, eq)
         entering = jnp.tile(EDGE * jnp.append(flat, False)[: len(ways)], 2)
         costs = costs.at[hopped].add(jnp.where(moving, entering, 0.0))
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
@@ -206,6 +207,7 @@ def refine(
         foretold = 0.5 * jnp.diag(eq.hessian) * (up - u) ** 2
         rise = level[0, :n] - here
         dip = (foretold > 2 * EDGE / _SHALLOW) & (rise < _SHALLOW * foretold)
+        dip &= rise < DUG
         above = beyond_edge(u, dip, up)
         new = (
             units[best],
@@ -220,15 +222,20 @@ def refine(
         told = jnp.where(first, home, 0)
         return new, each[told].sum() + prior(units[told])
 
+    def on_plateau(item: _Stage, eq: Normal) -> jax.Array:
+        """Which parameters were put onto a plateau, and are there, ``(n,)``."""
+        return item.freed & (jnp.diag(eq.hessian) < _UNSEEN)
+
     def trials(
-        u: Any, shift: Any, damp: Any, hops: Any, begun: Any, loose: Any, eq: Normal
+        u: Any, shift: Any, damp: Any, hops: Any, item: _Stage, loose: Any, eq: Normal
     ) -> Any:
         """Where the cost is tried: here, Newton steps of what is ``loose``, jumps of
         single parameters, and where the fit began."""
         slope = jax.jvp(away, (u,), (jnp.ones(n),))[1]
         grad = eq.gradient + pull * slope * away(u)
         hess = eq.hessian + jnp.diag(pull * slope**2 + _TINY)
-        free = not_held_back(space, u, grad) & loose
+        # There the prior alone would draw them back to the edge.
+        free = not_held_back(space, u, grad) & loose & ~on_plateau(item, eq)
 
         def trial(damp: jax.Array) -> tuple[jax.Array, jax.Array]:
             du = newton_step(hess, grad, free, damp)
@@ -239,7 +246,7 @@ def refine(
         near = jnp.concatenate([u[None], newton])
         shifted = shift + jnp.concatenate([unmoved[None], followed])
         shifted = shifted + shares[:, None, None, None] * eq.start_step
-        units = [*[near] * len(shares), hops.reshape(-1, n), begun[None]]
+        units = [*[near] * len(shares), hops.reshape(-1, n), item.begun[None]]
         stay = jnp.broadcast_to(shift, (2 * len(ways), *shift.shape))
         shifts = [shifted.reshape(-1, *shift.shape), stay, unmoved[None]]
         return jnp.concatenate(units), jnp.concatenate(shifts)
@@ -268,7 +275,7 @@ def refine(
         shift: Any,
         damp: Any,
         hops: Any,
-        begun: Any,
+        item: _Stage,
         loose: Any,
         weight: Any,
         trusted: Any,
@@ -283,7 +290,7 @@ def refine(
 
         def turn(points: Any, weights: jax.Array) -> Any:
             eq, each = paired.sweep(points[0], points[1], weights)
-            told = trials(u, shift, damp, hops, begun, loose, eq)
+            told = trials(u, shift, damp, hops, item, loose, eq)
             return jax.tree.map(padded, told), (eq, told, each[:places])
 
         points = jax.tree.map(padded, points)
@@ -349,8 +356,8 @@ def refine(
         steps = rounds * jnp.where(item.short, short, segments.horizon)
         u, shift, _, _, raised, each, hessian, up = carry
         # A plateau is wide, and likelier than a dip that noise may have dug.
-        flat = ((freed == best[0]) | (jnp.diag(hessian) < _UNSEEN)).all()
-        least = best[2][-1] + jnp.where(item.freed & flat, EDGE, 0.0)
+        flat = item.freed & (freed != best[0]) & (jnp.diag(hessian) < _UNSEEN)
+        least = best[2][-1] + EDGE * flat.sum()
         better = item.whole & (item.first | (costs[-1] < least))
         better &= phase != _FINISHED
         best = jax.tree.map(

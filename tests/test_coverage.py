@@ -76,6 +76,23 @@ def test_the_page_counts_what_is_inside(tmp_path: Path) -> None:
     assert inside.mean() == pytest.approx(0.5, abs=0.08)
 
 
+def test_what_is_stated_of_the_unseen_is_counted(tmp_path: Path) -> None:
+    """A limit that no data show, said to be known, is in no determined direction."""
+    given = {"off": [0.1, -2.0, 0.5], "std": [1.0, 0.5, 0.01]}
+    row: dict = {"seed": 0, "rank": 1, "versions": {"commit": "0123456789"}}
+    row |= {w: {"distance": 1.0, "bound": 1.0} for w in coverage.WAYS}
+    row[coverage.WAYS[-1]] |= given
+    for seen, said in (
+        ([False, False, True], "Of 2 parameters that"),
+        ([True, False, False], "2 are outside"),
+        ([False, True, True], "0 are outside"),
+        ([True, True, False], "1 of them farther than 3 "),
+    ):
+        row["determined"] = seen
+        (tmp_path / "coverage.jsonl").write_text(json.dumps(row) + "\n")
+        assert said in "\n".join(coverage_summary.section(tmp_path))
+
+
 def test_nothing_run_is_said(tmp_path: Path) -> None:
     assert "Not run" in coverage_summary.section(tmp_path)[-1]
 
