@@ -163,7 +163,8 @@ def test_a_limit_that_was_not_met_is_not_known(met: bool) -> None:
         assert abs(off) < 0.01
         assert out.hessian[i, i] > 1e4
     else:
-        assert abs(off) < 0.5
+        # Not farther than a plateau is entered beyond its edge.
+        assert abs(off) < 0.4 * float(space.log_width[i])
         assert out.hessian[i, i] < 1.0
 
 
