@@ -390,6 +390,7 @@ def _table3(rows: Sequence[Row]) -> list[str]:
     if lines:
         head = ("target", "UDR", "1", "50", "100", "200")
         out.append(markdown_table(head, lines))
+    out += [x for robot in CHANGED for x in _mixed(rows, robot)]
     found = _returns(rows, "cartpole", "cart_kp*0.5")
     one = _returns(rows, "cartpole", "cart_kp*0.5", 1).get(OURS, {})
     shares = [
@@ -402,6 +403,23 @@ def _table3(rows: Sequence[Row]) -> list[str]:
             f"UDR to Oracle, with 200 {shares[1]}."
         )
     return out
+
+
+def _mixed(rows: Sequence[Row], robot: str) -> list[str]:
+    """That demonstrations came from more than one training of UDR."""
+    target, columns = f"{CHANGED[robot]}*0.5", defaultdict[str, set[int]](set)
+    for r in rows:
+        mine = (r["robot"], r["target"], r["method"]) == (robot, target, OURS)
+        if mine and r["policy"] and not (r["settings"] or r["curves"]):
+            kind = r["versions"].get("runtime", {}).get("device_kind", "?")
+            columns[kind].add(r["trajectories"])
+    if len(columns) < 2:
+        return []
+    told = "; ".join(
+        f"{', '.join(map(str, sorted(counts)))} on {kind}"
+        for kind, counts in sorted(columns.items())
+    )
+    return [f"{robot}, demonstrations by machine, each with UDR of its own: {told}."]
 
 
 def _table4(rows: Sequence[Row]) -> list[str]:

@@ -121,6 +121,18 @@ def test_who_is_ahead_is_said(tmp_path: Path) -> None:
     assert said == "- cart_kp*0.5: EASI default first beside Oracle"
 
 
+def test_demonstrations_of_several_machines_are_said(tmp_path: Path) -> None:
+    rows = [
+        row("EASI default", "cart_kp*0.5", 0, trajectories=n, **{"return": 1.0})
+        for n in (1, 50, 200)
+    ]
+    assert "UDR of its own" not in page(tmp_path, *rows)
+    rows[2]["versions"] = {**VERSIONS, "runtime": {"device_kind": "GPU"}}
+    for r in rows[:2]:
+        r["versions"] = {**VERSIONS, "runtime": {"device_kind": "cpu"}}
+    assert "own: 200 on GPU; 1, 50 on cpu." in page(tmp_path, *rows)
+
+
 def test_what_was_run_is_a_table(tmp_path: Path) -> None:
     rows = [
         row(m, f"cart_kp*{x:g}", 0, **{"return": 100.0})
