@@ -58,8 +58,13 @@ def section(rows: Iterable[Row]) -> list[str]:
     return out
 
 
+def device(row: Row) -> str:
+    """What a row was made on."""
+    return row["versions"].get("runtime", {}).get("device_kind", "?")
+
+
 def devices(rows: Iterable[Row]) -> str:
     """How many of the rows were made on what."""
-    kinds = [r["versions"].get("runtime", {}).get("device_kind", "?") for r in rows]
+    kinds = [device(r) for r in rows]
     counted = sorted({k: kinds.count(k) for k in kinds}.items(), key=lambda x: -x[1])
     return ", ".join(k if len(counted) == 1 else f"{k} ({n})" for k, n in counted)

@@ -411,8 +411,7 @@ def _mixed(rows: Sequence[Row], robot: str) -> list[str]:
     for r in rows:
         mine = (r["robot"], r["target"], r["method"]) == (robot, target, OURS)
         if mine and r["policy"] and not (r["settings"] or r["curves"]):
-            kind = r["versions"].get("runtime", {}).get("device_kind", "?")
-            columns[kind].add(r["trajectories"])
+            columns[paper_matrix.device(r)].add(r["trajectories"])
     if len(columns) < 2:
         return []
     told = "; ".join(

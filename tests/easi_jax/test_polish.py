@@ -43,7 +43,7 @@ def run(problem: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def fits(problem: Any) -> tuple[RefineResult, RefineResult]:
-    """On a third of the pieces, and on all. Of a quarter so few meet the force limit
+    """On half of the pieces, and on all. Of a quarter so few meet the force limit
     that it might be noise, and it is not known."""
     machine, space, pieces = problem
     start = space.to_unit(1.2 * jnp.asarray(space.nominal))
@@ -52,7 +52,7 @@ def fits(problem: Any) -> tuple[RefineResult, RefineResult]:
     def fitted(pieces: Segments) -> RefineResult:
         return refine(machine, space, start, pieces, NOISE, iterations=20)
 
-    part = jnp.arange(pieces.count) % 3 == 0
+    part = jnp.arange(pieces.count) % 2 == 0
     few = replace(pieces, weight=pieces.weight * part)
     return fitted(few), fitted(pieces)
 
@@ -75,7 +75,7 @@ def test_few_pieces_end_where_all_have_it(problem: Any, run: Any, fits: Any) -> 
         rtol=0.1,
     )
     assert found.delta.shape == known.delta.shape
-    assert looks(problem, found) == np.isfinite(found.cost).sum() <= 8
+    assert looks(problem, found) == np.isfinite(found.cost).sum() < 8
     assert (found.raised == found.unit).all()
     assert (found.raised_hessian == found.hessian).all()
 
