@@ -10,6 +10,8 @@ from typing import Any
 from benchmarks.rival_cells import AFTER_GAP
 
 EPISODES = 100
+# Their trainings go on from UDR's networks, as GARAT's does.
+WARM = ("Oracle, warm start", "EASI default, warm start")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +84,7 @@ def identifiers() -> dict[str, Callable[[Cell], Any]]:
     return {
         "EASI paper": easi("paper", False),
         "EASI default": easi("default", True),
+        WARM[1]: easi("default", True),
         "EASI default, not refined": easi("default", False),
         "SimOpt": lambda _: SimOpt(),
         "CMA-ES": lambda _: PairedCmaEs(),
@@ -98,6 +101,7 @@ def learners() -> dict[str, Callable[[Cell], Any]]:
 
     return {
         "Oracle": lambda _: Oracle(),
+        WARM[0]: lambda _: Oracle(warm_start=True),
         "FineTune": lambda cell: FineTune(random_steps=_random(cell.robot)),
         "FineTune, no random actions": lambda _: FineTune(random_steps=0),
         "GARAT": lambda _: Garat(),
@@ -106,7 +110,7 @@ def learners() -> dict[str, Callable[[Cell], Any]]:
 
 METHODS = (
     *("UDR", "Oracle", "FineTune", "FineTune, no random actions", "GARAT"),
-    *("EASI paper", "EASI default", "EASI default, not refined"),
+    *("EASI paper", "EASI default", *WARM, "EASI default, not refined"),
     *("SimOpt", "CMA-ES", "DROPO", "random search"),
     *("mujoco.sysid", "NPE", AFTER_GAP),
 )
@@ -246,6 +250,7 @@ class _Bench:
                 dist,
                 distribution.point(space, self.target),
                 key,
+                self.state if cell.method in WARM else None,
             )
             curve.append(returns)
             return learned
@@ -288,7 +293,8 @@ class _Bench:
         from easi_jax.methods.policies import watched
 
         cell, env = self.cell, self.env
-        key = self.keys["oracle" if cell.method == "Oracle" else "final"]
+        ideal = cell.method in ("Oracle", WARM[0])
+        key = self.keys["oracle" if ideal else "final"]
         if cell.method == "Oracle" and cell.curves:
             # The same training, watched.
             policy, returns = watched(

@@ -14,7 +14,7 @@ from benchmarks import paper_matrix
 from benchmarks._cells import read_rows
 from benchmarks._common import markdown_table
 from benchmarks.paper import CHANGED, MUST, ON_HARDWARE, SEARCHES, STARTS
-from benchmarks.paper_cells import METHODS
+from benchmarks.paper_cells import METHODS, WARM
 from benchmarks.paper_runtime import WAYS
 from benchmarks.paper_twin import TWIN
 from benchmarks.twin_measures import COMMANDS, EPISODES, TRACKED
@@ -73,7 +73,8 @@ _ERROR = (
 _LENGTHS = (
     "Oracle and EASI train anew, by as many steps as UDR. FineTune and GARAT go on "
     "from UDR's policy, GARAT by as many steps again: it may pass Oracle where a "
-    "training of that length has not settled."
+    "training of that length has not settled. With a warm start Oracle and EASI go on "
+    "from it, too (`--warm-start`)."
 )
 
 Row = dict[str, Any]
@@ -242,13 +243,10 @@ def _first(
     said = []
     for factor, found in by_target.items():
         target = f"{CHANGED[robot]}*{factor:g}"
-        means = {m: mean(v.values()) for m, v in found.items() if m != "Oracle"}
-        if OURS not in means or len(means) < 3:
+        rivals = {m: v for m, v in found.items() if m not in ("Oracle", OURS, *WARM)}
+        if OURS not in found or len(rivals) < 2:
             continue
-        first = max(means, key=lambda m: means[m])
-        place = f"{OURS} first beside Oracle"
-        if first != OURS:
-            place = f"**{first} ahead of {OURS}**{_by(found[first], found[OURS])}"
+        place = _place(OURS, found, rivals)
         off = [
             abs(x)
             for r in rows
@@ -263,8 +261,20 @@ def _first(
                 f"{max(off):.0e}): it trains where Oracle does, and what is between "
                 "them is a training's chance"
             )
+        if WARM[1] in found:
+            place += f". {_place(WARM[1], found, rivals)}"
         said.append(f"- {target}: {place}")
     return ["\n".join(said)] if said else []
+
+
+def _place(
+    ours: str, found: dict[str, dict[int, float]], rivals: dict[str, dict[int, float]]
+) -> str:
+    first = max(rivals, key=lambda m: mean(rivals[m].values()))
+    if mean(rivals[first].values()) > mean(found[ours].values()):
+        return f"**{first} ahead of {ours}**{_by(rivals[first], found[ours])}"
+    by = _by(found[ours], rivals[first])
+    return f"{ours} first beside Oracle" + (f", ahead of {first}{by}" if by else "")
 
 
 def _by(first: dict[int, float], second: dict[int, float]) -> str:

@@ -54,6 +54,9 @@ class PipelineConfig:
     refine_pieces: int | None = None
     """Pieces that it takes at most; not given: as `easi_jax.identify.finish_pieces` and
     `finish_rest` have it."""
+    warm_start: bool = False
+    """Final training and Oracle go on from the networks of the policy that recorded the
+    demonstrations, in place of new ones."""
     eval_episodes: int = 100
     """Episodes of a final evaluation."""
 
@@ -180,9 +183,16 @@ class Pipeline:
 
     # -- stages --------------------------------------------------------------
 
-    def train_init(self, keys: jax.Array, dist: Distribution) -> Any:
-        """Fresh training states, ``(S, ...)``; ``dist`` has a leading axis S."""
-        return init_seeds(self.trainer, keys, dist, 0, self.mesh)
+    def train_init(self, keys: jax.Array, dist: Distribution, start: Any = None) -> Any:
+        """Fresh training states, ``(S, ...)``; ``dist`` has a leading axis S.
+
+        With the networks and observation statistics of ``start``, training states of
+        another training, where given.
+        """
+        fresh = init_seeds(self.trainer, keys, dist, 0, self.mesh)
+        return (
+            fresh if start is None else jax.vmap(self.trainer.continued)(fresh, start)
+        )
 
     def train_chunk(
         self, states: Any, dist: Distribution, target: jax.Array, n: int
@@ -331,7 +341,7 @@ class Pipeline:
         )
         found = self.estimate(state, demos)
         final, easi_history = self.train_chunk(
-            self.final_init(k["final"], found.distribution, state),
+            self.final_init(k["final"], found.distribution, state, first),
             found.distribution,
             target,
             self.final_iterations(),
@@ -351,11 +361,14 @@ class Pipeline:
             "estimate": found,
         }
 
-    def final_init(self, keys: jax.Array, dist: Any, search: SearchState) -> Any:
-        """Where final training starts: afresh, or with what the search trained."""
+    def final_init(
+        self, keys: jax.Array, dist: Any, search: SearchState, first: Any = None
+    ) -> Any:
+        """Where final training starts: with what the search trained, with the networks
+        of ``first`` (`PipelineConfig.warm_start`), or afresh."""
         if self.search.trainer:
             return search.training
-        return self.train_init(keys, dist)
+        return self.train_init(keys, dist, first if self.config.warm_start else None)
 
     def final_iterations(self) -> int:
         """Steps of final training; those made inside the search are taken off."""

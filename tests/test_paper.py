@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks import paper, paper_tables
 from benchmarks.paper import Config, cells
-from benchmarks.paper_cells import Cell
+from benchmarks.paper_cells import WARM, Cell
 from envs import make
 from train._command import main
 
@@ -119,6 +119,17 @@ def test_who_is_ahead_is_said(tmp_path: Path) -> None:
     rows[2]["log_ratio"] = [0.3, 0.0]
     (said,) = (x for x in page(tmp_path, *rows).splitlines() if x.startswith("- cart"))
     assert said == "- cart_kp*0.5: EASI default first beside Oracle"
+    warm = [row(WARM[1], "cart_kp*0.5", s, **{"return": 180.0 + s}) for s in (0, 1)]
+    (said,) = (
+        x
+        for x in page(tmp_path, *rows, *again, *warm).splitlines()
+        if x.startswith("- cart")
+    )
+    assert "EASI default first beside Oracle, ahead of GARAT by 0.5 (" in said
+    assert said.endswith(
+        ". EASI default, warm start first beside Oracle, ahead of GARAT by 10.0 "
+        "(standard error 1.0, same seeds)"
+    )
 
 
 def test_demonstrations_of_several_machines_are_said(tmp_path: Path) -> None:

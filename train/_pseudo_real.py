@@ -79,6 +79,7 @@ def run(config: "Config") -> None:
             noise=config.noise,
             refine=config.refine,
             restarts=config.restarts,
+            warm_start=config.warm_start,
             eval_episodes=config.eval_episodes,
         ),
         start=config.start,
@@ -153,7 +154,9 @@ def run(config: "Config") -> None:
         final = train(
             "final",
             estimate.distribution,
-            lambda: pipe.final_init(keys["final"], estimate.distribution, found),
+            lambda: pipe.final_init(
+                keys["final"], estimate.distribution, found, states
+            ),
             pipe.final_iterations(),
         )
         first = udr["method"]
@@ -164,7 +167,9 @@ def run(config: "Config") -> None:
             oracle = train(
                 "oracle",
                 many,
-                lambda: there.train_init(keys["oracle"], many),
+                lambda: there.train_init(
+                    keys["oracle"], many, states if config.warm_start else None
+                ),
                 there.config.training.iterations,
                 there,
             )

@@ -78,6 +78,10 @@ class Config:
     horizon: float | None = None
     """Seconds of motion that a measured piece holds; not given: one control step for
     clean demonstrations, as many as the noise asks for otherwise."""
+    warm_start: bool = False
+    """Final training goes on from the networks of the UDR policy in place of new ones
+    (the Oracle's, too): it gets further where a training of its length has not settled.
+    """
     oracle: bool = False
     """Train the Oracle too: a policy trained in the target itself."""
     seeds: tuple[int, ...] = ()
@@ -109,6 +113,8 @@ def run(config: Config) -> None:
         check_seeds(config.seeds)
     if config.restarts is not None and config.restarts < 0:
         raise UserError(f"--restarts is {config.restarts}: give 0 or more")
+    if config.data and config.warm_start:
+        raise UserError("--warm-start goes without --data: logs have no training")
     if config.data and config.env:
         raise UserError("--env goes without --data: give --model and --parameters")
     if config.data:

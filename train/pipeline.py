@@ -60,6 +60,9 @@ class Config:
     restarts: int | None = None
     """More starts of the least-squares finish, drawn from the search's spread; the best
     fit counts. Not given: 2 for noisy data, none for clean ones and larger robots."""
+    warm_start: bool = False
+    """Final training goes on from the networks of the UDR policy in place of new ones:
+    it gets further where a training of its length has not settled."""
     trajectories: int = 200
     """Demonstration trajectories."""
     noise: tuple[float, ...] = ()
@@ -132,6 +135,7 @@ def run(config: Config) -> None:
             noise=config.noise,
             refine=config.refine,
             restarts=config.restarts,
+            warm_start=config.warm_start,
             eval_episodes=config.eval_episodes,
         ),
         start=config.start,

@@ -2,7 +2,6 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 from train._command import main, say, show_table
 
@@ -127,7 +126,7 @@ def run(config: Config) -> None:
             "train",
             training.iterations,
             training_chunk(config.chunk, training),
-            lambda: _begun(pipe, keys["udr"], wide, old),
+            lambda: pipe.train_init(keys["udr"], wide, old),
             lambda s, n: step(s, wide, target, n),
             training_rows(config.seeds, training.steps_per_iteration),
             notes,
@@ -185,14 +184,6 @@ def run(config: Config) -> None:
         )
     show_table(title, ("seed", "return"), rows)
     say(f"report: {config.out / 'report.html'}")
-
-
-def _begun(pipe: Any, keys: Any, wide: Any, old: Any) -> Any:
-    """Training states before the first step, with old networks where there are any."""
-    import jax
-
-    fresh = pipe.train_init(keys, wide)
-    return fresh if old is None else jax.vmap(pipe.trainer.continued)(fresh, old)
 
 
 if __name__ == "__main__":

@@ -109,6 +109,9 @@ class Udr:
 class Oracle:
     """A whole training in the target itself: what knowing everything would bring."""
 
+    warm_start: bool = False
+    """From the networks of the policy's training in place of new ones."""
+
     def fit(
         self,
         practice: Practice,
@@ -116,10 +119,11 @@ class Oracle:
         budget: Budget,
         key: jax.Array,
     ) -> Learned:
-        """Trains from scratch in the target."""
+        """Trains in the target."""
         del demonstrations
         training = budgeted(practice.training, budget)
-        policy = trained_at(practice.real, training, practice.target, key)
+        start = practice.state if self.warm_start else None
+        policy = trained_at(practice.real, training, practice.target, key, start)
         return Learned(policy, 0, training.env_steps)
 
 

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import cast
 
 import jax
 import mujoco
@@ -14,19 +15,25 @@ import yaml
 from PIL import Image
 
 from easi_jax.errors import UserError
+from easi_jax.io import checkpoints
 from easi_jax.io.video import render
+from easi_jax.pipeline import Pipeline, PipelineConfig, seed_keys
 from easi_jax.rl.networks import act
+from easi_jax.search import SearchState
 from envs import make
 from tests.commands import command, refused
 from train import easi, evaluate, export, pipeline, udr
-from train._robots import load_policies
+from train._robots import load_policies, training_config
 
 # The whole chain is compiled here; on a busy machine that takes its time.
 pytestmark = pytest.mark.timeout(1500)
 
 SMALL = ("--env-steps", "2400", "--eval-episodes", "4")
 SEARCH = ("--generations", "4", "--population", "16", "--trajectories", "8")
-SETTINGS = ("--set", "segments=16", "real_batch=64", "discriminator_updates=2")
+SETTINGS = (
+    *("--set", "segments=16", "real_batch=64", "discriminator_updates=2"),
+    "--warm-start",
+)
 TARGET = ("--target", "cart_kp*0.5")
 
 
@@ -42,18 +49,14 @@ def chain(tmp_path_factory) -> Path:
     return root
 
 
+def _pipeline(warm_start: bool = False) -> Pipeline:
+    env = make("cartpole")
+    training = training_config(env, 2400)
+    return Pipeline(env, PipelineConfig(training=training, warm_start=warm_start))
+
+
 def _restored(run: Path, stage: str):
-    import jax
-
-    from easi_jax.io import checkpoints
-    from easi_jax.pipeline import Pipeline, PipelineConfig, seed_keys
-    from envs import make
-    from train._robots import training_config
-
-    pipe = Pipeline(
-        make("cartpole"),
-        PipelineConfig(training=training_config(make("cartpole"), 2400)),
-    )
+    pipe = _pipeline()
     wide = pipe.spread(pipe.udr(), 1)
     target = jax.eval_shape(lambda k: pipe.train_init(k, wide), seed_keys([0]))
     found = checkpoints.restore(run / "checkpoints" / stage, target)
@@ -196,6 +199,32 @@ def test_pipeline_equals_the_two_commands(chain: Path, tmp_path: Path) -> None:
     result = json.loads((out / "results.json").read_text())["returns"]
     other = json.loads((chain / "easi" / "results.json").read_text())["returns"]
     np.testing.assert_allclose(result["UDR"]["0"], other["UDR"]["0"], rtol=0.05)
+    assert _moved(out) < 0.3 * _moved(chain / "easi", fresh=True)
+
+
+def _moved(run: Path, fresh: bool = False) -> float:
+    """How far the final networks are from the first ones, or other new ones are."""
+    first, final = (load_policies(run, m)["policies"].network for m in ("UDR", "EASI"))
+    if fresh:
+        pipe = _pipeline()
+        wide = pipe.spread(pipe.udr(), 1)
+        final = pipe.policies(pipe.train_init(seed_keys([5]), wide)).network
+    apart = jax.tree.map(lambda a, b: float(((a - b) ** 2).sum()), first, final)
+    return sum(jax.tree.leaves(apart)) ** 0.5
+
+
+def test_warm_start_goes_on_from_the_first_networks_alone(chain: Path) -> None:
+    assert _moved(chain / "easi") < 0.3 * _moved(chain / "easi", fresh=True)
+    old, search = _restored(chain / "udr", "train").state, cast(SearchState, None)
+    begun = []
+    for warm in (True, False):
+        pipe = _pipeline(warm)
+        wide = pipe.spread(pipe.udr(), 1)
+        new = pipe.final_init(seed_keys([5]), wide, search, old)
+        assert (new.iteration, old.iteration) == (0, 24)
+        same = jax.tree.map(np.array_equal, new.learner.policy, old.learner.policy)
+        begun.append(all(jax.tree.leaves(same)))
+    assert begun == [True, False]
 
 
 @pytest.mark.parametrize(
