@@ -258,8 +258,8 @@ def _first(
         if off and max(off) < _EXACT:
             place += (
                 "; its parameters are the truth's in every seed (largest log ratio "
-                f"{max(off):.0e}): it trains where Oracle does, and what is between "
-                "them is a training's chance"
+                f"{max(off):.0e}): it trains where Oracle does, and what is between it "
+                "and Oracle is a training's chance"
             )
         if WARM[1] in found:
             place += f". {_place(WARM[1], found, rivals)}"
