@@ -134,7 +134,7 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
         distribution was found, and without a policy ``error``, the ratios' RMS along
         the directions that the demonstrations determine, and ``start_error``, that of
         the middle of where the search starts; what was ``simulated`` and
-        ``measured``, ``seconds``.
+        ``measured``, ``seconds``; the device that ``udr`` was trained on.
         With ``cell.curves``: ``curve`` (control steps, returns in the target) of the
         last training, ``trace`` (mean, below, above) of each parameter by generation,
         as ratios to the truth.
@@ -143,12 +143,14 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
     import jax.numpy as jnp
     import numpy as np
 
+    from easi_jax.io.files import read_json
     from easi_jax.rl.evaluate import evaluate
     from easi_jax.rl.networks import act
 
     bench = _Bench.open(cell, folder)
     begun = time.monotonic()
     policy, row = bench.policy, {"simulated": 0, "measured": 0}
+    row["udr"] = read_json(bench.run / "versions.json")["runtime"]["device_kind"]
     if cell.method in identifiers():
         policy, found = bench.identified(begun)
         row |= found

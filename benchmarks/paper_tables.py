@@ -421,7 +421,7 @@ def _mixed(rows: Sequence[Row], robot: str) -> list[str]:
     for r in rows:
         mine = (r["robot"], r["target"], r["method"]) == (robot, target, OURS)
         if mine and r["policy"] and not (r["settings"] or r["curves"]):
-            columns[paper_matrix.device(r)].add(r["trajectories"])
+            columns[r.get("udr") or paper_matrix.device(r)].add(r["trajectories"])
     if len(columns) < 2:
         return []
     told = "; ".join(

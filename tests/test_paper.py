@@ -142,6 +142,9 @@ def test_demonstrations_of_several_machines_are_said(tmp_path: Path) -> None:
     for r in rows[:2]:
         r["versions"] = {**VERSIONS, "runtime": {"device_kind": "cpu"}}
     assert "own: 200 on GPU; 1, 50 on cpu." in page(tmp_path, *rows)
+    for r in rows[:2]:
+        r["udr"] = "GPU"  # where their UDR was trained, wherever they ran
+    assert "UDR of its own" not in page(tmp_path, *rows)
 
 
 def test_what_was_run_is_a_table(tmp_path: Path) -> None:
