@@ -42,7 +42,7 @@ def run_cells(
         UserError: no such cell, or no such part.
     """
     from easi_jax.errors import UserError
-    from easi_jax.io.versions import versions
+    from easi_jax.io.runs.versions import versions
 
     if share.only:
         every = [c for c in every if c.key == share.only]

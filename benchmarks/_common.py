@@ -32,7 +32,7 @@ def commits_of(rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 def short(commit: str | None) -> str:
-    """A commit as `easi_jax.io.versions` has it, in 7 characters and its +."""
+    """A commit as `easi_jax.io.runs.versions` has it, in 7 characters and its +."""
     return commit[:7] + "+" * commit.endswith("+") if commit else "unknown"
 
 
@@ -97,7 +97,7 @@ def write_result(
     written as seen from the repository's root.
     """
     from easi_jax.io.files import atomic_write, to_json
-    from easi_jax.io.versions import versions
+    from easi_jax.io.runs.versions import versions
 
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.json"

@@ -63,7 +63,7 @@ def _compare(env: Any, config: Config) -> dict[str, list[list[float]]]:
     import numpy as np
 
     from benchmarks.physics import random_commands
-    from easi_jax.machine import Machine
+    from easi_jax.simulation.simulator import Simulator
 
     count = max(1, round(TIMES[-1] / env.dt))
     before = max(1, round(config.settle / env.dt))
@@ -73,18 +73,18 @@ def _compare(env: Any, config: Config) -> dict[str, list[list[float]]]:
     theta = env.space.to_si(unit)
     reset = jax.random.split(jax.random.key(0), config.population)
 
-    def machine(iterations: int, finer: int = 1) -> Machine:
+    def simulator(iterations: int, finer: int = 1) -> Simulator:
         m = env.mj_model.__copy__()
         m.opt.iterations = iterations
-        m.opt.timestep = env.dt / (env.machine.substeps * finer)
-        return env.machine.rebuilt(m)
+        m.opt.timestep = env.dt / (env.simulator.substeps * finer)
+        return env.simulator.rebuilt(m)
 
-    def positions(machine: Machine, first: Any, ctrl: jax.Array) -> Any:
+    def positions(simulator: Simulator, first: Any, ctrl: jax.Array) -> Any:
         def one(t: jax.Array, state: Any, u: jax.Array) -> Any:
-            model = machine.model(t)
+            model = simulator.model(t)
 
             def advance(s: Any, a: jax.Array) -> Any:
-                s = machine.step(model, s, a)
+                s = simulator.step(model, s, a)
                 return s, s.qpos
 
             return jax.lax.scan(advance, state, u)
@@ -92,10 +92,10 @@ def _compare(env: Any, config: Config) -> dict[str, list[list[float]]]:
         return jax.jit(jax.vmap(one))(theta, first, ctrl)
 
     first = jax.vmap(lambda k: env.reset(env.model(), k).physics)(reset)
-    first, _ = positions(env.machine, first, ctrl[:, :before])
+    first, _ = positions(env.simulator, first, ctrl[:, :before])
     ctrl = ctrl[:, before:]
     rows = [max(1, round(t / env.dt)) - 1 for t in TIMES]
-    exact = np.asarray(positions(machine(CONVERGED), first, ctrl)[1])
+    exact = np.asarray(positions(simulator(CONVERGED), first, ctrl)[1])
 
     def difference(other: Any) -> list[list[float]]:
         apart = np.abs(np.asarray(other) - exact).max(-1)[:, rows]
@@ -104,10 +104,10 @@ def _compare(env: Any, config: Config) -> dict[str, list[list[float]]]:
     found = {}
     for steps in config.steps:
         found[f"{steps} Newton steps"] = difference(
-            positions(machine(steps), first, ctrl)[1]
+            positions(simulator(steps), first, ctrl)[1]
         )
         say(f"{env.name}: {steps} Newton steps {found[f'{steps} Newton steps'][-1]}")
-    finer = positions(machine(CONVERGED, 4), first, ctrl)[1]
+    finer = positions(simulator(CONVERGED, 4), first, ctrl)[1]
     found["a quarter of the time step"] = difference(finer)
     return found
 

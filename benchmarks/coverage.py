@@ -51,7 +51,7 @@ def run(config: Config) -> None:
     """Runs the targets that are not there yet."""
     from benchmarks._common import at_least_one, command_of
     from easi_jax.errors import UserError
-    from easi_jax.io.versions import versions
+    from easi_jax.io.runs.versions import versions
 
     at_least_one(config, "targets", "trajectories", "generations")
     if not 0 <= config.late < 1:
@@ -84,34 +84,36 @@ def _solver(config: Config) -> Any:
     import jax.numpy as jnp
     import numpy as np
 
-    from easi_jax import distribution
-    from easi_jax.identify import RESTARTS, estimate, finish_pieces
-    from easi_jax.information import PairedFit, identifiability
-    from easi_jax.machine import Machine
-    from easi_jax.refine import step_weights
-    from easi_jax.rollout import collect, measured
-    from easi_jax.runtime import fast_loops
-    from easi_jax.search import Search, SearchData
-    from easi_jax.search_config import preset
-    from easi_jax.segments import windows
+    from easi_jax.data.segments import windows
+    from easi_jax.devices.runtime import fast_loops
+    from easi_jax.estimation.identifiability import identifiability
+    from easi_jax.estimation.levenberg_marquardt import step_weights
+    from easi_jax.estimation.normal_equations import PairedFit
+    from easi_jax.estimation.pieces import finish_pieces
+    from easi_jax.estimation.posterior import RESTARTS, estimate
+    from easi_jax.model import distribution
+    from easi_jax.search.config import preset
+    from easi_jax.search.easi import Search, SearchData
+    from easi_jax.simulation.rollout import collect, measured
+    from easi_jax.simulation.simulator import Simulator
     from envs import make
 
     env = make("cartpole")
     space = env.space.select([n for n in env.space.names if n not in WEIGHED])
-    machine = Machine(env.mj_model, space, env.dt)
+    simulator = Simulator(env.mj_model, space, env.dt)
     real = copy.copy(env)
-    real.machine, real.space = machine, space
+    real.simulator, real.space = simulator, space
     if config.late > 0:
-        real.machine = machine.rebuilt(fixed={"effect.delay.cart": config.late})
+        real.simulator = simulator.rebuilt(fixed={"effect.delay.cart": config.late})
     search = Search(
-        machine, preset("default", generations=config.generations, horizon=8)
+        simulator, preset("default", generations=config.generations, horizon=8)
     )
     noise = jnp.asarray(NOISE)
 
     @functools.partial(jax.jit, compiler_options=fast_loops())
     def find(key: jax.Array, truth: jax.Array) -> Any:
         k_run, k_noise, k_search = jax.random.split(key, 3)
-        model = real.machine.model(space.to_si(truth))
+        model = real.simulator.model(space.to_si(truth))
         runs = collect(
             *(real, model, controller, k_run, config.trajectories, env.episode_length)
         )
@@ -122,17 +124,17 @@ def _solver(config: Config) -> Any:
 
     @jax.jit
     def judge(demos: Any, mean: jax.Array, cov: jax.Array, truth: jax.Array) -> Any:
-        pieces = finish_pieces(machine, demos)
+        pieces = finish_pieces(simulator, demos)
         found = [
             estimate(
-                *(machine, search.space, mean, cov, pieces, noise, *how),
+                *(simulator, search.space, mean, cov, pieces, noise, *how),
                 restarts=RESTARTS,
                 adjusted=True,
             ).distribution
             for how in ((False, False), (False, True), (True, True))
         ]
         still = jnp.zeros((pieces.count, len(noise)))
-        fit = PairedFit(machine, space, pieces, noise)
+        fit = PairedFit(simulator, space, pieces, noise)
         bound = fit.normal(truth, still, step_weights(pieces, noise)).hessian
         return found, bound
 
@@ -168,7 +170,7 @@ def distances(off: Any, cov: Any, known: Any) -> dict[str, float]:
     Args:
         off: errors in log ratios, ``(n,)``.
         cov: covariance that was stated, ``(n, n)``.
-        known: `easi_jax.information.Identifiability` at the truth.
+        known: `easi_jax.estimation.normal_equations.Identifiability` at the truth.
 
     Returns:
         ``distance`` in the stated covariance, ``bound`` in that of Cramer and Rao;

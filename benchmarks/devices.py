@@ -107,8 +107,8 @@ def moved(name: str, population: int) -> Any:
     import numpy as np
 
     from benchmarks._common import wander
-    from easi_jax.mesh import make_mesh, sharded_map
-    from easi_jax.rollout import policy_rollout
+    from easi_jax.devices.mesh import make_mesh, sharded_map
+    from easi_jax.simulation.rollout import policy_rollout
     from envs import make
 
     env, mesh = make(name), make_mesh()
@@ -134,18 +134,19 @@ def searched(config: Config) -> dict[str, Any]:
     import numpy as np
 
     from benchmarks.recovery import NOISE, controller
-    from easi_jax.distribution import covariance
-    from easi_jax.identify import estimate, finish_pieces
-    from easi_jax.rollout import collect, measured
-    from easi_jax.search import Search, SearchData
-    from easi_jax.search_config import preset
-    from easi_jax.segments import windows
+    from easi_jax.data.segments import windows
+    from easi_jax.estimation.pieces import finish_pieces
+    from easi_jax.estimation.posterior import estimate
+    from easi_jax.model.distribution import covariance
+    from easi_jax.search.config import preset
+    from easi_jax.search.easi import Search, SearchData
+    from easi_jax.simulation.rollout import collect, measured
     from envs import make
 
     env = make("cartpole")
-    machine = env.machine.rebuilt(space=env.space.scaled(0.3, 0.9))
+    simulator = env.simulator.rebuilt(space=env.space.scaled(0.3, 0.9))
     search = Search(
-        machine, preset("default", generations=config.generations, horizon=8)
+        simulator, preset("default", generations=config.generations, horizon=8)
     )
     noise = jnp.asarray(NOISE)
 
@@ -156,8 +157,8 @@ def searched(config: Config) -> dict[str, Any]:
         data = SearchData(windows(demos, 8, 8), noise, ())
         state, _ = search.run(search.init(key, data), data, config.generations)
         mean, cov = state.result_mean, state.result_cov
-        pieces = finish_pieces(machine, demos)
-        fit = estimate(machine, search.space, mean, cov, pieces, noise, True)
+        pieces = finish_pieces(simulator, demos)
+        fit = estimate(simulator, search.space, mean, cov, pieces, noise, True)
         return mean, cov, fit.distribution
 
     mean, cov, found = jax.device_get(find(jax.random.key(0)))

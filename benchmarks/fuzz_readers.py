@@ -98,7 +98,7 @@ def _columns() -> dict[str, np.ndarray]:
 
 
 def _table(extension: str, columns: dict[str, Any] | None = None) -> bytes:
-    from easi_jax.io.log_tables import write_table
+    from easi_jax.io.logs.tables import write_table
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"log{extension}"
@@ -119,7 +119,7 @@ def _logs(extension: str) -> Callable[[], list[Files]]:
 
 def _read_log(extension: str) -> Callable[[Path], object]:
     def read(folder: Path) -> object:
-        from easi_jax.io.logs import read_logs
+        from easi_jax.io.logs.reader import read_logs
 
         return read_logs(folder / f"log{extension}", _cart())
 
@@ -134,13 +134,13 @@ def _arm_logs() -> list[Files]:
 
 @functools.cache
 def _arm() -> Any:
-    from easi_jax.io.model_file import read_mjcf
+    from easi_jax.io.models.mjcf import read_mjcf
 
     return read_mjcf(ARM / "model.xml")
 
 
 def _read_arm_log(folder: Path) -> object:
-    from easi_jax.io.logs import read_logs
+    from easi_jax.io.logs.reader import read_logs
 
     return read_logs(folder / "log.csv", _arm())
 
@@ -150,7 +150,7 @@ def _arm_parameters() -> list[Files]:
 
 
 def _read_arm_parameters(folder: Path) -> object:
-    from easi_jax.io.parameter_file import read_parameter_file
+    from easi_jax.io.models.parameter_file import read_parameter_file
 
     return read_parameter_file(folder / "p.yaml", _arm())
 
@@ -323,7 +323,7 @@ def _mappings() -> list[Files]:
 
 
 def _read_mapping(folder: Path) -> object:
-    from easi_jax.io.logs import read_logs
+    from easi_jax.io.logs.reader import read_logs
 
     return read_logs(folder / "log.csv", _cart(), folder / "map.yaml")
 
@@ -354,15 +354,15 @@ refitted:
 
 
 def _read_parameters(folder: Path) -> object:
-    from easi_jax.io.parameter_file import read_parameter_file
+    from easi_jax.io.models.parameter_file import read_parameter_file
 
     return read_parameter_file(folder / "p.yaml", _cart())
 
 
 def _read_effects(folder: Path) -> object:
-    from easi_jax.found_effects import FoundEffects, joined, named
-    from easi_jax.io.effects_file import read_effects
-    from easi_jax.parameters import ParameterSpace
+    from easi_jax.io.models.effects_file import read_effects
+    from easi_jax.model.found_effects import FoundEffects, joined, named
+    from easi_jax.model.parameters import ParameterSpace
 
     entries, own = read_effects(folder / "effects.yaml")
     found = FoundEffects(tuple(entries), own)
@@ -438,9 +438,9 @@ def _runs() -> list[Files]:
 
 
 def _read_run(folder: Path) -> object:
-    from easi_jax.io.metrics import read_metrics
-    from easi_jax.io.run_files import TRAINED, checked
-    from easi_jax.io.runs import RunFolder, read_config
+    from easi_jax.io.runs.folder import RunFolder, read_config
+    from easi_jax.io.runs.metrics import read_metrics
+    from easi_jax.io.runs.schemas import TRAINED, checked
     from train._robots import read_policies
 
     if not (folder / "versions.json").exists():  # else git is asked for the commit
@@ -454,7 +454,7 @@ def _read_run(folder: Path) -> object:
 
 def _read_found(folder: Path) -> object:
     from easi_jax.export.randomization import read_randomization, to_yaml
-    from easi_jax.io.run_files import GAP, read_checked, read_distribution
+    from easi_jax.io.runs.schemas import GAP, read_checked, read_distribution
 
     read_checked(folder / "gap.json", GAP, "a gap.json of train.gap")
     found = read_distribution(folder / "distribution.json")
@@ -479,7 +479,7 @@ def _founds() -> list[Files]:
 
 
 def _read_numbers(content: Any) -> Any:
-    from easi_jax.io.run_files import DISTRIBUTION, checked
+    from easi_jax.io.runs.schemas import DISTRIBUTION, checked
 
     return checked(content, DISTRIBUTION, "here")
 
@@ -543,7 +543,7 @@ def _target() -> Any:
 
 
 def _checkpoints() -> list[Files]:
-    from easi_jax.io import checkpoints
+    from easi_jax.io.runs import checkpoints
 
     folder = Path(tempfile.mkdtemp())
     try:
@@ -556,7 +556,7 @@ def _checkpoints() -> list[Files]:
 
 def _read_checkpoint(folder: Path) -> object:
     from easi_jax.errors import UserError
-    from easi_jax.io import checkpoints
+    from easi_jax.io.runs import checkpoints
 
     found = checkpoints.restore(folder, _target(), config_hash="a")
     if found is None:
@@ -613,7 +613,7 @@ def _models() -> list[Files]:
 
 
 def _read_model(folder: Path) -> object:
-    from easi_jax.io.model_file import read_mjcf
+    from easi_jax.io.models.mjcf import read_mjcf
 
     m = read_mjcf(folder / "model.xml")
     if SECRET.encode() in m.names:
@@ -666,7 +666,7 @@ def _drawn_report() -> Any:
 
 def _read_report(folder: Path) -> object:
     from easi_jax.io.files import read_json
-    from easi_jax.io.report import (
+    from easi_jax.io.report.html import (
         Diagnostic,
         ParameterRow,
         Picture,

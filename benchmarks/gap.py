@@ -43,7 +43,7 @@ class Config:
 def run(config: Config) -> None:
     """Makes, runs and grades each case."""
     from benchmarks._common import command_of
-    from easi_jax.io.versions import versions
+    from easi_jax.io.runs.versions import versions
     from tests.gap_cases import CaseError, draw_case
 
     done = set()

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from easi_jax.io.figure_style import (
+from easi_jax.io.report.figure_style import (
     BLUE,
     DASHED,
     FAINT,

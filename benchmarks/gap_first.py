@@ -10,18 +10,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from easi_jax.configuration import Configuration
-from easi_jax.distribution import covariance, gaussian
-from easi_jax.found_effects import FoundEffects, machine_with
-from easi_jax.io.effects_file import parsed_effects
-from easi_jax.io.logs import write_log
-from easi_jax.io.parameter_file import write_parameter_file
+from easi_jax.baselines import Budget, Easi, Identified, Task
+from easi_jax.data.recording import Run
+from easi_jax.data.segments import Segments
+from easi_jax.io.logs.reader import write_log
+from easi_jax.io.models.effects_file import parsed_effects
+from easi_jax.io.models.parameter_file import write_parameter_file
 from easi_jax.io.strict_yaml import read_yaml
-from easi_jax.machine import Machine
-from easi_jax.methods import Budget, Easi, Identified, Task
-from easi_jax.parameters import ParameterSpace
-from easi_jax.recording import Run
-from easi_jax.segments import Segments
+from easi_jax.model.distribution import covariance, gaussian
+from easi_jax.model.found_effects import FoundEffects
+from easi_jax.model.joint_space import Configuration
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation.simulator import Simulator
+from easi_jax.simulation.with_effects import simulator_with
 
 _ROOT = Path(__file__).parents[1]
 
@@ -51,7 +52,7 @@ class GapFirst:
             for e in effects.entries
             for k, v in e.columns.items()
         ]
-        machine = machine_with(task.machine, effects)
+        machine = simulator_with(task.machine, effects)
         found = Easi(refine=True).fit(
             replace(task, machine=machine), demonstrations, budget, key
         )
@@ -81,7 +82,7 @@ class GapFirst:
             return parsed_effects(read_yaml(found), str(found))
 
 
-def runs(machine: Machine, demonstrations: Segments) -> list[Run]:
+def runs(machine: Simulator, demonstrations: Segments) -> list[Run]:
     """Trajectories ``(B, T, 1, ...)`` as runs of a log."""
     d = jax.tree.map(lambda x: np.asarray(x, float), demonstrations)
     shape = Configuration.of(machine.mj_model)

@@ -16,7 +16,7 @@ from train._command import main, say, show_table
 
 
 @dataclasses.dataclass(frozen=True)
-class Machine:
+class Simulator:
     """Recordings of one machine, and what is known of it."""
 
     folder: str
@@ -29,7 +29,7 @@ class Machine:
 
 
 MACHINES = {
-    "emps": Machine(
+    "emps": Simulator(
         "emps",
         ("run1.csv",),
         ("run2_pulses.csv",),
@@ -41,7 +41,7 @@ MACHINES = {
         ),
         ("actuator_delay", "sensor_delay"),
     ),
-    "cartpole": Machine(
+    "cartpole": Simulator(
         "quanser_cartpole",
         ("chirp_plus_*.csv", "chirp_minus_*.csv"),
         ("swingup_0?.csv",),
@@ -51,14 +51,14 @@ MACHINES = {
             "coulomb_friction@slider|stribeck_friction@slider",
         ),
     ),
-    "drive_velocities": Machine(
+    "drive_velocities": Simulator(
         "quanser_cartpole",
         ("swingup_00_with_drive_velocities.csv",),
         (),
         0.2,
         ("sensor_delay@qvel.slider",),
     ),
-    "pendulum": Machine(
+    "pendulum": Simulator(
         "dfki_pendulum",
         ("sac.csv", "energy_0.5kg.csv", "swingup_ddp.csv"),
         (),
@@ -66,14 +66,14 @@ MACHINES = {
         ("coulomb_friction|stribeck_friction", "actuator_gain|payload_mass|armature"),
     ),
     # The torque follows the sign of the speed in what is left: friction is gain.
-    "pendulum_held_out": Machine(
+    "pendulum_held_out": Simulator(
         "dfki_pendulum",
         ("sac.csv", "energy_0.5kg.csv"),
         ("swingup_ddp.csv",),
         0.2,
         ("coulomb_friction|stribeck_friction", "actuator_gain|payload_mass|armature"),
     ),
-    "pendulum_1kg": Machine(
+    "pendulum_1kg": Simulator(
         "dfki_pendulum", ("energy_1kg.csv",), (), 0.2, ("payload_mass",)
     ),
 }
@@ -118,7 +118,7 @@ def run(config: Config) -> None:
         say(f"written: {path}")
 
 
-def analysed(machine: Machine, data: Path, out: Path) -> dict[str, Any]:
+def analysed(machine: Simulator, data: Path, out: Path) -> dict[str, Any]:
     """What train.gap says, and which of the expected names are among it."""
     from train import gap
 

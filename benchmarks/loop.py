@@ -243,7 +243,7 @@ def _recorded(robot: str, run_folder: Path, hidden: Path, folder: Path) -> list[
 
     from easi_jax.io.files import atomic_write
     from easi_jax.rl.networks import act
-    from easi_jax.rollout import collect, measured
+    from easi_jax.simulation.rollout import collect, measured
     from train import udr
     from train._effects import read_given, robots
     from train._robots import load_udr

@@ -65,7 +65,7 @@ class Cell:
 
 def identifiers() -> dict[str, Callable[[Cell], Any]]:
     """Methods that find a distribution over parameters."""
-    from easi_jax.methods import (
+    from easi_jax.baselines import (
         Dropo,
         Easi,
         MujocoSysid,
@@ -97,7 +97,7 @@ def identifiers() -> dict[str, Callable[[Cell], Any]]:
 
 def learners() -> dict[str, Callable[[Cell], Any]]:
     """Methods that end with a policy."""
-    from easi_jax.methods import FineTune, Garat, Oracle
+    from easi_jax.baselines import FineTune, Garat, Oracle
 
     return {
         "Oracle": lambda _: Oracle(),
@@ -202,8 +202,8 @@ class _Bench:
         import jax
         import jax.numpy as jnp
 
-        from easi_jax.methods.policies import quiet
-        from easi_jax.pipeline import (
+        from easi_jax.baselines.policies import quiet
+        from easi_jax.pipeline.stages import (
             Pipeline,
             PipelineConfig,
             seed_keys,
@@ -238,9 +238,9 @@ class _Bench:
         import jax
         import numpy as np
 
-        from easi_jax import distribution
-        from easi_jax.methods import Budget, Easi
-        from easi_jax.methods.policies import watched
+        from easi_jax.baselines import Budget, Easi
+        from easi_jax.baselines.policies import watched
+        from easi_jax.model import distribution
 
         cell, curve = self.cell, []
 
@@ -291,8 +291,8 @@ class _Bench:
         """The policy of a method that ends with one."""
         import jax.numpy as jnp
 
-        from easi_jax.methods import Budget, Practice
-        from easi_jax.methods.policies import watched
+        from easi_jax.baselines import Budget, Practice
+        from easi_jax.baselines.policies import watched
 
         cell, env = self.cell, self.env
         ideal = cell.method in ("Oracle", WARM[0])
@@ -330,9 +330,9 @@ class _Bench:
         import jax
         import jax.numpy as jnp
 
-        from easi_jax.methods import Task
+        from easi_jax.baselines import Task
         from easi_jax.rl.networks import act
-        from easi_jax.rollout import policy_rollout
+        from easi_jax.simulation.rollout import policy_rollout
 
         env = self.env
 
@@ -349,7 +349,7 @@ class _Bench:
             return jax.jit(jax.vmap(one))(resets)
 
         return Task(
-            machine=self.pipe.machine,
+            simulator=self.pipe.simulator,
             noise=jnp.zeros(2 * env.mj_model.nv),
             env=env,
             act=lambda policy, obs, key: act(policy, obs, key),
@@ -375,18 +375,19 @@ class _Bench:
         import jax.numpy as jnp
         import numpy as np
 
-        from easi_jax.identify import effective_noise
-        from easi_jax.information import PairedFit, identifiability
-        from easi_jax.refine import step_weights
+        from easi_jax.estimation.identifiability import identifiability
+        from easi_jax.estimation.levenberg_marquardt import step_weights
+        from easi_jax.estimation.normal_equations import PairedFit
+        from easi_jax.estimation.pieces import effective_noise
 
-        machine, space = self.env.machine, self.env.space
+        simulator, space = self.env.simulator, self.env.space
 
         @jax.jit
         def hessian(demos: Any) -> Any:
             pieces = self.pipe.pieces(demos)
             zero = jnp.zeros(2 * self.env.mj_model.nv)
-            noise = effective_noise(machine, pieces, zero)
-            fit = PairedFit(machine, space, pieces, noise, free_starts=False)
+            noise = effective_noise(simulator, pieces, zero)
+            fit = PairedFit(simulator, space, pieces, noise, free_starts=False)
             still = jnp.zeros((pieces.count, len(noise)))
             unit = space.to_unit(self.target)
             return fit.normal(unit, still, step_weights(pieces, noise, None)).hessian

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from easi_jax.io.figure_style import (
+from easi_jax.io.report.figure_style import (
     DASHED,
     FAINT,
     SERIES,

@@ -436,8 +436,8 @@ def _table4(rows: Sequence[Row]) -> list[str]:
     if any("elite_ratio" in s for r in rows for s in r["settings"]):
         out.append(
             "Weights of the better half alone are above zero "
-            "(`easi_jax.strategies.recombination_weights`), so from μ/λ = 0.5 on it is "
-            "the same search."
+            "(`easi_jax.search.evolution.recombination_weights`), "
+            "so from μ/λ = 0.5 on it is the same search."
         )
     return out
 
@@ -634,7 +634,7 @@ def _column(row: Row, i: int) -> list[list[float]]:
 
 
 def _drawn_fig5(rows: Sequence[Row]) -> str:
-    from easi_jax.io.figures import returns_by_step
+    from easi_jax.io.report.figures import returns_by_step
 
     found: dict[str, list[list[list[float]]]] = defaultdict(list)
     for r in rows:

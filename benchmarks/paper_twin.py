@@ -159,8 +159,8 @@ def _by_command(
     ``train.gap`` found."""
     from benchmarks.twin_measures import rounded
     from easi_jax.io.files import read_json
-    from easi_jax.io.logs import write_log
-    from easi_jax.io.parameter_file import write_parameter_file
+    from easi_jax.io.logs.reader import write_log
+    from easi_jax.io.models.parameter_file import write_parameter_file
     from train import easi
 
     del policy  # logs come without it
@@ -221,9 +221,9 @@ def _named(robot: str, place: Path) -> None:
 
 def with_effects(env: Any, place: Path) -> Any:
     """The environment with what ``train.gap`` found in ``place``, if it ran there."""
-    from easi_jax.found_effects import env_with
-    from easi_jax.io.effects_file import parsed_effects
+    from easi_jax.io.models.effects_file import parsed_effects
     from easi_jax.io.strict_yaml import read_yaml
+    from easi_jax.simulation.with_effects import env_with
 
     path = place / _FOUND
     if not path.exists():
@@ -238,11 +238,11 @@ def _by_controller(
     import jax
     import jax.numpy as jnp
 
-    from easi_jax import distribution
-    from easi_jax.methods import Budget, Easi, Task
-    from easi_jax.pipeline import seed_keys, stage_keys
+    from easi_jax.baselines import Budget, Easi, Task
+    from easi_jax.data.segments import join
+    from easi_jax.model import distribution
+    from easi_jax.pipeline.stages import seed_keys, stage_keys
     from easi_jax.rl.networks import act
-    from easi_jax.segments import join
     from train._robots import search_config
 
     del place, twin
@@ -250,7 +250,7 @@ def _by_controller(
     pieces = [jax.tree.map(_flat, log.segments()) for log in logs]
     demos = jax.tree.map(lambda x: jnp.asarray(x)[None], join(pieces))
     task = Task(
-        machine=env.machine,
+        simulator=env.simulator,
         noise=jnp.zeros(2 * env.mj_model.nv),
         env=env,
         act=lambda policy, obs, key: act(policy, obs, key, deterministic),
@@ -279,10 +279,10 @@ def trained(cell: Cell, place: Path, env: Any, found: dict[str, Any]) -> Any:
     import jax
     import jax.numpy as jnp
 
-    from easi_jax import distribution
-    from easi_jax.io.runs import RunFolder
-    from easi_jax.methods.policies import quiet
-    from easi_jax.pipeline import Pipeline, PipelineConfig, seed_keys, stage_keys
+    from easi_jax.baselines.policies import quiet
+    from easi_jax.io.runs.folder import RunFolder
+    from easi_jax.model import distribution
+    from easi_jax.pipeline.stages import Pipeline, PipelineConfig, seed_keys, stage_keys
     from train._robots import search_config, training_chunk, training_config
     from train._stages import jit_chunks, run_stage
 

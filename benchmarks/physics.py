@@ -38,10 +38,10 @@ def native_rates(env: Any, population: int, steps: int, repeats: int) -> list[fl
     import numpy as np
     from mujoco import rollout
 
-    from easi_jax import runtime
+    from easi_jax.devices import runtime
 
     m, n = env.mj_model, population
-    held = env.machine.substeps
+    held = env.simulator.substeps
     first = env.reset(env.model(), jax.random.key(0)).physics
     size = mujoco.mj_stateSize(m, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     start = np.zeros((n, size))
@@ -72,7 +72,7 @@ def search_rates(
 
     Args:
         step: one physics step in place of the package's, ``(model, state, ctrl)``.
-        fast: with `easi_jax.runtime.fast_loops`.
+        fast: with `easi_jax.devices.runtime.fast_loops`.
         sensing: read what controllers need, such as contact forces; the replay of
             measured motion does not.
 
@@ -82,30 +82,30 @@ def search_rates(
     import jax
     import jax.numpy as jnp
 
-    from easi_jax import physics
-    from easi_jax.mesh import make_mesh, sharded_map
-    from easi_jax.runtime import fast_loops
+    from easi_jax.devices.mesh import make_mesh, sharded_map
+    from easi_jax.devices.runtime import fast_loops
+    from easi_jax.simulation import step as physics
 
-    machine, n = env.machine, population
+    simulator, n = env.simulator, population
     ctrl = jnp.asarray(random_commands(env, n, steps), jnp.float32)
     unit = jax.random.uniform(jax.random.key(1), (n, env.space.size))
     first = env.reset(env.model(), jax.random.key(0)).physics
 
     def control_step(model: Any, state: Any, u: Any) -> Any:
         if step is None:
-            return machine.step(model, state, u)
+            return simulator.step(model, state, u)
         once = step
 
         def inner(s: Any, _: None) -> Any:
             return once(model, s, u), None
 
-        return jax.lax.scan(inner, state, None, length=machine.substeps)[0]
+        return jax.lax.scan(inner, state, None, length=simulator.substeps)[0]
 
     def local(items: Any) -> Any:
         def one(u: Any, c: Any) -> Any:
-            model = machine.model(env.space.to_si(u))
+            model = simulator.model(env.space.to_si(u))
             if not sensing:
-                model = machine.without_sense(model)
+                model = simulator.without_sense(model)
 
             def advance(s: Any, a: Any) -> Any:
                 s = control_step(model, s, a)
@@ -128,7 +128,7 @@ def search_rates(
         begin = time.monotonic()
         jax.block_until_ready(run(unit, ctrl))
         seconds = time.monotonic() - begin
-        out.append(n * steps * machine.substeps / seconds)
+        out.append(n * steps * simulator.substeps / seconds)
     return out[1:], compiled
 
 
@@ -146,8 +146,8 @@ def _variants() -> dict[str, tuple[Callable[..., Any] | None, bool, bool]]:
     """Label: physics step (None: the package's), newer loop emitters, sensing."""
     from mujoco import mjx
 
-    from easi_jax import physics
-    from easi_jax.small_linalg import unroll_small
+    from easi_jax.simulation import step as physics
+    from easi_jax.simulation.cpu.small_linalg import unroll_small
 
     def plain_mjx(model: Any, state: Any, ctrl: Any) -> Any:
         d = mjx.step(model.mjx, physics.data_at(model, state, ctrl))
@@ -185,7 +185,7 @@ def run(config: Config) -> None:
         rows = [("as the search runs it", f"{np.median(ours):,.0f}", f"{ratio:.2f}")]
         tried = {}
         for label, (step, fast, sensing) in _variants().items():
-            if not config.variants or (sensing and not env.machine.base.sense):
+            if not config.variants or (sensing and not env.simulator.base.sense):
                 continue
             rates, seconds = search_rates(env, n, steps, 2, step, fast, sensing)
             tried[label] = {"steps_per_s": rates, "compile_s": seconds}

@@ -35,7 +35,7 @@ def run(config: Config) -> None:
     from benchmarks._common import command_of, write_result
     from easi_jax.errors import UserError
     from easi_jax.io.files import read_json
-    from easi_jax.io.metrics import read_metrics
+    from easi_jax.io.runs.metrics import read_metrics
     from train._robots import load_policies
 
     if not config.runs:

@@ -64,7 +64,7 @@ def run(config: Config) -> None:
 
     from benchmarks._common import write_result
     from easi_jax.io.files import read_json
-    from easi_jax.io.parameter_file import read_parameter_file
+    from easi_jax.io.models.parameter_file import read_parameter_file
     from train import _from_logs, easi
     from train._log_problem import load_model
 
@@ -138,29 +138,31 @@ def evaluate(
     import jax.numpy as jnp
     import numpy as np
 
-    from easi_jax.io.logs import read_logs
-    from easi_jax.log_data import open_loop_error, rows_of, segments_from_runs
-    from easi_jax.machine import Machine
-    from easi_jax.segments import to_device
+    from easi_jax.data.cleaning import rows_of
+    from easi_jax.data.segments import to_device
+    from easi_jax.estimation.pieces import segments_from_runs
+    from easi_jax.estimation.prediction_error import open_loop_error
+    from easi_jax.io.logs.reader import read_logs
+    from easi_jax.simulation.simulator import Simulator
 
     logs = {name: read_logs(paths, mj_model).runs for name, paths in files.items()}
-    machine = Machine(mj_model, space, logs["chirp_plus"][0].dt)
-    steps, every = round(HORIZON / machine.dt), round(EVERY / machine.dt)
+    simulator = Simulator(mj_model, space, logs["chirp_plus"][0].dt)
+    steps, every = round(HORIZON / simulator.dt), round(EVERY / simulator.dt)
     error = jax.jit(
         jax.vmap(
-            lambda theta, s: open_loop_error(machine, machine.model(theta), s),
+            lambda theta, s: open_loop_error(simulator, simulator.model(theta), s),
             (0, None),
         )
     )
     means = [s["mean"] for s in seeds.values()]
     theta = jnp.asarray([space.nominal.tolist(), *means], jnp.float32)
-    joints = [n.removeprefix("qpos.") for n in machine.state_names[: mj_model.nv]]
+    joints = [n.removeprefix("qpos.") for n in simulator.state_names[: mj_model.nv]]
     measures: dict[str, Any] = {}
     for measure, first in (("all_windows", 0), ("without_first_row", 1)):
         measures[measure] = {}
         for name, runs in logs.items():
             cut = [rows_of(run, first, len(run)) for run in runs]
-            pieces = segments_from_runs(machine, cut, steps, every, fitted=True)
+            pieces = segments_from_runs(simulator, cut, steps, every, fitted=True)
             pieces = to_device(pieces)
             nominal, *rest = np.asarray(error(theta, pieces), float)
             middle = np.median(rest, axis=0)
@@ -174,7 +176,7 @@ def evaluate(
                 },
             }
             if name == "chirp_minus":
-                best = _fitted_to_itself(machine, space, pieces, theta[1])
+                best = _fitted_to_itself(simulator, space, pieces, theta[1])
                 value = np.asarray(error(best[None], pieces), float)[0]
                 measures[measure][name]["fitted_to_itself"] = dict(
                     zip(joints, value.tolist(), strict=True)
@@ -194,12 +196,12 @@ def evaluate(
     return {"measures": measures, "first_row_jump": jumps}
 
 
-def _fitted_to_itself(machine: Any, space: Any, pieces: Any, start: Any) -> Any:
+def _fitted_to_itself(simulator: Any, space: Any, pieces: Any, start: Any) -> Any:
     """Parameters (SI) that fit ``pieces`` best, their starts as measured."""
     import jax
     import jax.numpy as jnp
 
-    from easi_jax.refine import refine
+    from easi_jax.estimation.levenberg_marquardt import refine
 
     scale = [*GOALS.values()]
     misfit = jnp.asarray([*scale, *(jnp.inf for _ in scale)])
@@ -207,7 +209,7 @@ def _fitted_to_itself(machine: Any, space: Any, pieces: Any, start: Any) -> Any:
     fit = jax.jit(
         lambda unit: (
             refine(
-                machine, space, unit, pieces, still, 40, misfit=misfit, robust=0
+                simulator, space, unit, pieces, still, 40, misfit=misfit, robust=0
             ).unit
         )
     )

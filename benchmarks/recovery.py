@@ -79,15 +79,15 @@ def _case(
     import numpy as np
 
     from benchmarks._common import write_result
-    from easi_jax import identify
-    from easi_jax.heldout import relative_errors
-    from easi_jax.information import describe, identifiability
-    from easi_jax.machine import Machine
-    from easi_jax.rollout import collect, measured
-    from easi_jax.runtime import fast_loops
-    from easi_jax.search import Search, SearchData
-    from easi_jax.search_config import preset as make_preset
-    from easi_jax.segments import windows
+    from easi_jax.data.segments import windows
+    from easi_jax.devices.runtime import fast_loops
+    from easi_jax.estimation import posterior
+    from easi_jax.estimation.identifiability import describe, identifiability
+    from easi_jax.pipeline.held_out import relative_errors
+    from easi_jax.search.config import preset as make_preset
+    from easi_jax.search.easi import Search, SearchData
+    from easi_jax.simulation.rollout import collect, measured
+    from easi_jax.simulation.simulator import Simulator
     from envs import make
 
     env = make("cartpole")
@@ -95,12 +95,12 @@ def _case(
     space = env.space.select(names)
     if start is not None:
         space = space.scaled(*start)
-    machine = Machine(env.mj_model, space, env.dt)
+    simulator = Simulator(env.mj_model, space, env.dt)
     truth = np.asarray(space.nominal)
     noisy = any(noise)
     changes = {} if preset == "paper" else {"horizon": 8 if noisy else 1}
     search = Search(
-        machine,
+        simulator,
         make_preset(preset, generations=config.generations, **changes),
         env=env,
         act=lambda _, obs, key: controller(obs, key),
@@ -125,15 +125,15 @@ def _case(
 
     @jax.jit
     def finish(mean: jax.Array, cov: jax.Array, demos: Any) -> Any:
-        given = machine, search.space, mean, cov, demos, deviation, noisy
-        return identify.finish(*given, refined=True)
+        given = simulator, search.space, mean, cov, demos, deviation, noisy
+        return posterior.finish(*given, refined=True)
 
     @jax.jit
     def errors(mean: jax.Array, key: jax.Array) -> Any:
         fresh = trajectories(key, 20)
-        model, limit = machine.model(search.space.to_si(mean)), nominal.speed_limit
+        model, limit = simulator.model(search.space.to_si(mean)), nominal.speed_limit
         return tuple(
-            relative_errors(machine, model, windows(fresh, h, h), limit)
+            relative_errors(simulator, model, windows(fresh, h, h), limit)
             for h in (1, 10)
         )
 
@@ -193,7 +193,7 @@ def _case(
         config,
         case={"free": free, "noise": noise, "start": start, "preset": preset},
         parameters=names,
-        channels=machine.state_names,
+        channels=simulator.state_names,
         summary=summary,
         seeds=rows,
     )

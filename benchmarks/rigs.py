@@ -22,10 +22,10 @@ import mujoco
 import numpy as np
 
 from benchmarks.recovery import WEIGHED
-from easi_jax.machine import Machine
-from easi_jax.methods import Task
-from easi_jax.rollout import collect, measured, policy_rollout
-from easi_jax.segments import Segments
+from easi_jax.baselines import Task
+from easi_jax.data.segments import Segments
+from easi_jax.simulation.rollout import collect, measured, policy_rollout
+from easi_jax.simulation.simulator import Simulator
 from envs import make
 from envs.robot import model_file, parameter_space
 
@@ -44,7 +44,7 @@ class Rig:
 
     Attributes:
         name: of the robot.
-        machine: what is simulated; truths lie about its nominal values.
+        simulator: what is simulated; truths lie about its nominal values.
         noise: of the sensors, standard deviations ``(2 nv,)``.
         home: what the drives are sent on average, ``(nu,)``; also where joints start.
         reach: amplitude of commands, ``(nu,)``.
@@ -53,39 +53,39 @@ class Rig:
     """
 
     name: str
-    machine: Machine
+    simulator: Simulator
     noise: np.ndarray
     home: np.ndarray
     reach: np.ndarray
     xml: str
     env: Any = None
 
-    def with_machine(self, machine: Machine) -> Any:
+    def with_machine(self, simulator: Simulator) -> Any:
         """The environment with another machine."""
         out = copy.copy(self.env)
-        out.machine, out.space = machine, machine.space
+        out.simulator, out.space = simulator, simulator.space
         return out
 
-    def late(self, seconds: float) -> Machine:
+    def late(self, seconds: float) -> Simulator:
         """The machine with commands that all arrive late, which no model knows of."""
-        m = self.machine.mj_model
+        m = self.simulator.mj_model
         drives = [m.actuator(i).name for i in range(m.nu)]
         fixed = {f"effect.delay.{name}": seconds for name in drives}
-        return self.machine.rebuilt(fixed=fixed)
+        return self.simulator.rebuilt(fixed=fixed)
 
     def record(
         self,
-        machine: Machine,
+        simulator: Simulator,
         theta: jax.Array,
         key: jax.Array,
         trajectories: int,
         explore: float,
     ) -> Segments:
-        """Trajectories ``(B, T, 1, ...)`` of ``machine`` at ``theta (n,)``, without
+        """Trajectories ``(B, T, 1, ...)`` of ``simulator`` at ``theta (n,)``, without
         noise; ``explore`` is the share of the usual exploration."""
         std = explore * _EXPLORED[self.name]
         if self.env is not None:
-            env = self.with_machine(machine)
+            env = self.with_machine(simulator)
             return collect(
                 env,
                 env.model(theta),
@@ -96,28 +96,28 @@ class Rig:
             )
 
         def one(key: jax.Array) -> Segments:
-            return self._open_loop(machine, machine.model(theta), key, std)
+            return self._open_loop(simulator, simulator.model(theta), key, std)
 
         return jax.vmap(one)(jax.random.split(key, trajectories))
 
     def _open_loop(
-        self, machine: Machine, model: Any, key: jax.Array, std: float
+        self, simulator: Simulator, model: Any, key: jax.Array, std: float
     ) -> Segments:
         k_phase, k_rate, k_noise = jax.random.split(key, 3)
         shape = (2, len(self.home))
         phase = jax.random.uniform(k_phase, shape, maxval=2 * jnp.pi)
         low, high = _FREQUENCIES
         rate = jax.random.uniform(k_rate, shape, minval=low, maxval=high)
-        time = self.machine.dt * jnp.arange(STEPS)[:, None, None]
+        time = self.simulator.dt * jnp.arange(STEPS)[:, None, None]
         sines = jnp.sin(2 * jnp.pi * rate * time + phase).mean(1)
         noise = std * jax.random.normal(k_noise, (STEPS, len(self.home)))
         ctrl = self.home + self.reach * sines + noise
 
         def step(state: Any, u: jax.Array) -> Any:
-            new = machine.step(model, state, u)
+            new = simulator.step(model, state, u)
             return new, (state.qpos, state.qvel, new.qpos, new.qvel)
 
-        first = machine.start(
+        first = simulator.start(
             jnp.asarray(self.home, jnp.float32), jnp.zeros(len(self.home)), model
         )
         _, (qpos, qvel, after, speed) = jax.lax.scan(step, first, ctrl)
@@ -130,12 +130,12 @@ class Rig:
             weight=jnp.ones(STEPS),
         )
 
-    def task(self, machine: Machine, theta: jax.Array, explore: float) -> Task:
-        """What a method is given; ``machine`` at ``theta`` is the real one."""
+    def task(self, simulator: Simulator, theta: jax.Array, explore: float) -> Task:
+        """What a method is given; ``simulator`` at ``theta`` is the real one."""
         noise = jnp.asarray(self.noise, jnp.float32)
         if self.env is None:
-            return Task(self.machine, noise)
-        real = self.with_machine(machine)
+            return Task(self.simulator, noise)
+        real = self.with_machine(simulator)
 
         def act(policy: Any, obs: jax.Array, key: jax.Array) -> jax.Array:
             return controller(policy, obs, key)
@@ -158,9 +158,9 @@ class Rig:
 
         std = jnp.asarray(explore * _EXPLORED[self.name])
         return Task(
-            self.machine,
+            self.simulator,
             noise,
-            env=self.with_machine(self.machine),
+            env=self.with_machine(self.simulator),
             act=act,
             act_best=best,
             policy=std,
@@ -181,10 +181,10 @@ def cartpole() -> Rig:
     env = make("cartpole")
     known = {*WEIGHED, "cart_speed_limit"}
     names = [n for n in env.space.names if n not in known]
-    machine = Machine(env.mj_model, env.space.select(names), env.dt)
+    simulator = Simulator(env.mj_model, env.space.select(names), env.dt)
     noise = np.array([5e-4, 2e-3, 1e-2, 2e-2])
     xml = model_file("cartpole").read_text()
-    return Rig("cartpole", machine, noise, np.zeros(1), np.zeros(1), xml, env)
+    return Rig("cartpole", simulator, noise, np.zeros(1), np.zeros(1), xml, env)
 
 
 def arm6() -> Rig:
@@ -218,9 +218,9 @@ def _rig(
 ) -> Rig:
     """A rig of joints that all have encoders: 0.5 mrad, 5 mrad/s."""
     m = mujoco.MjModel.from_xml_string(xml)
-    machine = Machine(m, parameter_space(m, addresses, _K), _DT)
+    simulator = Simulator(m, parameter_space(m, addresses, _K), _DT)
     noise = np.repeat([5e-4, 5e-3], m.nv)
-    return Rig(name, machine, noise, home, np.full(m.nu, reach), xml)
+    return Rig(name, simulator, noise, home, np.full(m.nu, reach), xml)
 
 
 RIGS: dict[str, Callable[[], Rig]] = {"cartpole": cartpole, "arm6": arm6, "go2": go2}

@@ -64,7 +64,7 @@ def method_of(cell: Cell, xml: str) -> Any:
     """The method, with as many pieces of the recording as the budget pays for; where
     only single transitions are known, as many control steps."""
     from benchmarks.gap_first import GapFirst
-    from easi_jax.methods import (
+    from easi_jax.baselines import (
         Dropo,
         Easi,
         MujocoSysid,
@@ -97,8 +97,9 @@ def solve(cell: Cell) -> dict[str, Any]:
 
     Returns:
         ``error``: RMS of the log ratio to the truth along the ``rank`` directions that
-        the data determine (`easi_jax.information`), None without any; ``bound``: that
-        of Cramer and Rao; ``start_error``: that of the middle of where searches start;
+        the data determine (`easi_jax.estimation.normal_equations`), None without any;
+        ``bound``: that of Cramer and Rao; ``start_error``: that of the middle of where
+        searches start;
         ``covered``: whether the truth is in the found 90 % region of these directions;
         ``log_ratio`` and unit-coordinate ``std`` of each parameter; ``seconds``;
         control steps ``simulated`` and, of the real machine beyond the recording,
@@ -109,19 +110,19 @@ def solve(cell: Cell) -> dict[str, Any]:
     import numpy as np
 
     from benchmarks.rigs import RIGS
-    from easi_jax.distribution import covariance
-    from easi_jax.methods import Budget
+    from easi_jax.baselines import Budget
+    from easi_jax.model.distribution import covariance
 
     rig = RIGS[cell.robot]()
     if cell.setting == "clean":
         rig = dataclasses.replace(rig, noise=np.zeros_like(rig.noise))
-    space = rig.machine.space
+    space = rig.simulator.space
     k_truth, k_record, k_noise, k_order, k_fit = jax.random.split(
         jax.random.key(cell.seed), 5
     )
     away = jax.random.uniform(k_truth, (space.size,), minval=-1.0, maxval=1.0)
     theta = jnp.asarray(space.nominal, jnp.float32) * _SPREAD**away
-    real = rig.late(_LATE) if cell.setting == "effect" else rig.machine
+    real = rig.late(_LATE) if cell.setting == "effect" else rig.simulator
     explore = 1.0 if cell.setting in ("stochastic", "effect") else 0.0
     task = rig.task(real, theta, explore)
     demos = recorded(
@@ -166,7 +167,7 @@ def recorded(
     """
     import jax
 
-    from easi_jax.rollout import measured
+    from easi_jax.simulation.rollout import measured
 
     def record(theta: Any, k_record: Any, k_noise: Any) -> Any:
         clean = rig.record(real, theta, k_record, cell.trajectories, explore)
@@ -187,17 +188,17 @@ def fisher(task: Any, demos: Any, truth: Any) -> Any:
     import jax.numpy as jnp
     import numpy as np
 
-    from easi_jax.identify import effective_noise
-    from easi_jax.information import PairedFit
-    from easi_jax.refine import step_weights
-    from easi_jax.segments import windows
+    from easi_jax.data.segments import windows
+    from easi_jax.estimation.levenberg_marquardt import step_weights
+    from easi_jax.estimation.normal_equations import PairedFit
+    from easi_jax.estimation.pieces import effective_noise
 
     steps = min(_PIECE, demos.weight.shape[1])
     pieces = windows(demos, steps, steps)
 
     def information(truth: Any, pieces: Any) -> Any:
-        noise = effective_noise(task.machine, pieces, task.noise)
-        fit = PairedFit(task.machine, task.space, pieces, noise, task.mesh)
+        noise = effective_noise(task.simulator, pieces, task.noise)
+        fit = PairedFit(task.simulator, task.space, pieces, noise, task.mesh)
         still = jnp.zeros((pieces.count, len(noise)))
         return fit.normal(truth, still, step_weights(pieces, noise)).hessian
 
@@ -215,7 +216,7 @@ def score(
     import numpy as np
     from scipy.stats import chi2
 
-    from easi_jax.information import identifiability
+    from easi_jax.estimation.identifiability import identifiability
 
     known = identifiability(space, information)
     if not known.rank:

@@ -89,8 +89,8 @@ def run(config: Config) -> None:
 
 
 def _pipe(config: Config, env: Any, start: str = "within", **search: Any) -> Any:
-    from easi_jax.pipeline import Pipeline, PipelineConfig
-    from easi_jax.search_config import preset
+    from easi_jax.pipeline.stages import Pipeline, PipelineConfig
+    from easi_jax.search.config import preset
 
     return Pipeline(
         env,
@@ -109,7 +109,7 @@ def _demonstrations(pipe: Any, saved: Any, seeds: Any) -> Any:
     import jax
     import jax.numpy as jnp
 
-    from easi_jax.pipeline import seed_keys, stage_keys
+    from easi_jax.pipeline.stages import seed_keys, stage_keys
 
     keys = stage_keys(seed_keys(list(seeds)))
     policies = jax.tree.map(
@@ -138,7 +138,7 @@ def _searched(pipe: Any, demos: Any, keys: Any, policies: Any) -> Any:
     """The compiled search ``f(state)``, its first state, seconds to compile."""
     import jax
 
-    from easi_jax.runtime import fast_loops
+    from easi_jax.devices.runtime import fast_loops
 
     state = pipe.search_init(keys["search"][:1], _first(demos, 0), _first(policies, 0))
     begin = time.monotonic()
@@ -209,8 +209,8 @@ def _buffer(config: Config, env: Any, label: str) -> None:
     import jax
     import jax.numpy as jnp
 
-    from easi_jax.io import checkpoints
-    from easi_jax.pipeline import Pipeline, PipelineConfig, seed_keys, stage_keys
+    from easi_jax.io.runs import checkpoints
+    from easi_jax.pipeline.stages import Pipeline, PipelineConfig, seed_keys, stage_keys
     from easi_jax.rl.presets import training_preset
 
     training = dataclasses.replace(
@@ -256,7 +256,7 @@ def _recovery(config: Config, env: Any, saved: Any, label: str, start: str) -> N
     import numpy as np
 
     from benchmarks._common import command_of, write_result
-    from easi_jax.information import describe, identifiability
+    from easi_jax.estimation.identifiability import describe, identifiability
 
     pipe = _pipe(
         config,

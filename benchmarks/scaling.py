@@ -58,8 +58,8 @@ def run(config: Config) -> None:
     import jax
 
     from benchmarks._cells import add_row, read_rows
-    from easi_jax.io.versions import versions
-    from easi_jax.mesh import make_mesh
+    from easi_jax.devices.mesh import make_mesh
+    from easi_jax.io.runs.versions import versions
     from envs import open_env
 
     env, mesh = open_env(config.robot, None, config.option), make_mesh(config.devices)
@@ -103,9 +103,9 @@ def every_part(mj_model: Any) -> Any:
     """Gains and force limit of every position drive, damping and armature of every
     joint, mass and center of every body, all that contacts take of named geoms, gravity
     and density of the air: 117 of a Go2."""
-    from easi_jax.addresses import names, places
-    from easi_jax.parameters import ParameterSpace, declare
-    from easi_jax.quantities import joint_name, scalar_dofs
+    from easi_jax.model.addresses import names, places
+    from easi_jax.model.parameters import ParameterSpace, declare
+    from easi_jax.model.quantities import joint_name, scalar_dofs
 
     m = mj_model
     touching = [m.geom(i).name for *_, i in places(m, "geom.*.friction")]
@@ -148,14 +148,14 @@ def _generation(
     import jax
     import jax.numpy as jnp
 
-    from easi_jax.rollout import collect
-    from easi_jax.runtime import fast_loops
-    from easi_jax.search import Search, SearchData
-    from easi_jax.search_config import preset
-    from easi_jax.segments import windows
+    from easi_jax.data.segments import windows
+    from easi_jax.devices.runtime import fast_loops
+    from easi_jax.search.config import preset
+    from easi_jax.search.easi import Search, SearchData
+    from easi_jax.simulation.rollout import collect
 
     chosen = preset("default", generations=config.generations, **search)
-    made = Search(env.machine.rebuilt(space=space), chosen, mesh=mesh)
+    made = Search(env.simulator.rebuilt(space=space), chosen, mesh=mesh)
 
     def data(key: jax.Array) -> SearchData:
         demos = collect(env, env.model(), wander(env), key, 20, env.episode_length)
@@ -182,8 +182,8 @@ def _training(config: Config, env: Any, mesh: Any, seeds: int) -> dict[str, floa
     import jax
     import jax.numpy as jnp
 
-    from easi_jax.pipeline import Pipeline, PipelineConfig, seed_keys, stage_keys
-    from easi_jax.runtime import fast_loops
+    from easi_jax.devices.runtime import fast_loops
+    from easi_jax.pipeline.stages import Pipeline, PipelineConfig, seed_keys, stage_keys
     from train._robots import training_config
 
     training = training_config(env, None)

@@ -12,8 +12,16 @@ from scipy.optimize import nnls
 
 from benchmarks._cells import read_rows
 from benchmarks._common import commits_of, markdown_table
-from easi_jax.io.figure_style import SERIES, dash, fit, grid, legend_above, styled, svg
-from easi_jax.search_config import SearchConfig
+from easi_jax.io.report.figure_style import (
+    SERIES,
+    dash,
+    fit,
+    grid,
+    legend_above,
+    styled,
+    svg,
+)
+from easi_jax.search.config import SearchConfig
 
 OF = {
     "parameters": "a generation by parameters searched",

@@ -70,11 +70,11 @@ def ready(generations: int) -> Any:
     import jax.numpy as jnp
     import numpy as np
 
-    from easi_jax.identify import estimate
-    from easi_jax.rollout import collect, measured
-    from easi_jax.search import Search, SearchData
-    from easi_jax.search_config import preset
-    from easi_jax.segments import windows
+    from easi_jax.data.segments import windows
+    from easi_jax.estimation.posterior import estimate
+    from easi_jax.search.config import preset
+    from easi_jax.search.easi import Search, SearchData
+    from easi_jax.simulation.rollout import collect, measured
     from envs import make
 
     env = make("cartpole")
@@ -87,7 +87,7 @@ def ready(generations: int) -> Any:
         real_batch=64,
         discriminator_updates=2,
     )
-    search = Search(env.machine, settings)
+    search = Search(env.simulator, settings)
     noise = jnp.full(2 * env.mj_model.nv, 1e-3)
 
     @jax.jit
@@ -99,7 +99,7 @@ def ready(generations: int) -> Any:
         data = SearchData(windows(demos, 8, 8), noise, ())
         state, info = search.run(search.init(begin, data), data, generations)
         found = estimate(
-            env.machine,
+            env.simulator,
             env.space,
             state.result_mean,
             state.result_cov,

@@ -38,15 +38,15 @@ def _search(config: Config) -> Any:
     import jax.numpy as jnp
 
     from benchmarks.recovery import controller
-    from easi_jax.rollout import collect
-    from easi_jax.search import Search, SearchData
-    from easi_jax.search_config import preset
-    from easi_jax.segments import windows
+    from easi_jax.data.segments import windows
+    from easi_jax.search.config import preset
+    from easi_jax.search.easi import Search, SearchData
+    from easi_jax.simulation.rollout import collect
     from envs import make
 
     env = make("cartpole")
     search = Search(
-        env.machine,
+        env.simulator,
         preset(
             "default",
             population=config.population,
@@ -66,7 +66,7 @@ def _whole(search: Any, config: Config) -> Any:
     """All generations as one program."""
     import jax
 
-    from easi_jax.runtime import fast_loops
+    from easi_jax.devices.runtime import fast_loops
 
     return jax.jit(
         lambda s, d: search.run(s, d, config.generations),
@@ -97,7 +97,7 @@ def _generations(config: Config) -> dict[str, Any]:
     """A whole search, and the same without its discriminator and strategy."""
     import jax
 
-    from easi_jax.runtime import fast_loops
+    from easi_jax.devices.runtime import fast_loops
 
     _, search, data = _search(config)
     d = jax.jit(data)(jax.random.key(0))

@@ -52,15 +52,15 @@ def run(config: Config) -> None:
     import numpy as np
 
     from benchmarks._common import command_of, write_result
-    from easi_jax.pipeline import (
+    from easi_jax.devices.runtime import fast_loops
+    from easi_jax.pipeline.stages import (
         Pipeline,
         PipelineConfig,
         seed_keys,
         stage_keys,
         target_parameters,
     )
-    from easi_jax.runtime import fast_loops
-    from easi_jax.search_config import preset
+    from easi_jax.search.config import preset
     from envs import open_env
     from train._robots import training_config
 

@@ -9,7 +9,7 @@ from scipy.signal import welch
 
 from benchmarks.twin_runs import commanded, play
 from easi_jax.rl.networks import act
-from easi_jax.rollout import policy_rollout
+from easi_jax.simulation.rollout import policy_rollout
 from envs.frames import matrix
 
 EPISODES = 100  # of Table 2

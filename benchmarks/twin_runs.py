@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.twin import Twin
-from easi_jax.configuration import Configuration
-from easi_jax.env import EnvState
-from easi_jax.recording import Run
+from easi_jax.data.recording import Run
+from easi_jax.data.segments import Segments
+from easi_jax.model.joint_space import Configuration
 from easi_jax.rl.networks import PolicyParams, act
-from easi_jax.segments import Segments
+from easi_jax.simulation.env import EnvState
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class Recording:
         )
 
     def runs(self, twin: Twin) -> list[Run]:
-        """Each episode as a run of a log, for `easi_jax.io.logs.write_log`."""
+        """Each episode as a run of a log, for `easi_jax.io.logs.reader.write_log`."""
         found = []
         for i, steps in enumerate(self.steps):
             rows = slice(0, steps + 1)
@@ -175,14 +175,14 @@ def _functions(env: Any, deterministic: bool) -> tuple[Any, Any, Any]:
     def arrive(state: EnvState, action: Any, qpos: Any, qvel: Any) -> EnvState:
         """``env.step`` with the twin's state in place of a simulated one."""
         told = copy.copy(env)
-        physics = env.machine.start(qpos, qvel)
-        told.machine = SimpleNamespace(step=lambda *_: physics)
+        physics = env.simulator.start(qpos, qvel)
+        told.simulator = SimpleNamespace(step=lambda *_: physics)
         return told.step(env.model(), state, action)
 
     @jax.jit
     @jax.vmap
     def look(state: EnvState, qpos: Any, qvel: Any) -> EnvState:
-        physics = env.machine.start(qpos, qvel)
+        physics = env.simulator.start(qpos, qvel)
         memory = () if state.memory == () else (state.memory,)
         return replace(state, physics=physics, obs=env.observe(physics, *memory))
 

@@ -44,7 +44,7 @@ def make(name: str, **options: Any) -> Any:
 
 _NEEDED = (
     *("name", "obs_size", "action_size", "episode_length", "dt", "mj_model", "space"),
-    *("machine", "model", "reset", "step", "control"),
+    *("simulator", "model", "reset", "step", "control"),
 )
 
 
@@ -77,6 +77,8 @@ def load(path: Path) -> Any:
         own = (isinstance(e, SyntaxError) and e.lineno) or (lines or [None])[-1]
         where = f"{path}, line {own}" if own else str(path)
         raise UserError(f"--env {where}: {type(e).__name__}: {e}") from e
+    if not hasattr(env, "simulator") and hasattr(env, "machine"):
+        env.simulator = env.machine  # its name in version 0.1
     missing = [n for n in _NEEDED if not hasattr(env, n)]
     if missing:
         raise UserError(

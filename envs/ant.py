@@ -17,12 +17,12 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import support
 
-from easi_jax.action_map import ActionMap
-from easi_jax.env import EnvState, advance, start
-from easi_jax.machine import Machine
-from easi_jax.mesh import own_device
-from easi_jax.model import Model
-from easi_jax.physics import Physics
+from easi_jax.devices.mesh import own_device
+from easi_jax.model.mjx_model import Model
+from easi_jax.simulation.action_map import ActionMap
+from easi_jax.simulation.env import EnvState, advance, start
+from easi_jax.simulation.simulator import Simulator
+from easi_jax.simulation.step import Physics
 from envs.frames import matrix, roll_yaw
 from envs.robot import Robot, not_finite, vector
 
@@ -89,7 +89,7 @@ class Ant(Robot):
     def __init__(self) -> None:
         super().__init__(ADDRESSES)
         loads = FootLoads.of(self.mj_model)
-        self.machine = Machine(self.mj_model, self.space, self.dt, loads, 24)
+        self.simulator = Simulator(self.mj_model, self.space, self.dt, loads, 24)
         m = self.mj_model
         low, high = m.jnt_range[1:].T
         self._middle, self._half = (low + high) / 2, (high - low) / 2
@@ -104,7 +104,7 @@ class Ant(Robot):
         angles = jnp.clip(self._home + spread, self._low, self._high)
         base = jnp.array([0.0, 0.0, START_HEIGHT, 1.0, 0.0, 0.0, 0.0])
         speeds = jax.random.uniform(k_speed, (8,), minval=-0.1, maxval=0.1)
-        physics = self.machine.start(
+        physics = self.simulator.start(
             jnp.concatenate([base, angles]), jnp.concatenate([jnp.zeros(6), speeds])
         )
         still = jnp.zeros(8)

@@ -10,10 +10,10 @@ ball comes back with a third of its speed).
 import jax
 import jax.numpy as jnp
 
-from easi_jax.action_map import ActionMap
-from easi_jax.env import EnvState, advance, start
-from easi_jax.model import Model
-from easi_jax.physics import Physics
+from easi_jax.model.mjx_model import Model
+from easi_jax.simulation.action_map import ActionMap
+from easi_jax.simulation.env import EnvState, advance, start
+from easi_jax.simulation.step import Physics
 from envs.robot import Robot, not_finite, vector
 
 RATE = 2.0  # rad of target at action 1, in a step
@@ -81,7 +81,7 @@ class Ballbalance(Robot):
         qpos = qpos.at[_BALL].set(jnp.append(far * out, height))
         qvel = jnp.zeros(self.mj_model.nv)
         qvel = qvel.at[_BALL_SPEED].set(jnp.append(-inward * out, -2.0))
-        physics = self.machine.start(qpos, qvel)
+        physics = self.simulator.start(qpos, qvel)
         targets = jnp.zeros(3)
         return start(physics, self.observe(physics, targets), targets)
 

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from easi_jax.action_map import ActionMap
-from easi_jax.env import EnvState, advance, start
-from easi_jax.machine import Machine
-from easi_jax.model import Model
-from easi_jax.parameters import Parameter, ParameterSpace
-from easi_jax.physics import Physics
+from easi_jax.model.mjx_model import Model
+from easi_jax.model.parameters import Parameter, ParameterSpace
+from easi_jax.simulation.action_map import ActionMap
+from easi_jax.simulation.env import EnvState, advance, start
+from easi_jax.simulation.simulator import Simulator
+from easi_jax.simulation.step import Physics
 from envs.robot import model_file
 
 TARGET_RANGE = 0.2  # m of cart target at action 1
@@ -77,11 +77,11 @@ class Cartpole:
         text = model_file("cartpole").read_text()
         self.mj_model = mujoco.MjModel.from_xml_string(text)
         self.space = space()
-        self.machine = Machine(self.mj_model, self.space, self.dt)
+        self.simulator = Simulator(self.mj_model, self.space, self.dt)
 
     def model(self, theta: jax.Array | None = None) -> Model:
         """The model at ``theta`` ``(11,)`` in SI units; nominal without it."""
-        return self.machine.model(
+        return self.simulator.model(
             jnp.asarray(self.space.nominal) if theta is None else theta
         )
 
@@ -90,7 +90,7 @@ class Cartpole:
         del model
         scale = jnp.array([0.1, 0.1, 0.2, 0.2])
         s = jax.random.uniform(key, (4,), minval=-scale, maxval=scale)
-        physics = self.machine.start(s[:2], s[2:])
+        physics = self.simulator.start(s[:2], s[2:])
         return start(physics, self.observe(physics))
 
     def control(self, state: EnvState, action: jax.Array) -> jax.Array:
@@ -105,7 +105,7 @@ class Cartpole:
 
     def step(self, model: Model, state: EnvState, action: jax.Array) -> EnvState:
         """One control step of 20 ms; never resets."""
-        physics = self.machine.step(model, state.physics, self.control(state, action))
+        physics = self.simulator.step(model, state.physics, self.control(state, action))
         obs = self.observe(physics)
         x, v, angle, rate = obs
         failed = (jnp.abs(x) > FAIL_X) | (jnp.abs(angle) > FAIL_ANGLE)

@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from easi_jax.action_map import ActionMap
-from easi_jax.drives import TorqueSpeed
-from easi_jax.env import EnvState, advance, start
 from easi_jax.errors import UserError, nearest
-from easi_jax.machine import Machine
-from easi_jax.model import Model
-from easi_jax.physics import Physics
+from easi_jax.model.mjx_model import Model
+from easi_jax.model.torque_speed import TorqueSpeed
+from easi_jax.simulation.action_map import ActionMap
+from easi_jax.simulation.env import EnvState, advance, start
+from easi_jax.simulation.simulator import Simulator
+from easi_jax.simulation.step import Physics
 from envs.frames import from_yaw, matrix
 from envs.robot import Robot, not_finite, vector
 
@@ -162,7 +162,9 @@ class Go2(Robot):
         self.action_map = ActionMap(ACTION_SCALE, self._pose, low, high)
         self._limit = m.actuator_forcerange[:, 1]
         if torque_speed:
-            self.machine = Machine(m, self.space, self.dt, torque_speed=motor_curve())
+            self.simulator = Simulator(
+                m, self.space, self.dt, torque_speed=motor_curve()
+            )
 
     def reset(self, model: Model, key: jax.Array) -> EnvState:
         """Standing, turned anywhere, joints and speeds a little off."""
@@ -174,7 +176,7 @@ class Go2(Robot):
         )
         qpos = jnp.concatenate([self._stand[:3], from_yaw(yaw), joints])
         qvel = jax.random.uniform(k_speed, (18,), minval=-0.2, maxval=0.2)
-        physics = self.machine.start(qpos, qvel)
+        physics = self.simulator.start(qpos, qvel)
         memory = Memory(
             command=self.draw_command(k_command),
             last=jnp.zeros(12),

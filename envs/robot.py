@@ -1,4 +1,4 @@
-"""What the built-in robots share: model file, parameters, machine."""
+"""What the built-in robots share: model file, parameters, simulator."""
 
 from collections.abc import Mapping
 from importlib import resources
@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from easi_jax.env import EnvState
-from easi_jax.machine import Machine
-from easi_jax.model import Model
-from easi_jax.parameters import ParameterSpace, declare
-from easi_jax.physics import Physics
+from easi_jax.model.mjx_model import Model
+from easi_jax.model.parameters import ParameterSpace, declare
+from easi_jax.simulation.env import EnvState
+from easi_jax.simulation.simulator import Simulator
+from easi_jax.simulation.step import Physics
 
 _FACTOR = 1e3  # of the nominal value, that bounds allow either way
 
@@ -25,7 +25,7 @@ class Robot:
     Attributes:
         mj_model: the robot in MuJoCo.
         space: its parameters; a search starts in [nominal / k, k nominal].
-        machine: how it is simulated.
+        simulator: how it is simulated.
         default_target: how the pseudo-real robot differs where nothing else is said.
         training: settings by algorithm, the default first; presets where empty.
     """
@@ -44,7 +44,7 @@ class Robot:
         addresses: dict[str, str],
         model: Path | mujoco.MjModel | None = None,
     ) -> None:
-        """Builds the machine.
+        """Builds the simulator.
 
         Args:
             addresses: parameter names and what each is in the model
@@ -53,11 +53,20 @@ class Robot:
         """
         self.mj_model = _read(self.name, model)
         self.space = parameter_space(self.mj_model, addresses, self.k)
-        self.machine = Machine(self.mj_model, self.space, self.dt)
+        self.simulator = Simulator(self.mj_model, self.space, self.dt)
+
+    @property
+    def machine(self) -> Simulator:
+        """`simulator` under its name of version 0.1, for environment files of then."""
+        return self.simulator
+
+    @machine.setter
+    def machine(self, value: Simulator) -> None:
+        self.simulator = value
 
     def model(self, theta: jax.Array | None = None) -> Model:
         """The model at ``theta (n,)`` in SI units; nominal without it."""
-        return self.machine.model(
+        return self.simulator.model(
             jnp.asarray(self.space.nominal) if theta is None else theta
         )
 
@@ -69,7 +78,7 @@ class Robot:
         self, model: Model, state: EnvState, action: jax.Array
     ) -> Physics:
         """The physics after a control step."""
-        return self.machine.step(model, state.physics, self.control(state, action))
+        return self.simulator.step(model, state.physics, self.control(state, action))
 
 
 def model_file(name: str) -> Path:

@@ -18,7 +18,7 @@ LONGEST = (
     *("train/test_easi_from_logs.py", "envs/test_registry.py", "train/test_gap.py"),
     *("train/test_gap_shared.py", "train/test_gap_set.py", "train/test_gap_pairs.py"),
     *("examples/test_your_own_robot.py", "train/test_every_robot.py"),
-    *("easi_jax/test_found_effects.py", "easi_jax/test_identify.py"),
+    *("easi_jax/model/test_found_effects.py", "easi_jax/estimation/test_posterior.py"),
 )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks import coverage, coverage_summary
-from easi_jax.information import identifiability
+from easi_jax.estimation.identifiability import identifiability
 from envs import make
 
 

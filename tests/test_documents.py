@@ -108,7 +108,8 @@ def test_the_site_builds(tmp_path: Path) -> None:
     command = ("-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path))
     subprocess.run([sys.executable, *command], cwd=ROOT, check=True, timeout=1200)
     assert (
-        'id="easi_jax.search.Search' in (tmp_path / "reference/index.html").read_text()
+        'id="easi_jax.search.easi.Search'
+        in (tmp_path / "reference/index.html").read_text()
     )
     assert "<math" in (tmp_path / "method/index.html").read_text()
 
@@ -134,7 +135,7 @@ effects:
 ORDER = ("index", "your_own_robot", "export", "gap", "importers", "batch")
 
 
-def machine(folder: Path) -> None:
+def simulator(folder: Path) -> None:
     """``robot.xml``, the built-in Cartpole, and logs of one whose rail rubs more."""
     text = (ROOT / "envs" / "assets" / "cartpole.xml").read_text()
     (folder / "robot.xml").write_text(text)
@@ -179,7 +180,7 @@ def shop(folder: Path) -> None:
         *(("sweep.csv", "LOG.csv"), ("moves.csv", "LOG2.csv")),
     ):
         shutil.copy(arm / source, folder / target)
-    machine(folder)
+    simulator(folder)
 
 
 def tiny(words: list[str], folder: Path) -> list[str]:

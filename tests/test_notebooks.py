@@ -71,9 +71,9 @@ def test_cartpole_to_transfer(tmp_path: Path) -> None:
     told = executed(
         "cartpole_to_transfer", tmp_path, "stiffness", "before", "after", "returns"
     )
-    found, machine = (told["stiffness"][k] for k in ("found", "machine"))
-    assert told["stiffness"]["model"] == pytest.approx(4 * machine)
-    assert found == pytest.approx(machine, rel=0.1)
+    found, simulator = (told["stiffness"][k] for k in ("found", "machine"))
+    assert told["stiffness"]["model"] == pytest.approx(4 * simulator)
+    assert found == pytest.approx(simulator, rel=0.1)
     for before, after in zip(told["before"], told["after"], strict=True):
         assert after < 0.2 * before
     assert list(told["returns"]) == ["UDR", "EASI", "Oracle"]

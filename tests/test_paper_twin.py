@@ -16,9 +16,9 @@ from benchmarks.rival_cells import AFTER_GAP
 from benchmarks.twin import CARTPOLE, GAPS, GO2, Gap, Motor, Twin
 from benchmarks.twin_runs import commanded, play
 from easi_jax.errors import UserError
-from easi_jax.found_effects import EffectEntry
-from easi_jax.io.effects_file import write_effects
-from easi_jax.io.logs import read_logs, write_log
+from easi_jax.io.logs.reader import read_logs, write_log
+from easi_jax.io.models.effects_file import write_effects
+from easi_jax.model.found_effects import EffectEntry
 from easi_jax.rl.evaluate import evaluate
 from easi_jax.rl.networks import PolicyParams, act
 from envs import make
@@ -61,8 +61,8 @@ def robot(request: pytest.FixtureRequest) -> Any:
     """An environment, its twin without a gap, and MJX from the same start."""
     env = ENVS[request.param]
     qpos, qvel, ctrl = begin(env)
-    step = jax.jit(lambda state, u: env.machine.step(env.model(), state, u))
-    state, out = env.machine.start(jnp.asarray(qpos), jnp.asarray(qvel)), []
+    step = jax.jit(lambda state, u: env.simulator.step(env.model(), state, u))
+    state, out = env.simulator.start(jnp.asarray(qpos), jnp.asarray(qvel)), []
     for u in ctrl:
         state = step(state, jnp.asarray(u, jnp.float32))
         out.append(np.asarray(state.qpos))
@@ -73,7 +73,7 @@ def test_without_its_gap_a_twin_is_the_environment(robot: Any) -> None:
     """To rounding at the model's own physics step; at 0.5 ms to what that step costs
     MJX over half a second (`benchmarks.accuracy`)."""
     env, fine, mjx = robot
-    same = moved(env, Gap(timestep=env.dt / env.machine.substeps))
+    same = moved(env, Gap(timestep=env.dt / env.simulator.substeps))
     assert len(mjx) * env.dt == 0.5
     np.testing.assert_allclose(same, mjx, atol=1e-5)
     np.testing.assert_allclose(fine, mjx, atol=0.03)
@@ -203,7 +203,7 @@ def test_play_is_the_environments_own_episode(name: str) -> None:
         POLICIES[name], keys
     )
     got = play(
-        Twin(env, Gap(timestep=env.dt / env.machine.substeps)),
+        Twin(env, Gap(timestep=env.dt / env.simulator.substeps)),
         POLICIES[name],
         *(0, 6, 40),
         start=lambda _: jax.vmap(lambda k: env.reset(env.model(), k))(resets),

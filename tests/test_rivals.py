@@ -16,11 +16,11 @@ from benchmarks.gap_first import own, runs
 from benchmarks.rigs import RIGS
 from benchmarks.rival_cells import BUDGETS, Cell, method_of, score
 from benchmarks.rivals_summary import best_rival, section, verdict
-from easi_jax.distribution import covariance, gaussian
+from easi_jax.baselines import Identified
 from easi_jax.errors import UserError
-from easi_jax.io.logs import read_logs, write_log
-from easi_jax.methods import Identified
-from easi_jax.parameters import Parameter, ParameterSpace
+from easi_jax.io.logs.reader import read_logs, write_log
+from easi_jax.model.distribution import covariance, gaussian
+from easi_jax.model.parameters import Parameter, ParameterSpace
 
 # Two whose product alone is seen, one by itself; a unit is a factor of 9.
 SPACE = ParameterSpace(
@@ -185,13 +185,13 @@ def test_a_result_is_told_in_the_coordinates_that_were_asked_for() -> None:
 
 def test_recordings_become_logs(tmp_path: Path) -> None:
     rig = RIGS["cartpole"]()
-    theta = jnp.asarray(rig.machine.space.nominal, jnp.float32)
-    demos = jax.jit(lambda k: rig.record(rig.machine, theta, k, 2, 1.0))(
+    theta = jnp.asarray(rig.simulator.space.nominal, jnp.float32)
+    demos = jax.jit(lambda k: rig.record(rig.simulator, theta, k, 2, 1.0))(
         jax.random.key(0)
     )
     path = tmp_path / "log.csv"
-    write_log(path, rig.machine.mj_model, runs(rig.machine, demos))
-    read = read_logs(path, rig.machine.mj_model).runs
+    write_log(path, rig.simulator.mj_model, runs(rig.simulator, demos))
+    read = read_logs(path, rig.simulator.mj_model).runs
     assert len(read) == 2
     for i, run in enumerate(read):
         steps = int(demos.weight[i].sum())

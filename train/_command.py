@@ -68,7 +68,7 @@ def main(
     except BrokenPipeError:
         _unheard()
     try:
-        from easi_jax import distributed
+        from easi_jax.devices import distributed
         from easi_jax.errors import UserError
 
         try:
@@ -317,14 +317,14 @@ def _interrupted(out: Path | str | None, resumable: bool) -> str:
 
 def _heard() -> bool:
     """Whether this process speaks: of several in one run, the first does."""
-    from easi_jax import distributed
+    from easi_jax.devices import distributed
 
     return distributed.leader()
 
 
 def _parted(error: BaseException) -> bool:
     """Whether a program failed because another process of this run is gone."""
-    from easi_jax import distributed
+    from easi_jax.devices import distributed
 
     if distributed.count() == 1:
         return False
@@ -338,7 +338,7 @@ def _parted(error: BaseException) -> bool:
 def _leave_others(error: BaseException) -> None:
     """Ends a process of several at once: at its end Python would wait for them, and
     they for it."""
-    from easi_jax import distributed
+    from easi_jax.devices import distributed
 
     if distributed.count() > 1 and not isinstance(error, SystemExit):
         import traceback

@@ -44,7 +44,7 @@ def read_given(config: Any) -> Given:
 
 
 def _content(path: Path | None) -> dict[str, Any] | None:
-    from easi_jax.io.effects_file import parsed_effects
+    from easi_jax.io.models.effects_file import parsed_effects
     from easi_jax.io.strict_yaml import read_yaml
 
     if path is None:
@@ -56,8 +56,8 @@ def _content(path: Path | None) -> dict[str, Any] | None:
 
 def found_in(content: dict[str, Any] | None, where: str = "--effects") -> Any:
     """`FoundEffects` of a recorded content; empty where there is none."""
-    from easi_jax.found_effects import FoundEffects
-    from easi_jax.io.effects_file import parsed_effects
+    from easi_jax.io.models.effects_file import parsed_effects
+    from easi_jax.model.found_effects import FoundEffects
 
     return FoundEffects() if content is None else parsed_effects(content, where)
 
@@ -70,7 +70,7 @@ def robots(env: Any, given: Given) -> tuple[Any, Any]:
     Raises:
         UserError: effects at a place that the robot lacks.
     """
-    from easi_jax.found_effects import env_with
+    from easi_jax.simulation.with_effects import env_with
 
     real = None
     if given.target_effects is not None:
@@ -81,7 +81,7 @@ def robots(env: Any, given: Given) -> tuple[Any, Any]:
 
 def target_name(changes: Sequence[str], given: Given) -> str:
     """The target in a line: what differs from the nominal robot."""
-    from easi_jax.found_effects import named
+    from easi_jax.model.found_effects import named
 
     hidden = named(found_in(given.target_effects).physical)
     return ", ".join([*changes, *([hidden] if hidden else [])]) or "nominal"
@@ -89,7 +89,7 @@ def target_name(changes: Sequence[str], given: Given) -> str:
 
 def effect_notes(given: Given) -> list[str]:
     """What a report says of them."""
-    from easi_jax.found_effects import named
+    from easi_jax.model.found_effects import named
 
     notes = []
     if given.effects is not None:
@@ -106,7 +106,7 @@ def effect_notes(given: Given) -> list[str]:
 
 
 def _read_only(found: Any) -> list[str]:
-    from easi_jax.found_effects import named
+    from easi_jax.model.found_effects import named
 
     left = [e for e in found.entries if e.of_readings]
     if not left:

@@ -51,9 +51,9 @@ def read_excite_problem(config: Any) -> ExciteProblem:
     from easi_jax.excite.candidates import LEAD, make_bench
     from easi_jax.excite.choose import check_names
     from easi_jax.excite.drives import limits_of, scalar_dofs
-    from easi_jax.gap.own import own_space
-    from easi_jax.io.parameter_file import read_parameter_file
-    from easi_jax.quantities import joint_name
+    from easi_jax.io.models.parameter_file import read_parameter_file
+    from easi_jax.model.parameter_proposal import own_space
+    from easi_jax.model.quantities import joint_name
     from train._gap_problem import read_model
 
     if not config.model:
@@ -200,9 +200,10 @@ def _from_data(config: Any, m: Any, notes: list[str]) -> tuple[Any, Any, Any]:
 
     if not config.data:
         return None, np.full(m.nv, _NOISE), None
+    from easi_jax.data.cleaning import to_common_step
+    from easi_jax.data.noise import pooled_noise
     from easi_jax.gap.scales import scales_of
-    from easi_jax.io.logs import read_logs
-    from easi_jax.log_data import pooled_noise, to_common_step
+    from easi_jax.io.logs.reader import read_logs
 
     log = read_logs(list(config.data), m, config.mapping)
     notes += log.notes
@@ -218,8 +219,8 @@ def _from_gap(config: Any, m: Any, notes: list[str]) -> tuple[list[Any], Any]:
         return [], {}
     from easi_jax.errors import UserError
     from easi_jax.gap.table import object_id
-    from easi_jax.io.effects_file import read_effects
-    from easi_jax.io.run_files import GAP, read_checked
+    from easi_jax.io.models.effects_file import read_effects
+    from easi_jax.io.runs.schemas import GAP, read_checked
 
     path = config.gap / "gap.json" if config.gap.is_dir() else config.gap
     told = read_checked(path, GAP, "a gap.json of train.gap")

@@ -67,7 +67,7 @@ def _keys(choice: Any) -> tuple[str, ...]:
 
 def _named(problem: Any, kind: str, values: Any) -> dict[str, float]:
     from easi_jax.excite.drives import scalar_dofs
-    from easi_jax.quantities import joint_name
+    from easi_jax.model.quantities import joint_name
 
     m = problem.mj_model
     if kind == "actuator":
@@ -77,7 +77,7 @@ def _named(problem: Any, kind: str, values: Any) -> dict[str, float]:
 
 def _start(problem: Any) -> dict[str, float]:
     from easi_jax.excite.drives import scalar_dofs
-    from easi_jax.quantities import joint_name
+    from easi_jax.model.quantities import joint_name
 
     m, start = problem.mj_model, problem.bench.start
     return {joint_name(m, j): float(start[q]) for j, (q, _) in scalar_dofs(m).items()}
@@ -97,7 +97,7 @@ def _limits(config: Any, problem: Any, best: Any) -> dict[str, Any]:
     import numpy as np
 
     from easi_jax.excite.drives import scalar_dofs
-    from easi_jax.quantities import joint_name
+    from easi_jax.model.quantities import joint_name
 
     m, lim = problem.mj_model, problem.bench.limits
     q_all = np.concatenate([x.qpos for x in best.motions])
@@ -284,7 +284,7 @@ def write_results(
 ) -> Path:
     """Writes both files; returns the path of the commands."""
     from easi_jax.io.files import atomic_write, to_json
-    from easi_jax.io.runs import RunFolder
+    from easi_jax.io.runs.folder import RunFolder
 
     text = commands_csv(problem, best)
     if config.out.suffix == ".csv":

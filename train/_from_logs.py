@@ -22,10 +22,10 @@ def run(config: Any) -> None:
     seeds = config.seeds or (0,)
     import jax
 
-    from easi_jax.io.runs import RunFolder
-    from easi_jax.search import Search
+    from easi_jax.io.runs.folder import RunFolder
+    from easi_jax.search.easi import Search
 
-    search = Search(problem.machine, _settings(config, problem))
+    search = Search(problem.simulator, _settings(config, problem))
 
     with RunFolder.open(
         config.out,
@@ -34,7 +34,7 @@ def run(config: Any) -> None:
         resume=config.resume,
         overwrite=config.overwrite,
     ) as folder:
-        from easi_jax.distributed import started
+        from easi_jax.devices.distributed import started
         from train._log_results import ready_errors, write
         from train._stages import found_check
 
@@ -79,7 +79,7 @@ def _settings(config: Any, problem: Problem) -> Any:
         )
     if any(s.startswith("segments=") for s in config.set):
         return chosen
-    cost = chosen.population * problem.piece * problem.machine.substeps
+    cost = chosen.population * problem.piece * problem.simulator.substeps
     segments = max(16, min(chosen.segments, _STEPS // cost))
     return replace(chosen, segments=segments)
 
@@ -90,15 +90,15 @@ def _search(
     import jax
     import jax.numpy as jnp
 
-    from easi_jax.log_data import segments_from_runs
-    from easi_jax.pipeline import seed_keys
-    from easi_jax.runtime import fast_loops, quick_compile
-    from easi_jax.search import SearchData
-    from easi_jax.segments import to_device
+    from easi_jax.data.segments import to_device
+    from easi_jax.devices.runtime import fast_loops, quick_compile
+    from easi_jax.estimation.pieces import segments_from_runs
+    from easi_jax.pipeline.stages import seed_keys
+    from easi_jax.search.easi import SearchData
     from train._stages import jit_chunks, run_stage, search_check, search_rows
 
     pieces = segments_from_runs(
-        problem.machine, problem.fit, problem.piece, max(1, problem.piece // 2)
+        problem.simulator, problem.fit, problem.piece, max(1, problem.piece // 2)
     )
     noise = jnp.asarray(problem.noise, jnp.result_type(float))
     data = SearchData(segments=to_device(pieces), noise=noise)
@@ -134,33 +134,37 @@ def _ready_finish(
     import jax.numpy as jnp
     import numpy as np
 
-    from easi_jax import distributed, replay
-    from easi_jax.identify import effective_noise, estimate, few, polished, widened
-    from easi_jax.information import shift_start
-    from easi_jax.log_data import misfit_of, outlier_weights, segments_from_runs
-    from easi_jax.runtime import quick_compile
-    from easi_jax.segments import to_device
+    from easi_jax.data.segments import to_device
+    from easi_jax.devices import distributed
+    from easi_jax.devices.runtime import quick_compile
+    from easi_jax.estimation.normal_equations import shift_start
+    from easi_jax.estimation.pieces import effective_noise, few, segments_from_runs
+    from easi_jax.estimation.posterior import estimate, polished, widened
+    from easi_jax.estimation.prediction_error import misfit_of, outlier_weights
+    from easi_jax.simulation import open_loop
     from train._stages import placed
 
-    machine, space = problem.machine, search.space
-    steps = max(problem.steps, round(FINISH / machine.dt))
+    simulator, space = problem.simulator, search.space
+    steps = max(problem.steps, round(FINISH / simulator.dt))
     steps = min(steps, max(len(r) for r in problem.fit) - 1)
     # Twice over, each counted half: where pieces begin matters less.
     every = max(1, steps // 2)
-    whole = to_device(segments_from_runs(machine, problem.fit, steps, every))
+    whole = to_device(segments_from_runs(simulator, problem.fit, steps, every))
     whole = replace(whole, weight=whole.weight * every / steps)
-    pieces = few(machine, whole) if refined else whole
+    pieces = few(simulator, whole) if refined else whole
     more = pieces.count < whole.count
     noise = jnp.asarray(problem.noise, jnp.result_type(float))
     # Velocities derived from the positions say nothing that those do not.
-    seen = jnp.asarray(np.concatenate([np.ones(machine.mj_model.nv), problem.measured]))
+    seen = jnp.asarray(
+        np.concatenate([np.ones(simulator.mj_model.nv), problem.measured])
+    )
     hidden = jnp.where(seen > 0, 0.0, jnp.inf)
 
     def finish(
         mean: Any, cov: Any, pieces: Any, misfit: Any, robust: Any, near: Any
     ) -> Any:
         found = estimate(
-            machine,
+            simulator,
             space,
             mean,
             cov,
@@ -178,13 +182,13 @@ def _ready_finish(
 
     def ending(center: Any, cov: Any, whole: Any, misfit: Any) -> Any:
         how = search.config.informed_spread, search.mesh, misfit
-        found = polished(machine, space, center, cov, whole, noise, *how)
+        found = polished(simulator, space, center, cov, whole, noise, *how)
         return found, errors(found, whole)
 
     def errors(found: Any, pieces: Any) -> Any:
-        model = machine.model(space.to_si(found.fit))
-        starts = shift_start(machine, pieces, found.delta)
-        return replay.errors_from(machine, model, starts, pieces)
+        model = simulator.model(space.to_si(found.fit))
+        starts = shift_start(simulator, pieces, found.delta)
+        return open_loop.errors_from(simulator, model, starts, pieces)
 
     n = space.size
     like = placed((jnp.zeros(n), jnp.eye(n), pieces, hidden, _ROBUST, False))
@@ -195,7 +199,7 @@ def _ready_finish(
 
     def passes(mean: Any, cov: Any) -> tuple[Any, Any]:
         misfit, weighed, center = hidden, pieces, mean
-        assumed = effective_noise(machine, pieces, noise)
+        assumed = effective_noise(simulator, pieces, noise)
 
         def judged(error: Any, weight: Any, assumed: Any) -> tuple[Any, Any]:
             misfit = jnp.maximum(misfit_of(error, assumed, weight), hidden)
@@ -208,7 +212,7 @@ def _ready_finish(
             weighed = replace(pieces, weight=pieces.weight * weight)
             center = found.fit
             say(f"least-squares finish: pass {k + 1} of {_PASSES}")
-        assumed = effective_noise(machine, whole, noise)
+        assumed = effective_noise(simulator, whole, noise)
         weighed = whole
         for k in range(_ENDINGS if more else 0):
             given = center, cov, weighed, misfit
@@ -226,7 +230,7 @@ def _ready_finish(
         notes = []
         if odd.size:
             notes.append(
-                f"{odd.size} of {whole.count} pieces of {steps * machine.dt:g} s "
+                f"{odd.size} of {whole.count} pieces of {steps * simulator.dt:g} s "
                 "fit much worse than the rest and weigh less than half "
                 "(a bump, a wrong reading, or motion that the model lacks)"
             )

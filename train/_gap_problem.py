@@ -62,7 +62,7 @@ class GapProblem:
     @property
     def fixed(self) -> dict[str, float]:
         """What the model has and MJCF cannot say, where no parameter sets it."""
-        from easi_jax.found_effects import set_by_none
+        from easi_jax.model.found_effects import set_by_none
 
         return set_by_none(self.model.mj_model, self.space, self.model.fixed)
 
@@ -74,10 +74,10 @@ def read_gap_problem(config: Any) -> GapProblem:
         UserError: whatever is wrong with the files or the options.
     """
     from easi_jax.errors import UserError
-    from easi_jax.gap.coverage import coverage_notes
-    from easi_jax.gap.own import own_space
-    from easi_jax.gap.readings import reading_faults
-    from easi_jax.io.parameter_file import read_parameter_file
+    from easi_jax.gap.excitation_coverage import coverage_notes
+    from easi_jax.gap.sensor_faults import reading_faults
+    from easi_jax.io.models.parameter_file import read_parameter_file
+    from easi_jax.model.parameter_proposal import own_space
     from train._log_problem import read_runs
 
     if not (math.isfinite(config.horizon) and config.horizon > 0):

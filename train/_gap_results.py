@@ -115,7 +115,7 @@ def disagreement(run: str, times: float) -> str:
 
 def gap_json(problem: Any, outcome: Any) -> dict[str, Any]:
     """The content of ``gap.json``, as the log format describes it."""
-    from easi_jax.gap.where import where
+    from easi_jax.gap.error_localization import where
 
     c, m = outcome.channels, problem.model.mj_model
     last = outcome.after if outcome.found else outcome.refit
@@ -196,8 +196,8 @@ def write_results(
     retrained: dict[str, Any] | None = None,
 ) -> Path:
     """Writes all files; returns the report's path. ``retrained``: see `_retrain`."""
-    from easi_jax.found_effects import EffectEntry
-    from easi_jax.io.effects_file import write_effects
+    from easi_jax.io.models.effects_file import write_effects
+    from easi_jax.model.found_effects import EffectEntry
 
     entries, shown = [], []
     for f in outcome.found:
@@ -238,20 +238,20 @@ def _with_found(problem: Any, outcome: Any, entries: Any) -> Any:
     import numpy as np
 
     from easi_jax.export.mjcf import identified_model
-    from easi_jax.io.repaired_model import repaired_model
-    from easi_jax.machine import Machine
-    from easi_jax.parameters import ParameterSpace
+    from easi_jax.io.models.repaired_mjcf import repaired_model
+    from easi_jax.model.parameters import ParameterSpace
+    from easi_jax.simulation.simulator import Simulator
 
     source = problem.model.source
     values = {r["address"]: r["to"] for r in outcome.refitted}
     moved = [p for p in problem.space.parameters if p.addresses[0] in values]
     if not moved and problem.model.path is not None:
         return repaired_model(source, entries)
-    machine = Machine(
+    simulator = Simulator(
         problem.model.mj_model, ParameterSpace(tuple(moved)), problem.fit[0].dt
     )
     theta = np.array([values[p.addresses[0]] for p in moved], float)
-    return identified_model(source, machine, theta, entries)
+    return identified_model(source, simulator, theta, entries)
 
 
 def retrained_line(retrained: dict[str, Any]) -> str:
@@ -270,7 +270,7 @@ def retrained_line(retrained: dict[str, Any]) -> str:
 
 def column_name(column: Any) -> str:
     """A column's name in an effects file: ``com.0`` for one entry of a vector."""
-    from easi_jax.effect_quantities import VECTORS
+    from easi_jax.model.effect_catalog import VECTORS
 
     if column.field in VECTORS:
         return f"{column.field}.{column.index[-1]}"
@@ -280,9 +280,9 @@ def column_name(column: Any) -> str:
 def _report(folder: Any, config: Any, problem: Any, o: Any, content: Any) -> Path:
     import numpy as np
 
-    from easi_jax.io.gap_figures import gap_steps, traces
-    from easi_jax.io.report import Picture, Report, Table, write_report
-    from easi_jax.io.versions import versions
+    from easi_jax.io.report.gap_figures import gap_steps, traces
+    from easi_jax.io.report.html import Picture, Report, Table, write_report
+    from easi_jax.io.runs.versions import versions
 
     c = o.channels
     lines = []
@@ -423,10 +423,10 @@ def _residual_map(problem: Any, o: Any) -> list[Any]:
     """A picture of where errors sit; none where no hinge or slide is compared."""
     import numpy as np
 
-    from easi_jax.gap.where import condition_errors
-    from easi_jax.io.gap_figures import residual_maps
-    from easi_jax.io.report import Picture
-    from easi_jax.quantities import scalar_dofs
+    from easi_jax.gap.error_localization import condition_errors
+    from easi_jax.io.report.gap_figures import residual_maps
+    from easi_jax.io.report.html import Picture
+    from easi_jax.model.quantities import scalar_dofs
 
     c, m = o.channels, problem.model.mj_model
     joints, names, before = condition_errors(o.before.errors, o.before.conditions, m, c)

@@ -20,7 +20,7 @@ class Problem:
 
     Attributes:
         name: of the model.
-        machine: with the parameters, at the logs' control step.
+        simulator: with the parameters, at the logs' control step.
         fit, held: runs.
         held_name: which data are held out.
         noise: standard deviations of positions and velocities, ``(2 nv,)``.
@@ -32,7 +32,7 @@ class Problem:
     """
 
     name: str
-    machine: Any
+    simulator: Any
     fit: list[Any]
     held: list[Any]
     held_name: str
@@ -52,10 +52,11 @@ def read_problem(config: Any) -> Problem:
     """
     import numpy as np
 
+    from easi_jax.data.cleaning import true_readings, trusted_velocity
     from easi_jax.errors import UserError
-    from easi_jax.found_effects import joined
-    from easi_jax.log_data import true_readings, trusted_velocity, visible_steps
-    from easi_jax.machine import Machine
+    from easi_jax.estimation.pieces import visible_steps
+    from easi_jax.model.found_effects import joined
+    from easi_jax.simulation.simulator import Simulator
 
     name, mj_model, space = _model_and_space(config)
     found = found_in(read_given(config).effects, str(config.effects))
@@ -82,25 +83,25 @@ def read_problem(config: Any) -> Problem:
             f"--noise is {list(config.noise)}: {name} needs {2 * nv} numbers, 0 or "
             "more: positions, then velocities"
         )
-    machine = Machine(mj_model, space, fit[0].dt, fixed=fixed)
+    simulator = Simulator(mj_model, space, fit[0].dt, fixed=fixed)
     measured = np.array([run.qvel_measured for run in fit]).all() & np.all(
         [(trusted_velocity(run) == run.qvel).all(0) for run in fit], axis=0
     )
     if any(run.qvel_measured for run in fit) and not measured.all():
-        joints = [n for n, m in zip(machine.state_names[nv:], measured, strict=True)]
+        joints = [n for n, m in zip(simulator.state_names[nv:], measured, strict=True)]
         doubted = [n for n, m in zip(joints, measured, strict=True) if not m]
         notes.append(
             f"{', '.join(doubted)}: not the derivative of the positions (filtered or "
             "late?), so velocities are taken from the positions"
         )
-    steps = max(1, round(horizon / machine.dt))
-    _check_lengths(fit, held, steps, machine.dt)
+    steps = max(1, round(horizon / simulator.dt))
+    _check_lengths(fit, held, steps, simulator.dt)
     piece = steps
     if config.horizon is None:
         piece = visible_steps(fit, noise, steps, _ABOVE_NOISE)
     return Problem(
         name,
-        machine,
+        simulator,
         fit,
         held,
         held_name,
@@ -108,7 +109,7 @@ def read_problem(config: Any) -> Problem:
         measured,
         piece,
         steps,
-        steps * machine.dt,
+        steps * simulator.dt,
         notes,
     )
 
@@ -139,15 +140,11 @@ def read_runs(config: Any, mj_model: Any, horizon: float) -> MeasuredRuns:
     Raises:
         UserError: whatever is wrong with the files, or nothing is left to fit.
     """
-    from easi_jax.data_split import split_held_out
+    from easi_jax.data.cleaning import split_at_resets, to_common_step, without_odd_ends
+    from easi_jax.data.holdout import split_held_out
+    from easi_jax.data.noise import pooled_noise
     from easi_jax.errors import UserError
-    from easi_jax.io.logs import read_logs
-    from easi_jax.log_data import (
-        pooled_noise,
-        split_at_resets,
-        to_common_step,
-        without_odd_ends,
-    )
+    from easi_jax.io.logs.reader import read_logs
 
     # Not Path.resolve: it fails where links lead in a circle.
     kept_out = {os.path.realpath(p) for p in config.held_out}
@@ -197,8 +194,8 @@ def _check_lengths(fit: list[Any], held: list[Any], steps: int, dt: float) -> No
 
 def _model_and_space(config: Any) -> tuple[str, Any, Any]:
     from easi_jax.errors import UserError
-    from easi_jax.io.parameter_file import read_parameter_file
-    from easi_jax.parameters import ParameterSpace
+    from easi_jax.io.models.parameter_file import read_parameter_file
+    from easi_jax.model.parameters import ParameterSpace
 
     if config.model is None:
         if config.robot is None:
@@ -235,7 +232,7 @@ def load_model(path: Path, allowed: tuple[Path, ...] = ()) -> Any:
         UserError: as `read_mjcf`; or nothing in it moves.
     """
     from easi_jax.errors import UserError
-    from easi_jax.io.model_file import read_mjcf
+    from easi_jax.io.models.mjcf import read_mjcf
 
     model = read_mjcf(path, allowed)
     if model.nv == 0:

@@ -29,10 +29,10 @@ def write(
     """
     import numpy as np
 
-    from easi_jax.io.figures import prediction_errors
-    from easi_jax.io.metrics import read_metrics
-    from easi_jax.io.report import Diagnostic, Picture, Report, Table, write_report
-    from easi_jax.io.versions import versions
+    from easi_jax.io.report.figures import prediction_errors
+    from easi_jax.io.report.html import Diagnostic, Picture, Report, Table, write_report
+    from easi_jax.io.runs.metrics import read_metrics
+    from easi_jax.io.runs.versions import versions
 
     space = search.space
     results = []
@@ -136,25 +136,29 @@ def write(
 
 
 def ready_errors(problem: Problem, space: Any) -> Callable[[Any], Any]:
-    """Compiles what takes SI parameters to `easi_jax.log_data.errors_and_floor`."""
+    """Compiles what takes SI parameters to
+    `easi_jax.data.cleaning.errors_and_floor`."""
     import jax
     import jax.numpy as jnp
 
-    from easi_jax.log_data import errors_and_floor, segments_from_runs
-    from easi_jax.runtime import quick_compile
-    from easi_jax.segments import to_device
+    from easi_jax.data.segments import to_device
+    from easi_jax.devices.runtime import quick_compile
+    from easi_jax.estimation.pieces import segments_from_runs
+    from easi_jax.estimation.prediction_error import errors_and_floor
     from train._stages import placed
 
-    machine, every = problem.machine, max(1, problem.steps // 2)
+    simulator, every = problem.simulator, max(1, problem.steps // 2)
     held, fit = (
-        to_device(segments_from_runs(machine, runs, problem.steps, every, fitted=True))
+        to_device(
+            segments_from_runs(simulator, runs, problem.steps, every, fitted=True)
+        )
         for runs in (problem.held, problem.fit)
     )
     noise = jnp.asarray(problem.noise, jnp.result_type(float))
 
     def errors(theta: Any) -> Any:
-        model = machine.model(theta)
-        return errors_and_floor(machine, model, held, fit, noise, jax.random.key(0))
+        model = simulator.model(theta)
+        return errors_and_floor(simulator, model, held, fit, noise, jax.random.key(0))
 
     like = placed(jnp.zeros(space.size))
     compiled = jax.jit(errors).lower(like).compile(quick_compile())
@@ -180,12 +184,12 @@ def _errors(
                 "floor": floor.tolist(),
             }
         )
-    machine = problem.machine
-    coordinates = machine.state_names[: machine.mj_model.nv]
+    simulator = problem.simulator
+    coordinates = simulator.state_names[: simulator.mj_model.nv]
     names = [n.removeprefix("qpos.") for n in coordinates]
     return {
         "channels": names,
-        "units": _units(machine.mj_model),
+        "units": _units(simulator.mj_model),
         "before": before.tolist(),
         "seeds": seeds,
     }
@@ -208,7 +212,7 @@ def _better(before: Sequence[float], after: Sequence[float]) -> str:
 
 
 def _parameter_rows(space: Any, result: Any) -> list[Any]:
-    from easi_jax.io.report import ParameterRow
+    from easi_jax.io.report.html import ParameterRow
 
     return [
         ParameterRow(
@@ -226,7 +230,7 @@ def _parameter_rows(space: Any, result: Any) -> list[Any]:
 
 
 def _seed_table(rows: Sequence[Any], results: Sequence[Any], seeds: Any) -> Any:
-    from easi_jax.io.report import Table
+    from easi_jax.io.report.html import Table
 
     return Table(
         "Agreement of the seeds",
@@ -266,6 +270,6 @@ def _diagnostics(
         make(
             "measurement noise",
             ", ".join(f"{x:.2g}" for x in problem.noise),
-            note=f"of {', '.join(problem.machine.state_names)} (SI)",
+            note=f"of {', '.join(problem.simulator.state_names)} (SI)",
         ),
     ]

@@ -24,7 +24,7 @@ from train._stages import (
 )
 
 if TYPE_CHECKING:
-    from train.easi import Config
+    from train._easi_config import Config
 
 
 def run(config: "Config") -> None:
@@ -33,17 +33,17 @@ def run(config: "Config") -> None:
     import jax.numpy as jnp
     import numpy as np
 
-    from easi_jax import distributed
+    from easi_jax.devices import distributed
+    from easi_jax.devices.runtime import fast_loops
     from easi_jax.errors import UserError
-    from easi_jax.io.runs import RunFolder
-    from easi_jax.pipeline import (
+    from easi_jax.io.runs.folder import RunFolder
+    from easi_jax.pipeline.stages import (
         Pipeline,
         PipelineConfig,
         seed_keys,
         stage_keys,
         target_parameters,
     )
-    from easi_jax.runtime import fast_loops
 
     udr = load_udr(config.udr, config.env)
     seeds = config.seeds or udr["seeds"]
@@ -228,8 +228,8 @@ def _saved(folder: Any, name: str, make: Any, check: Any, refined: bool) -> Any:
     """A result that is costly to make again, kept as a checkpoint once checked."""
     import jax
 
-    from easi_jax import distributed
-    from easi_jax.io import checkpoints
+    from easi_jax.devices import distributed
+    from easi_jax.io.runs import checkpoints
 
     place = folder.checkpoints / name
     found = checkpoints.restore(
@@ -256,8 +256,8 @@ def held_out_errors(
     import jax.numpy as jnp
     import numpy as np
 
-    from easi_jax import distributed
-    from easi_jax.heldout import shares
+    from easi_jax.devices import distributed
+    from easi_jax.pipeline.held_out import shares
 
     env = pipe.env
     fresh = jax.vmap(lambda k: jax.random.fold_in(k, 7))(keys)
@@ -271,7 +271,7 @@ def held_out_errors(
     compute = jax.jit(lambda m: shares(pipe, policies, target, m, fresh))
     out = {name: distributed.local(compute(m)) for name, m in models.items()}
     return {
-        "channels": env.machine.state_names,
+        "channels": env.simulator.state_names,
         "one_step": {k: np.asarray(v[0]) for k, v in out.items()},
         "open_loop": {k: np.asarray(v[1]) for k, v in out.items()},
     }

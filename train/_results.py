@@ -27,7 +27,7 @@ def seed_result(space: Any, unit_mean: Any, unit_cov: Any, hessian: Any) -> Any:
     """One seed's result as plain numbers, for ``distribution.json``."""
     import numpy as np
 
-    from easi_jax.information import describe, identifiability
+    from easi_jax.estimation.identifiability import describe, identifiability
 
     ident = identifiability(space, np.asarray(hessian))
     mean = np.asarray(space.to_si(unit_mean), float)
@@ -83,8 +83,8 @@ def history_figure(
     """Parameters by generation of one seed, from the run's metrics (as Fig. 4)."""
     import numpy as np
 
-    from easi_jax.io.figures import parameters_by_generation
-    from easi_jax.io.metrics import read_metrics
+    from easi_jax.io.report.figures import parameters_by_generation
+    from easi_jax.io.runs.metrics import read_metrics
 
     lines = read_metrics(folder.path / "metrics.jsonl", "search")[:generations]
     low, high = space.initial
@@ -121,8 +121,8 @@ def motion_strip(env: Any, qpos: Any, method: str, notes: list[str]) -> list[Any
     import numpy as np
 
     from easi_jax.errors import UserError
-    from easi_jax.io.report import Picture
-    from easi_jax.io.video import FRAMES, render, strip
+    from easi_jax.io.report.html import Picture
+    from easi_jax.io.report.video import FRAMES, render, strip
 
     moving = np.flatnonzero(np.any(np.diff(np.asarray(qpos), axis=0) != 0, axis=1))
     end = int(moving[-1]) + 1 if moving.size else 0
@@ -147,11 +147,11 @@ def truth_of(pipe: Any, theta: Any) -> Any:
     what that lacks has no strength there."""
     import numpy as np
 
-    from easi_jax.addresses import nominal
+    from easi_jax.model.addresses import nominal
 
     real = pipe.real.space
     known = dict(zip(real.names, np.asarray(theta, float), strict=True))
-    fixed = pipe.real.machine.fixed
+    fixed = pipe.real.simulator.fixed
     out = []
     for p in pipe.space.parameters:
         value = known.get(p.name)
@@ -183,16 +183,16 @@ def write_pseudo_real(
     """
     import numpy as np
 
-    from easi_jax.io.figures import returns_by_method, returns_by_step
-    from easi_jax.io.metrics import read_metrics
-    from easi_jax.io.report import (
+    from easi_jax.io.report.figures import returns_by_method, returns_by_step
+    from easi_jax.io.report.html import (
         Diagnostic,
         ParameterRow,
         Report,
         Table,
         write_report,
     )
-    from easi_jax.io.versions import versions
+    from easi_jax.io.runs.metrics import read_metrics
+    from easi_jax.io.runs.versions import versions
     from easi_jax.rl.presets import algorithm_of
 
     space, config, notes = pipe.space, pipe.config, list(notes)
@@ -345,7 +345,7 @@ def write_pseudo_real(
 
 def _pictures(methods: str, steps: str, by_generation: str, seed: int) -> list[Any]:
     """The report's figures; one without content has an empty SVG."""
-    from easi_jax.io.report import Picture
+    from easi_jax.io.report.html import Picture
 
     return [
         Picture(

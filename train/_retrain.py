@@ -12,8 +12,8 @@ def check_robot(robot: str, mj_model: Any, env_steps: int | None = None) -> None
         UserError: no such robot or file, a joint, actuator or body is missing in it, or
             too few steps.
     """
-    from easi_jax.addresses import names
     from easi_jax.errors import UserError
+    from easi_jax.model.addresses import names
     from envs import open_env
     from train._robots import training_config
 

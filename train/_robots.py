@@ -34,7 +34,7 @@ def search_config(
         UserError: unknown preset or name, or a value of the wrong kind.
     """
     from easi_jax.errors import UserError, nearest
-    from easi_jax.search_config import preset as make
+    from easi_jax.search.config import preset as make
 
     base = make(preset)
     known = asdict(base)
@@ -138,7 +138,7 @@ def target_of(
 
 def save_policies(folder: Any, method: str, policies: Any) -> None:
     """Keeps the policies ``(S, ...)`` of one method in a run folder."""
-    from easi_jax.io import checkpoints
+    from easi_jax.io.runs import checkpoints
 
     place = folder.checkpoints / f"policy_{method}"
     checkpoints.save(place, 0, policies, config_hash=folder.config_hash)
@@ -168,9 +168,9 @@ def load_policies(
     import jax
 
     from easi_jax.errors import UserError, nearest
-    from easi_jax.io import checkpoints
-    from easi_jax.io.runs import read_config
-    from easi_jax.pipeline import Pipeline, PipelineConfig
+    from easi_jax.io.runs import checkpoints
+    from easi_jax.io.runs.folder import read_config
+    from easi_jax.pipeline.stages import Pipeline, PipelineConfig
 
     config = read_config(folder)
     if not (folder / "results.json").exists():
@@ -222,7 +222,7 @@ def read_policies(path: Path) -> dict[str, Any]:
     """
     from easi_jax.errors import UserError
     from easi_jax.io.files import read_json
-    from easi_jax.io.run_files import POLICIES, checked
+    from easi_jax.io.runs.schemas import POLICIES, checked
 
     told = read_json(path)
     if isinstance(told, dict) and "methods" not in told:
@@ -247,10 +247,10 @@ def load_udr(folder: Path, env_file: Path | None = None) -> dict[str, Any]:
     import jax
 
     from easi_jax.errors import UserError
-    from easi_jax.io import checkpoints
-    from easi_jax.io.run_files import TRAINED, checked
-    from easi_jax.io.runs import config_hash, read_config
-    from easi_jax.pipeline import Pipeline, PipelineConfig, seed_keys
+    from easi_jax.io.runs import checkpoints
+    from easi_jax.io.runs.folder import config_hash, read_config
+    from easi_jax.io.runs.schemas import TRAINED, checked
+    from easi_jax.pipeline.stages import Pipeline, PipelineConfig, seed_keys
 
     config = read_config(folder)
     if "robot" not in config or "env_steps" not in config or "udr" in config:

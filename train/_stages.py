@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from train._command import progress
 
 if TYPE_CHECKING:
-    from easi_jax.io.runs import RunFolder
+    from easi_jax.io.runs.folder import RunFolder
 
 T = TypeVar("T")
 Rows = list[tuple[int, dict[str, float]]]
@@ -43,8 +43,8 @@ def run_stage(
     """
     import jax
 
-    from easi_jax import distributed
-    from easi_jax.io import checkpoints
+    from easi_jax.devices import distributed
+    from easi_jax.io.runs import checkpoints
 
     folder = run.checkpoints / name
     found = checkpoints.restore(
@@ -90,8 +90,8 @@ def placed(tree: Any) -> Any:
     import jax.numpy as jnp
     from jax.sharding import NamedSharding, PartitionSpec
 
-    from easi_jax import distributed
-    from easi_jax.mesh import make_mesh
+    from easi_jax.devices import distributed
+    from easi_jax.devices.mesh import make_mesh
 
     def strong(x: Any) -> Any:
         x = jnp.asarray(x)
@@ -142,7 +142,7 @@ def training_curve(
     folder: Path, stage: str, seeds: Sequence[int]
 ) -> tuple[list[int], list[list[float]]]:
     """``(steps, returns[step][seed])`` of a stage from its metrics."""
-    from easi_jax.io.metrics import read_metrics
+    from easi_jax.io.runs.metrics import read_metrics
 
     lines = read_metrics(folder / "metrics.jsonl", stage)
     steps = [line["step"] for line in lines]
@@ -238,7 +238,7 @@ def jit_chunks(
 ) -> Callable[..., Any]:
     """``fun(*arrays, n)`` compiled once for each chunk length.
 
-    ``options`` of the compiler are such as those of `easi_jax.runtime`.
+    ``options`` of the compiler are such as those of `easi_jax.devices.runtime`.
     """
     import jax
 

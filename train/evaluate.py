@@ -45,8 +45,8 @@ def run(config: Config) -> None:
 
     from easi_jax.errors import UserError
     from easi_jax.io.files import atomic_write, to_json
-    from easi_jax.io.video import check_video, render, write_video
-    from easi_jax.pipeline import Pipeline, PipelineConfig, target_parameters
+    from easi_jax.io.report.video import check_video, render, write_video
+    from easi_jax.pipeline.stages import Pipeline, PipelineConfig, target_parameters
     from train._effects import effect_notes, read_given
     from train._robots import check_seeds, load_policies
 

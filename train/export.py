@@ -53,8 +53,8 @@ def run(config: Config) -> None:
             known = ", ".join(_FORMS)
             raise UserError(f'--to "{form}": {known}{nearest(form, _FORMS)}')
     from easi_jax.io.files import atomic_write
-    from easi_jax.io.run_files import read_checked
-    from easi_jax.io.runs import read_config
+    from easi_jax.io.runs.folder import read_config
+    from easi_jax.io.runs.schemas import read_checked
 
     settings, results = read_config(config.run_folder), {}
     if (config.run_folder / "results.json").exists():
@@ -118,7 +118,7 @@ def _parameter_files(
 ) -> dict[str, str | bytes]:
     from easi_jax.errors import UserError
     from easi_jax.export.randomization import to_yaml
-    from easi_jax.io.run_files import read_distribution
+    from easi_jax.io.runs.schemas import read_distribution
 
     found = read_distribution(config.run_folder / "distribution.json")
     first = str(found.get("best_seed", next(iter(found["seeds"]))))
@@ -148,9 +148,9 @@ def _model_files(
             strict=True,
         )
     )
-    source, machine, entries = _machine_of(config, settings, found, values)
-    theta = np.array([values[name] for name in machine.space.names], float)
-    model = identified_model(source, machine, theta, entries)
+    source, simulator, entries = _machine_of(config, settings, found, values)
+    theta = np.array([values[name] for name in simulator.space.names], float)
+    model = identified_model(source, simulator, theta, entries)
     if model.left:
         say(f"note: MJCF has no word for {', '.join(model.left)}: not in model.xml")
     assets = {name: place.read_bytes() for name, place in model.assets.items()}
@@ -165,8 +165,8 @@ def _machine_of(
 ) -> tuple[Path, Any, list[Any]]:
     """File of the model, a machine with the identified parameters but those of effects,
     and the effects as identified."""
-    from easi_jax.machine import Machine
-    from easi_jax.parameters import Parameter, ParameterSpace
+    from easi_jax.model.parameters import Parameter, ParameterSpace
+    from easi_jax.simulation.simulator import Simulator
     from train._effects import found_in
 
     effects = found_in(settings.get("effects"))
@@ -194,14 +194,14 @@ def _machine_of(
         for e in effects.entries
     ]
     source, mj_model, dt = _model_of(config, settings)
-    machine = Machine(mj_model, ParameterSpace(tuple(space)), dt, fixed=own)
-    return source, machine, entries
+    simulator = Simulator(mj_model, ParameterSpace(tuple(space)), dt, fixed=own)
+    return source, simulator, entries
 
 
 def _model_of(config: Config, settings: dict[str, Any]) -> tuple[Path, Any, Any]:
     """File of the run's model, the model, and its control step where there is one."""
     from easi_jax.errors import UserError
-    from easi_jax.io.run_files import MADE_WITH, checked
+    from easi_jax.io.runs.schemas import MADE_WITH, checked
     from envs import REGISTRY
     from envs.robot import model_file
     from train._log_problem import load_model

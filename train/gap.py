@@ -58,10 +58,10 @@ class Config:
 
 def run(config: Config) -> None:
     """Reads and checks, finds, writes."""
-    from easi_jax import runtime
+    from easi_jax.devices import runtime
     from easi_jax.errors import UserError
-    from easi_jax.io.runs import RunFolder
-    from easi_jax.io.versions import versions
+    from easi_jax.io.runs.folder import RunFolder
+    from easi_jax.io.runs.versions import versions
     from train._gap_problem import read_gap_problem
     from train._gap_results import retrained_line, write_results
     from train._retrain import check_robot, retrain
@@ -75,7 +75,7 @@ def run(config: Config) -> None:
     if config.retrain is not None:
         check_robot(config.retrain, problem.model.mj_model, config.retrain_steps)
     from easi_jax.gap.analysis import Analysis
-    from easi_jax.gap.journal import Journal, key_of
+    from easi_jax.io.runs.step_cache import Journal, key_of
 
     analysis = Analysis(
         problem.model.mj_model,

@@ -15,8 +15,8 @@ class Config:
 def run(config: Config) -> None:
     """Prints the three tables."""
     printed = _import_output()
-    from easi_jax import runtime
-    from easi_jax.io.versions import versions
+    from easi_jax.devices import runtime
+    from easi_jax.io.runs.versions import versions
 
     found = versions()
     packages = {k: v or "not installed" for k, v in found["packages"].items()}
@@ -42,7 +42,7 @@ def run(config: Config) -> None:
 
 
 def measures(state: dict[str, object], printed: str) -> list[tuple[str, str, str]]:
-    """Name, yes or no, and detail of each measure of ``easi_jax.runtime``.
+    """Name, yes or no, and detail of each measure of ``easi_jax.devices.runtime``.
 
     Args:
         state: of ``runtime.status()``.

@@ -38,8 +38,8 @@ def run(config: Config) -> None:
     """Writes the file and shows what is in it."""
     from easi_jax.errors import UserError
     from easi_jax.io.files import atomic_write
-    from easi_jax.io.parameter_file import read_parameter_file
-    from easi_jax.proposal import as_text, propose
+    from easi_jax.io.models.parameter_file import read_parameter_file
+    from easi_jax.model.parameter_proposal import as_text, propose
     from train._log_problem import load_model
 
     if config.out.exists() and not config.overwrite:
@@ -88,8 +88,8 @@ def _verdicts(
     """
     import numpy as np
 
-    from easi_jax.information import describe, identifiability
-    from easi_jax.proposal import space_of
+    from easi_jax.estimation.identifiability import describe, identifiability
+    from easi_jax.model.parameter_proposal import space_of
 
     space = space_of(proposals)
     notes, keep = [], list(range(space.size))
@@ -124,14 +124,15 @@ def _information(config: Config, m: Any, proposals: list[Any]) -> Any:
     import jax.numpy as jnp
     import numpy as np
 
-    from easi_jax.identify import effective_noise
-    from easi_jax.information import PairedFit
-    from easi_jax.io.logs import read_logs
-    from easi_jax.log_data import pooled_noise, segments_from_runs, to_common_step
-    from easi_jax.machine import Machine
-    from easi_jax.proposal import space_of
-    from easi_jax.refine import step_weights
-    from easi_jax.segments import to_device
+    from easi_jax.data.cleaning import to_common_step
+    from easi_jax.data.noise import pooled_noise
+    from easi_jax.data.segments import to_device
+    from easi_jax.estimation.levenberg_marquardt import step_weights
+    from easi_jax.estimation.normal_equations import PairedFit
+    from easi_jax.estimation.pieces import effective_noise, segments_from_runs
+    from easi_jax.io.logs.reader import read_logs
+    from easi_jax.model.parameter_proposal import space_of
+    from easi_jax.simulation.simulator import Simulator
 
     log = read_logs(list(config.data), m, config.mapping)
     noise = pooled_noise(log.runs)
@@ -139,17 +140,17 @@ def _information(config: Config, m: Any, proposals: list[Any]) -> Any:
     for note in (*log.notes, *notes):
         say(f"note: {note}")
     space = space_of(proposals)
-    machine = Machine(m, space, runs[0].dt)
-    steps = max(1, round(_HORIZON / machine.dt))
-    pieces = to_device(segments_from_runs(machine, runs, steps, steps))
-    noise = effective_noise(machine, pieces, jnp.asarray(noise, jnp.float32))
+    simulator = Simulator(m, space, runs[0].dt)
+    steps = max(1, round(_HORIZON / simulator.dt))
+    pieces = to_device(segments_from_runs(simulator, runs, steps, steps))
+    noise = effective_noise(simulator, pieces, jnp.asarray(noise, jnp.float32))
     unit = space.to_unit(jnp.asarray(space.nominal))
     unit = jnp.where(jnp.isfinite(unit), unit, 0.5)
     say("Fisher information of the logs ...")
 
     @jax.jit
     def information(unit: Any) -> Any:
-        paired = PairedFit(machine, space, pieces, noise)
+        paired = PairedFit(simulator, space, pieces, noise)
         zero = jnp.zeros((pieces.count, 2 * m.nv))
         return paired.normal(unit, zero, step_weights(pieces, noise)).hessian
 

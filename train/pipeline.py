@@ -96,11 +96,11 @@ def run(config: Config) -> None:
     import jax.numpy as jnp
     import numpy as np
 
-    from easi_jax import distributed
+    from easi_jax.devices import distributed
     from easi_jax.errors import UserError
-    from easi_jax.io import checkpoints
-    from easi_jax.io.runs import RunFolder
-    from easi_jax.pipeline import (
+    from easi_jax.io.runs import checkpoints
+    from easi_jax.io.runs.folder import RunFolder
+    from easi_jax.pipeline.stages import (
         Pipeline,
         PipelineConfig,
         seed_keys,

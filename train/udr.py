@@ -77,11 +77,11 @@ def run(config: Config) -> None:
     import jax.numpy as jnp
     import numpy as np
 
-    from easi_jax.io.figures import returns_by_step
-    from easi_jax.io.report import Picture, Report, Table, write_report
-    from easi_jax.io.runs import RunFolder
-    from easi_jax.io.versions import versions
-    from easi_jax.pipeline import (
+    from easi_jax.io.report.figures import returns_by_step
+    from easi_jax.io.report.html import Picture, Report, Table, write_report
+    from easi_jax.io.runs.folder import RunFolder
+    from easi_jax.io.runs.versions import versions
+    from easi_jax.pipeline.stages import (
         Pipeline,
         PipelineConfig,
         seed_keys,

@@ -24,9 +24,10 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from easi_jax import replay
-from easi_jax.information import describe, identifiability
-from easi_jax.pipeline import (
+from easi_jax.data.segments import windows
+from easi_jax.devices.runtime import fast_loops
+from easi_jax.estimation.identifiability import describe, identifiability
+from easi_jax.pipeline.stages import (
     Pipeline,
     PipelineConfig,
     seed_keys,
@@ -34,9 +35,8 @@ from easi_jax.pipeline import (
     target_parameters,
 )
 from easi_jax.rl.presets import training_preset
-from easi_jax.runtime import fast_loops
-from easi_jax.search_config import preset
-from easi_jax.segments import windows
+from easi_jax.search.config import preset
+from easi_jax.simulation import open_loop
 from envs import make
 
 # full: minutes on a laptop. tiny: to see that every cell runs; its policies are poor.
@@ -73,8 +73,8 @@ pipe = Pipeline(
     ),
 )
 keys = stage_keys(seed_keys(SEEDS))
-for name, unit, model, machine in zip(names, units, nominal, target, strict=True):
-    print(f"{name:17} model {model:<8.4g} machine {float(machine):<8.4g} {unit}")
+for name, unit, model, real in zip(names, units, nominal, target, strict=True):
+    print(f"{name:17} model {model:<8.4g} machine {float(real):<8.4g} {unit}")
 
 # %% [markdown]
 # ## 1. A rough policy
@@ -200,7 +200,7 @@ pieces = windows(jax.tree.map(lambda x: x[0], fresh), 10, 10)
 @jax.jit
 def prediction_error(theta):
     """RMS error of positions and velocities after 0.2 s, SI."""
-    error = replay.errors(env.machine, env.model(theta), pieces)[:, -1]
+    error = open_loop.errors(env.simulator, env.model(theta), pieces)[:, -1]
     weight = pieces.weight / pieces.weight.sum()
     return jnp.sqrt(weight @ error**2)
 

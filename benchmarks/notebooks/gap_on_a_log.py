@@ -24,9 +24,9 @@ import numpy as np
 
 import train
 from benchmarks import gap_real
-from easi_jax.io.logs import read_logs
-from easi_jax.recording import physics_steps
-from easi_jax.windows import make_windows
+from easi_jax.data.recording import physics_steps
+from easi_jax.data.windows import make_windows
+from easi_jax.io.logs.reader import read_logs
 from train import gap
 
 # full: a minute or two on a laptop. tiny: the example, whatever is at hand.
@@ -36,9 +36,9 @@ SECONDS = 8 if TINY else 20  # of each of the example's recordings
 OUT = Path("results/gap_on_a_log")
 OUT.mkdir(parents=True, exist_ok=True)
 ROOT = Path(train.__file__).parents[1]
-machine = gap_real.MACHINES["emps"]
+simulator = gap_real.MACHINES["emps"]
 folder = Path(os.environ.get("EASI_DATA", ROOT / gap_real.Config().data))
-folder /= machine.folder
+folder /= simulator.folder
 REAL = not TINY and (folder / "model.xml").is_file()
 print("a real machine" if REAL else "an example")
 
@@ -87,9 +87,9 @@ def record(path, rng):
 
 
 if REAL:
-    model, horizon = folder / "model.xml", machine.horizon
-    data = tuple(folder / name for name in machine.data)
-    held_out = tuple(folder / name for name in machine.held_out)
+    model, horizon = folder / "model.xml", simulator.horizon
+    data = tuple(folder / name for name in simulator.data)
+    held_out = tuple(folder / name for name in simulator.held_out)
 else:
     model, horizon = OUT / "pendulum.xml", 0.2
     data, held_out = (OUT / "run1.csv",), (OUT / "run2.csv",)

@@ -24,8 +24,8 @@ from benchmarks._common import markdown_table
 from benchmarks.paper_cells import METHODS, solve
 from benchmarks.paper_tables import PUBLISHED
 from benchmarks.paper_tables import told as shown
-from easi_jax.io.versions import versions
-from easi_jax.pipeline import target_parameters
+from easi_jax.io.runs.versions import versions
+from easi_jax.pipeline.stages import target_parameters
 from envs import make
 
 # full: about a minute a cell on a laptop. tiny: to see that it runs; its policies and

@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 import train
-from easi_jax.io.metrics import read_metrics
+from easi_jax.io.runs.metrics import read_metrics
 from train import easi, parameters
 
 # full: a minute or two on a laptop. tiny: to see that every cell runs.
@@ -107,12 +107,12 @@ spec.body("lower").geoms[0].mass = truth["lower_mass"]
 spec.joint("shoulder").damping[0] = truth["shoulder_damping"]
 spec.joint("elbow").damping[0] = truth["elbow_damping"]
 spec.actuator("shoulder").gear[0] = truth["shoulder_gear"]
-machine = spec.compile()
+simulator = spec.compile()
 
 
 def record(path, wanted, rng):
     """Plays the machine under a PD controller that wants angles ``(T, 2)`` [rad]."""
-    data = mujoco.MjData(machine)
+    data = mujoco.MjData(simulator)
     data.qpos[:] = before = wanted[0]
     rows = []
     for t, goal in enumerate(wanted):
@@ -122,7 +122,7 @@ def record(path, wanted, rng):
         command = np.array([2.0, 1.5]) * (goal - measured) - 0.05 * speed
         data.ctrl[:] = np.clip(command, -1, 1)
         rows.append([CONTROL_STEP * t, *measured, *data.ctrl])
-        mujoco.mj_step(machine, data, FINE_STEPS)
+        mujoco.mj_step(simulator, data, FINE_STEPS)
     head = "time,qpos.shoulder,qpos.elbow,ctrl.shoulder,ctrl.elbow"
     np.savetxt(path, rows, fmt="%.7g", delimiter=",", header=head, comments="")
     return np.array(rows)

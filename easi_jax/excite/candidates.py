@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from easi_jax.configuration import Configuration
+from easi_jax.data.recording import Run
 from easi_jax.errors import UserError
 from easi_jax.excite import drives, play, signals
-from easi_jax.quantities import is_position_servo
-from easi_jax.recording import Run
+from easi_jax.model.joint_space import Configuration
+from easi_jax.model.quantities import is_position_servo
 
 LEAD = 1.0  # s of rest at either end
 _FASTEST = 0.2  # of the control rate that a band may reach

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from easi_jax.data.recording import physics_steps
 from easi_jax.errors import UserError, nearest
 from easi_jax.excite import evaluate as ev
 from easi_jax.excite.candidates import Test
@@ -17,14 +18,14 @@ from easi_jax.excite.separation import (
     separation,
     soft_minimum,
 )
-from easi_jax.gap.fit import bounds_of
-from easi_jax.gap.places import places, ripples
+from easi_jax.gap.batched_least_squares import bounds_of
+from easi_jax.gap.candidates import places, ripples
 from easi_jax.gap.scales import scales_of
-from easi_jax.gap.table import EFFECTS, Place, Scales, covered, does
-from easi_jax.parameters import ParameterSpace
-from easi_jax.physics import WRITTEN_OUT
-from easi_jax.quantities import scalar_dofs
-from easi_jax.recording import physics_steps
+from easi_jax.gap.table import Place, Scales, covered, does
+from easi_jax.model.effect_catalog import EFFECTS
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.model.quantities import scalar_dofs
+from easi_jax.simulation.step import WRITTEN_OUT
 
 _WORK = 4e6  # physics steps of all simulations together
 _WORK_WIDE = 1e6

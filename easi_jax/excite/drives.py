@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.errors import UserError
-from easi_jax.quantities import (
+from easi_jax.model.quantities import (
     actuator_name,
     is_position_servo,
     is_scalar,

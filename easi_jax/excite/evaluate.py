@@ -5,16 +5,16 @@ from collections.abc import Callable, Sequence
 import mujoco
 import numpy as np
 
+from easi_jax.data.recording import Run
 from easi_jax.excite.separation import Design
-from easi_jax.gap import measure
-from easi_jax.gap.fit import Bounds
-from easi_jax.gap.layout import Layout
+from easi_jax.gap import gap_metric as measure
+from easi_jax.gap.batched_least_squares import Bounds
+from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.predictor import Predictor
-from easi_jax.gap.residuals import make_residuals, start_sensitivity, velocity_slack
 from easi_jax.gap.table import Place, Scales
+from easi_jax.gap.whitening import make_residuals, start_sensitivity, velocity_slack
 from easi_jax.gap.window_set import WindowSet, join, window_set
-from easi_jax.parameters import ParameterSpace
-from easi_jax.recording import Run
+from easi_jax.model.parameters import ParameterSpace
 
 _TOGETHER = 16  # vectors in one call, between two lines of progress
 _FLOOR = 0.05  # of the error that the start velocity's own fit makes
@@ -77,7 +77,7 @@ def products_of(
         scales: how large motion is.
     """
     p, nv = design.predictor, m.nv
-    step = runs[0].dt / p.machine.substeps
+    step = runs[0].dt / p.simulator.substeps
     slack = [velocity_slack([r], step) for r in runs]
     moved = np.concatenate(
         [
@@ -92,7 +92,7 @@ def products_of(
         groups.append(p.errors(x))
         tell(f"simulated {first + len(x)} of {len(design.vectors)} changes")
     errors = np.concatenate(groups)
-    names = [n.removeprefix("qpos.") for n in p.machine.state_names[:nv]]
+    names = [n.removeprefix("qpos.") for n in p.simulator.state_names[:nv]]
     out, at = [], 0
     for part, run, loose in zip(parts, runs, slack, strict=True):
         here = slice(at, at + len(part))

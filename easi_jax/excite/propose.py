@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
+from easi_jax.data.recording import Run
 from easi_jax.errors import UserError
 from easi_jax.excite import candidates, drives
 from easi_jax.excite import evaluate as ev
 from easi_jax.excite.separation import Design, alike, separation
-from easi_jax.gap.fit import Bounds
+from easi_jax.gap.batched_least_squares import Bounds
 from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.scales import scales_of
 from easi_jax.gap.table import Place
 from easi_jax.gap.window_set import WindowSet, join
-from easi_jax.recording import Run
 
 _WINDOWS = 32  # of each run
 _MARGIN = 0.05

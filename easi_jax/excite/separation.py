@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from easi_jax.gap.fit import Bounds
+from easi_jax.gap.batched_least_squares import Bounds
 from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.table import Place
 

@@ -10,15 +10,15 @@ import mujoco
 import numpy as np
 
 from easi_jax.errors import UserError
-from easi_jax.found_effects import EffectEntry
-from easi_jax.in_mujoco import InMujoco
-from easi_jax.io.repaired_model import Repaired, repaired_model
-from easi_jax.machine import Machine
+from easi_jax.io.models.repaired_mjcf import Repaired, repaired_model
+from easi_jax.model.found_effects import EffectEntry
+from easi_jax.simulation.mujoco_c import InMujoco
+from easi_jax.simulation.simulator import Simulator
 
 
 def identified_model(
     source: Path,
-    machine: Machine,
+    simulator: Simulator,
     theta: np.ndarray,
     entries: Sequence[EffectEntry] = (),
 ) -> Repaired:
@@ -26,14 +26,14 @@ def identified_model(
 
     Args:
         source: file that the machine's model came from.
-        machine: whose parameters they are.
+        simulator: whose parameters they are.
         entries: effects that the machine has besides.
 
     Raises:
         UserError: ``source`` is another model than the machine's.
     """
-    unit = np.asarray(machine.space.to_unit(theta), float)
-    write = InMujoco(machine)
+    unit = np.asarray(simulator.space.to_unit(theta), float)
+    write = InMujoco(simulator)
     model = write.at(unit)
     # MuJoCo writes numbers of a model back into the text that it read last.
     read = mujoco.MjModel.from_xml_path(str(source))
@@ -41,7 +41,7 @@ def identified_model(
         raise UserError(f"{source} is not the model that these parameters are of")
     lost = [
         name
-        for name, reached in zip(machine.space.names, write.reaches, strict=True)
+        for name, reached in zip(simulator.space.names, write.reaches, strict=True)
         if not reached
     ]
     with tempfile.TemporaryDirectory() as folder:

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from easi_jax.action_map import ActionMap
 from easi_jax.errors import UserError
 from easi_jax.rl.networks import PolicyParams, act
+from easi_jax.simulation.action_map import ActionMap
 
 _OPSET = 17
 

@@ -19,10 +19,10 @@ import mujoco
 import numpy as np
 import yaml
 
-from easi_jax.addresses import open_gates
 from easi_jax.errors import UserError
 from easi_jax.io.strict_yaml import read_yaml
-from easi_jax.model import put_model, with_parameters
+from easi_jax.model.addresses import open_gates
+from easi_jax.model.mjx_model import put_model, with_parameters
 
 _WIDE = 2.0  # standard deviations of a range
 _HEAD = """\

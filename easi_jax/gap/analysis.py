@@ -13,9 +13,17 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
+from easi_jax.data.recording import Run, physics_steps
 from easi_jax.errors import UserError
-from easi_jax.gap import measure
-from easi_jax.gap.evidence import (
+from easi_jax.gap import gap_metric as measure
+from easi_jax.gap.batched_least_squares import Bounds, bounds_of, window_weights
+from easi_jax.gap.candidates import places, ripples
+from easi_jax.gap.discretization_error import error_of_steps, within_a_step
+from easi_jax.gap.effect_set import Candidate, Model
+from easi_jax.gap.effect_vector import Layout
+from easi_jax.gap.error_localization import Conditions
+from easi_jax.gap.forward_selection import Selector, shortlist
+from easi_jax.gap.model_comparison import (
     GOAL,
     HELPS,
     better,
@@ -24,29 +32,20 @@ from easi_jax.gap.evidence import (
     rank,
     simplest,
 )
-from easi_jax.gap.fit import Bounds, bounds_of, window_weights
-from easi_jax.gap.journal import key_of
-from easi_jax.gap.layout import Layout
-from easi_jax.gap.models import Candidate, Model
-from easi_jax.gap.numbers import Numbers
-from easi_jax.gap.outcome import Figures, Found, Outcome, Part
-from easi_jax.gap.own_steps import error_of_steps, within_a_step
-from easi_jax.gap.places import places, ripples
 from easi_jax.gap.predictor import BLOCK, Predictor
-from easi_jax.gap.residuals import (
+from easi_jax.gap.result import Figures, Found, Numbers, Outcome, Part
+from easi_jax.gap.scales import scales_of
+from easi_jax.gap.table import Place, covered, does
+from easi_jax.gap.whitening import (
     make_residuals,
     start_sensitivity,
     velocity_slack,
 )
-from easi_jax.gap.scales import scales_of
-from easi_jax.gap.selection import Selector, shortlist
-from easi_jax.gap.table import Place, covered, does
-from easi_jax.gap.where import Conditions
 from easi_jax.gap.window_set import join, reach, spread, window_set
-from easi_jax.parameters import ParameterSpace
+from easi_jax.io.runs.step_cache import key_of
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.model.quantities import scalar_dofs
 from easi_jax.progress import Progress, silent
-from easi_jax.quantities import scalar_dofs
-from easi_jax.recording import Run, physics_steps
 
 _FITTED = (32, 96)  # windows that fits see
 _STEPS = 9_600  # physics steps in them
@@ -127,10 +126,10 @@ class Analysis:
         )
         self.fit_blocks = np.arange(len(repeated) // BLOCK)
         self.held_blocks = np.arange(len(repeated) // BLOCK, self.predictor.blocks)
-        machine = self.predictor.machine
+        simulator = self.predictor.simulator
         self.channels = measure.channels(
             mj_model,
-            [n.removeprefix("qpos.") for n in machine.state_names[: mj_model.nv]],
+            [n.removeprefix("qpos.") for n in simulator.state_names[: mj_model.nv]],
             self.runs,
             self.noise,
             self.predictor.steps,
@@ -140,7 +139,7 @@ class Analysis:
                 "nothing moves by more than five times its noise over a horizon of "
                 f"{horizon:g} s: record larger or faster motion, or lengthen --horizon"
             )
-        self.step = dt / machine.substeps
+        self.step = dt / simulator.substeps
         self.slack = velocity_slack(fit, self.step)
         self.dropped: set[str] = set()  # found, and then found to say nothing
         self.bounds = bounds_of(space, layout)
@@ -176,7 +175,7 @@ class Analysis:
             *held.values(),
             self.noise,
             self.slack,
-            self.predictor.machine.dt,
+            self.predictor.simulator.dt,
             self.predictor.steps,
             self.predictor.devices,
         )
@@ -222,7 +221,7 @@ class Analysis:
         have all of it, so its share is fitted like the model's own parameters.
         """
         windows, count = self.predictor.windows, len(self.fit_windows)
-        error = error_of_steps(self.m, windows, self.predictor.machine.dt)
+        error = error_of_steps(self.m, windows, self.predictor.simulator.dt)
         mine = measure.squares(error[:count]).mean(0)
         size = float(measure.gap(mine, self.channels.scale))
         if size < _STEPS_SEEN * self.fit_floor:
@@ -501,7 +500,7 @@ class Analysis:
             found: dict[frozenset[str], Model] = {}
             # What was taken out of the best may still be in the others.
             beam = [b for b in beam if len(b.places) <= len(model.places)]
-            most = _LIKELY if self.predictor.machine.wide else None
+            most = _LIKELY if self.predictor.simulator.wide else None
             likely: set[str] = set()  # to be tried beside all sets but the first
             for parent in beam:
                 if parent is not beam[0]:

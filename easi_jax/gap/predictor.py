@@ -19,21 +19,21 @@ import mujoco
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
-from easi_jax import backlash, effects
-from easi_jax.backlash import Rotor
-from easi_jax.contact_pairs import pair_ids
-from easi_jax.distributed import started
-from easi_jax.effect_quantities import EFFECT_TABLE
-from easi_jax.effects import Effects
-from easi_jax.gap.layout import Layout
+from easi_jax.devices.distributed import started
+from easi_jax.devices.mesh import make_mesh, sharded_map
+from easi_jax.devices.runtime import fast_loops, on_cpu, quick_compile
+from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.window_set import Rows, WindowSet
-from easi_jax.machine import Machine
-from easi_jax.mesh import make_mesh, sharded_map
-from easi_jax.model import Model, full_structure
-from easi_jax.parameters import ParameterSpace
-from easi_jax.physics import Physics, arrived_step
-from easi_jax.quantities import scalar_places
-from easi_jax.runtime import fast_loops, on_cpu, quick_compile
+from easi_jax.model import backlash, effects
+from easi_jax.model.backlash import MotorState
+from easi_jax.model.contact_pairs import pair_ids
+from easi_jax.model.effect_catalog import EFFECT_TABLE
+from easi_jax.model.effects import Effects
+from easi_jax.model.mjx_model import Model, full_structure
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.model.quantities import scalar_places
+from easi_jax.simulation.simulator import Simulator
+from easi_jax.simulation.step import Physics, arrived_step
 
 BLOCK = 16  # windows
 _ITEMS = 4  # that a core works on together: many requests ask for few
@@ -63,7 +63,7 @@ _PLAY = ("width", "rotor", "felt")
 def _fields(layout: Layout) -> tuple[str, ...]:
     """Of `Effects`, those that predictions reckon with."""
     varied = {c.field for c in layout.columns}
-    unused = () if effects.touches(varied) else effects.IN_CONTACTS
+    unused = () if effects.has_contact_effects(varied) else effects.IN_CONTACTS
     return tuple(f for f in Effects.__dataclass_fields__ if f not in unused)
 
 
@@ -71,7 +71,7 @@ class Predictor:
     """Errors of open-loop predictions of a fixed set of windows.
 
     Attributes:
-        machine: the model with its own parameters.
+        simulator: the model with its own parameters.
         layout: columns of the effects.
         windows: what is predicted.
         own: number of the model's own parameters; they come first in a vector.
@@ -89,10 +89,10 @@ class Predictor:
         fixed: Mapping[str, float] | None = None,
     ) -> None:
         """``fixed``: what the machine has and MJCF cannot say, by address."""
-        self.machine = Machine(opened(mj_model), space, dt, fixed=fixed)
+        self.simulator = Simulator(opened(mj_model), space, dt, fixed=fixed)
         # Centers of mass move.
-        base = self.machine.base
-        self.machine.base = base.replace(mjx=full_structure(base.mjx))
+        base = self.simulator.base
+        self.simulator.base = base.replace(mjx=full_structure(base.mjx))
         self.layout, self.windows = layout, windows
         self.own = len(space.nominal)
         self.neutral = np.concatenate([np.asarray(space.nominal), layout.neutral])
@@ -192,7 +192,7 @@ class Predictor:
     def model(self, x: jax.Array, play: bool = True) -> Model:
         """The model of a vector ``(n,)``; pure. ``play``: whether drives may have."""
         e = self.layout.effects(x[self.own :])
-        model = self.machine.model(x[: self.own])
+        model = self.simulator.model(x[: self.own])
         present = tuple(f for f in self._fields if play or f not in _PLAY)
         return model.replace(
             mjx=effects.with_effects(model.mjx, e, present),
@@ -207,7 +207,7 @@ class Predictor:
         Where readings are late they are those of other times than the window's.
         """
         e = self.layout.effects(jnp.asarray(x[self.own :], jnp.float32))
-        late = np.asarray(e.late, float) / self.machine.dt
+        late = np.asarray(e.late, float) / self.simulator.dt
         early = windows.led[:, None] * late.max(initial=0.0)  # (W, 1)
         start = windows.row[:, None] - early
         step = np.arange(self.steps + 1)
@@ -265,23 +265,23 @@ class Predictor:
         start as without delays. Where a run only begins, all is later by that delay.
         """
         start_q, ctrl, past, past_q, past_v, seen, speed, led = window
-        machine, e, nv = self.machine, model.effects, self.nv
+        simulator, e, nv = self.simulator, model.effects, self.nv
         assert e is not None
         early = led * jnp.max(e.late)
         start = len(speed) // 2  # its row in both
-        now = start - (early - e.late) / machine.dt  # (nv,)
+        now = start - (early - e.late) / simulator.dt  # (nv,)
         read = _between(seen, now + jnp.arange(self.steps + 1)[:, None])
         v = _between(speed, now[None])[0]
-        q = machine.move(start_q, read[0] - e.bias + moved[:nv])
-        physics = machine.start(q, v + moved[nv:], model).replace(memory=())
+        q = simulator.move(start_q, read[0] - e.bias + moved[:nv])
+        physics = simulator.start(q, v + moved[nv:], model).replace(memory=())
         arrived = effects.command_sequence(
             e.replace(delay=e.delay + early),
             jnp.concatenate([past, ctrl]),
             self._delay_steps,
-            machine.dt,
-            machine.substeps,
+            simulator.dt,
+            simulator.substeps,
         )
-        if effects.turns(model.present):
+        if effects.has_backlash(model.present):
             before = (past_q, past_v)
             physics = self._turned(model, physics, arrived[: len(past)], *before)
 
@@ -292,7 +292,7 @@ class Predictor:
         _, qs = jax.lax.scan(step, physics, arrived[len(past) :])
         # From the start, so that readings are plain numbers also where q is not.
         zero = jnp.zeros(nv)
-        difference = jax.vmap(machine.difference, (None, None, 0, None))
+        difference = jax.vmap(simulator.difference, (None, None, 0, None))
         path = difference(start_q, zero, qs, zero)[:, :nv]
         error = path + e.bias - read[1:]
         turn = 2 * jnp.pi
@@ -304,7 +304,7 @@ class Predictor:
     ) -> Physics:
         """The first state with drives as they turned before, while their joints moved
         as measured."""
-        machine, e = self.machine, model.effects
+        simulator, e = self.simulator, model.effects
         assert e is not None
         drives = backlash.geared(model.mjx)
         if not drives:
@@ -312,7 +312,7 @@ class Predictor:
         at, dof = self._scalar
         still = jnp.full(self.nv, 1e6)  # as heavy as what is not moved
         # Rows of a millisecond would only cost time.
-        every = max(1, round(_ROW / machine.dt))
+        every = max(1, round(_ROW / simulator.dt))
         count = len(qpos) // every
         rows = len(qpos) - every * np.arange(count, 0, -1)
         q = jnp.zeros((count + 1, self.nv))
@@ -321,12 +321,12 @@ class Predictor:
         sent = arrived[len(qpos) - every * count :]
         sent = sent.reshape(count, -1, sent.shape[-1]).mean(1)
 
-        def row(rotor: Rotor, now: tuple) -> tuple:
+        def row(rotor: MotorState, now: tuple) -> tuple:
             u, q, v, before = now
             return backlash.pushes(
                 *(model.mjx, drives, rotor.replace(joint=before), e.width, e.rotor),
                 *(still, (q, v), backlash.sent(model.mjx, u, first.act)),
-                jnp.asarray(every * machine.dt),
+                jnp.asarray(every * simulator.dt),
             ), None
 
         begin = first.rotor.replace(angle=q[0], speed=v[0])

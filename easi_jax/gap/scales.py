@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from easi_jax.contact_pairs import pair_ids, touching
-from easi_jax.drive_forces import drive_forces
+from easi_jax.data.drive_forces import drive_forces
+from easi_jax.data.recording import Run
+from easi_jax.data.windows import fitted_velocity
 from easi_jax.gap.table import Scales
-from easi_jax.recording import Run
-from easi_jax.windows import fitted_velocity
+from easi_jax.model.contact_pairs import pair_ids, touching
 
 _ROWS = 400
 _LONGEST = 0.1  # s

@@ -1,8 +1,8 @@
 """The effects that the workflow knows: names, and what one at a place consists of.
 
 A `Place` is one effect at one joint, actuator, body or at the whole model. Its numbers
-are columns of a long vector that holds every place (`easi_jax.gap.layout`); at their
-neutral values the model is as given. Names and units: the log format's table of
+are columns of a long vector that holds every place (`easi_jax.gap.effect_vector`); at
+their neutral values the model is as given. Names and units: the log format's table of
 effects.
 """
 
@@ -11,66 +11,10 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
-from easi_jax import addresses as language
-from easi_jax.effect_quantities import SHARED
 from easi_jax.errors import UserError
-from easi_jax.parameters import ParameterSpace
-
-EFFECTS = (
-    "coulomb_friction",
-    "stribeck_friction",
-    "viscous_damping",
-    "quadratic_drag",
-    "joint_stiffness",
-    "constant_force",
-    "torque_ripple",
-    "armature",
-    "backlash",
-    "actuator_gain",
-    "actuator_delay",
-    "actuator_lag",
-    "actuator_saturation",
-    "actuator_deadband",
-    "payload_mass",
-    "com_offset",
-    "gravity_tilt",
-    "sensor_bias",
-    "sensor_delay",
-    "contact_friction",
-    "contact_softness",
-)
-
-
-# Named only where they do clearly better than what most machines have.
-RARE = (
-    "stribeck_friction",
-    "quadratic_drag",
-    "joint_stiffness",
-    "torque_ripple",
-    "backlash",
-    "actuator_saturation",
-    "actuator_deadband",
-    "com_offset",
-    "gravity_tilt",
-)
-
-
-# Sizes beyond which an effect is as unlikely as a rare one: a motor is rarely 2.5 times
-# weaker than its data sheet, but may well carry a load that nobody told of.
-_UNUSUAL = {"actuator_gain": (0.4, 2.5), "gravity_tilt": (-0.25, 0.25)}
-
-
-# Effects that are also quantities which a model states and a refit may move.
-REFITTED = {
-    "viscous_damping": ("joint", "damping"),
-    "coulomb_friction": ("joint", "frictionloss"),
-    "joint_stiffness": ("joint", "stiffness"),
-    "armature": ("joint", "armature"),
-    "actuator_gain": ("actuator", "gain"),
-    "actuator_saturation": ("actuator", "force_limit"),
-    "actuator_lag": ("actuator", "time_constant"),
-    "payload_mass": ("body", "mass"),
-}
+from easi_jax.model import addresses as language
+from easi_jax.model.effect_catalog import _UNUSUAL, RARE, REFITTED, SHARED
+from easi_jax.model.parameters import ParameterSpace
 
 
 @dataclass(frozen=True)
@@ -155,7 +99,7 @@ class Scales:
         peak: its largest, but for two rows in 1,000, ``(nu,)``.
         span: range of positions, ``(nv,)``.
         touching: share of rows in which pairs of geoms touch, ``(P,)``
-            (`easi_jax.contact_pairs`).
+            (`easi_jax.model.contact_pairs`).
         dt: control step [s].
         longest: longest delay that is looked for [s].
     """

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from easi_jax.drive_forces import exertion
-from easi_jax.recording import Run
-from easi_jax.windows import fitted_velocity, make_windows
+from easi_jax.data.drive_forces import exertion
+from easi_jax.data.recording import Run
+from easi_jax.data.windows import fitted_velocity, make_windows
 
 _BEFORE = 0.6  # s before a window in which a drive with play finds its side
 _EXTREME = 4  # for so many, one more that has large forces or speeds

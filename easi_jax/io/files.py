@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from easi_jax import distributed
+from easi_jax.devices import distributed
 from easi_jax.errors import UserError
 
 _NON_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}

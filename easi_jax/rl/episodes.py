@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from easi_jax.env import Env, EnvState, Model
-from easi_jax.mesh import sharded_map
+from easi_jax.devices.mesh import sharded_map
 from easi_jax.rl.evaluate import evaluate
 from easi_jax.rl.learner import Info
 from easi_jax.rl.networks import PolicyParams, act
+from easi_jax.simulation.env import Env, EnvState, Model
 
 
 class Tested(NamedTuple):

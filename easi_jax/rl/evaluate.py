@@ -6,8 +6,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from easi_jax.env import Env, Model
 from easi_jax.rl.networks import PolicyParams
+from easi_jax.simulation.env import Env, Model
 
 Act = Callable[[PolicyParams, jax.Array, jax.Array, bool], jax.Array]
 

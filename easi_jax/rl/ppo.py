@@ -23,11 +23,11 @@ from brax.training.agents.ppo.networks import PPONetworks
 from flax import linen
 from jax.sharding import Mesh
 
-from easi_jax.env import Env, EnvState, Model
 from easi_jax.rl.config import PpoConfig
 from easi_jax.rl.episodes import Episodes, Tested, finite, mean_where, raw_key
 from easi_jax.rl.learner import Info
 from easi_jax.rl.networks import PolicyParams, make_networks, standardize
+from easi_jax.simulation.env import Env, EnvState, Model
 
 
 @flax.struct.dataclass

@@ -18,7 +18,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from easi_jax.env import EnvState
+from easi_jax.simulation.env import EnvState
 
 
 @flax.struct.dataclass

@@ -22,12 +22,12 @@ from brax.training import types
 from brax.training.acme import running_statistics
 from jax.sharding import Mesh
 
-from easi_jax.env import Env, EnvState, Model
 from easi_jax.rl.buffer import RingQueue
 from easi_jax.rl.config import SacConfig
 from easi_jax.rl.episodes import Episodes, Tested, finite, mean_where, raw_key
 from easi_jax.rl.learner import Info, Learner, LearnerState
 from easi_jax.rl.networks import PolicyParams, act
+from easi_jax.simulation.env import Env, EnvState, Model
 
 
 @flax.struct.dataclass

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from easi_jax.mesh import make_mesh, sharded_map
+from easi_jax.devices.mesh import make_mesh, sharded_map
 from easi_jax.rl.learner import Info
 from easi_jax.rl.trainer import Trainer
 

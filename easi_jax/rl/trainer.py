@@ -6,13 +6,13 @@ from typing import Any, Protocol
 import jax
 from jax.sharding import Mesh
 
-from easi_jax.env import Env, Model
 from easi_jax.rl.config import PpoConfig, SacConfig
 from easi_jax.rl.episodes import Tested
 from easi_jax.rl.learner import Info
 from easi_jax.rl.networks import PolicyParams
 from easi_jax.rl.ppo import Ppo
 from easi_jax.rl.sac import Sac
+from easi_jax.simulation.env import Env, Model
 
 TrainingConfig = SacConfig | PpoConfig
 

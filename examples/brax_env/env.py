@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from brax import envs as brax_envs
 
-from easi_jax.env import EnvState, advance, start
+from easi_jax.simulation.env import EnvState, advance, start
 from envs.robot import Robot, not_finite
 
 
@@ -30,7 +30,7 @@ class InvertedPendulum(Robot):
 
     def reset(self, model, key):
         q, v = 0.01 * jax.random.uniform(key, (2, 2), minval=-1.0)
-        physics = self.machine.start(q, v)
+        physics = self.simulator.start(q, v)
         return start(physics, self._obs(physics))
 
     def control(self, state, action):

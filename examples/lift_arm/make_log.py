@@ -13,9 +13,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from easi_jax.configuration import Configuration
-from easi_jax.io.logs import write_log
-from easi_jax.recording import Run
+from easi_jax.data.recording import Run
+from easi_jax.io.logs.reader import write_log
+from easi_jax.model.joint_space import Configuration
 
 HERE = Path(__file__).parent
 

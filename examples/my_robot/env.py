@@ -14,12 +14,12 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from easi_jax.action_map import ActionMap
-from easi_jax.env import EnvState, advance, start
-from easi_jax.model import Model
-from easi_jax.physics import Physics
+from easi_jax.model.mjx_model import Model
 from easi_jax.rl.config import SacConfig
 from easi_jax.rl.trainer import TrainingConfig
+from easi_jax.simulation.action_map import ActionMap
+from easi_jax.simulation.env import EnvState, advance, start
+from easi_jax.simulation.step import Physics
 from envs.robot import Robot, not_finite
 
 LINK = 0.3  # m
@@ -79,7 +79,7 @@ class TwoLink(Robot):
         del model
         at, speed = jax.random.split(key)
         qpos = jax.random.uniform(at, (2,), minval=-jnp.pi, maxval=jnp.pi)
-        physics = self.machine.start(qpos, 0.1 * jax.random.normal(speed, (2,)))
+        physics = self.simulator.start(qpos, 0.1 * jax.random.normal(speed, (2,)))
         return start(physics, _observe(physics))
 
     def control(self, state: EnvState, action: jax.Array) -> jax.Array:

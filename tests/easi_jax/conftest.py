@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from easi_jax import rollout
-from easi_jax.segments import Segments
+from easi_jax.data.segments import Segments
+from easi_jax.simulation import rollout
 from envs.cartpole import Cartpole
 
 

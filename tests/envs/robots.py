@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from easi_jax.machine import Machine
+from easi_jax.simulation.simulator import Simulator
 from envs import REGISTRY, load, make
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -70,11 +70,11 @@ CASES = {
 assert set(REGISTRY) <= set(CASES), "a robot is not tested"
 
 
-def converged(env: Any) -> Machine:
+def converged(env: Any) -> Simulator:
     """The robot with a solver that goes to the end, as C's does below."""
     m = env.mj_model.__copy__()
     m.opt.iterations = 100
-    return env.machine.rebuilt(m)
+    return env.simulator.rebuilt(m)
 
 
 def spec_of(env: Any) -> mujoco.MjSpec:
@@ -102,7 +102,7 @@ def compiled(env: Any, values: dict[str, float]) -> tuple[mujoco.MjModel, np.nda
                     _WRITE[kind, quantity](o, values[p.name])
     m = spec.compile()
     m.opt.iterations, m.opt.ls_iterations, m.opt.tolerance = 100, 50, 1e-14
-    m.opt.timestep = env.machine.dt / env.machine.substeps
+    m.opt.timestep = env.simulator.dt / env.simulator.substeps
     return m, limit
 
 
@@ -181,7 +181,7 @@ def c_rollout(
     out = []
     for u in ctrl:
         d.ctrl[:] = u
-        for _ in range(env.machine.substeps):
+        for _ in range(env.simulator.substeps):
             mujoco.mj_step(m, d)
             d.qvel[:] = np.clip(d.qvel, -limit, limit)
         out.append(np.concatenate([d.qpos, d.qvel]))

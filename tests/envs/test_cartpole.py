@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from easi_jax.env import EnvState
+from easi_jax.simulation.env import EnvState
 from envs.cartpole import Cartpole, space
 
 
@@ -26,7 +26,7 @@ def step(env: Cartpole) -> Any:
 
         def one(s: jax.Array, a: jax.Array) -> EnvState:
             start = env.reset(model, jax.random.key(0))
-            physics = env.machine.start(s[:2], s[2:])
+            physics = env.simulator.start(s[:2], s[2:])
             return env.step(model, start.replace(physics=physics, count=count), a)
 
         return jax.vmap(one)(states, actions)
@@ -68,7 +68,7 @@ def test_reward_and_end(step: Any) -> None:
 
 
 def test_observation_is_position_speed_angle_rate(env: Cartpole) -> None:
-    physics = env.machine.start(jnp.array([1.0, 3.0]), jnp.array([2.0, 4.0]))
+    physics = env.simulator.start(jnp.array([1.0, 3.0]), jnp.array([2.0, 4.0]))
     np.testing.assert_array_equal(env.observe(physics), [1, 2, 3, 4])
     assert env.obs_names == ("x", "v", "angle", "rate")
 
@@ -116,11 +116,11 @@ def test_every_parameter_changes_the_motion(env: Cartpole) -> None:
     def end(theta: jax.Array) -> jax.Array:
         model = env.model(theta)
         # To reach the force limit, the speed limit and stick alike.
-        start = env.machine.start(jnp.array([-0.19, 0.2]), jnp.array([0.0, 1.0]))
+        start = env.simulator.start(jnp.array([-0.19, 0.2]), jnp.array([0.0, 1.0]))
         ctrl = jnp.array([0.2] * 25 + [-0.2] * 5)[:, None]
 
         def step(s: Any, u: jax.Array) -> Any:
-            s = env.machine.step(model, s, u)
+            s = env.simulator.step(model, s, u)
             return s, jnp.concatenate([s.qpos, s.qvel])
 
         return jax.lax.scan(step, start, ctrl)[1]

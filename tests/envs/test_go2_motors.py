@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from easi_jax.errors import UserError
-from easi_jax.pipeline import Pipeline, PipelineConfig
+from easi_jax.pipeline.stages import Pipeline, PipelineConfig
 from envs import make, open_env
 from envs.go2 import MOTOR, motor_curve
 
@@ -39,8 +39,8 @@ def kicked() -> Any:
         env = make("go2", torque_speed=curve)
         qpos, qvel = _start(env)
         model = env.model()
-        step = jax.jit(env.machine.step)
-        state, states = env.machine.start(qpos, qvel), []
+        step = jax.jit(env.simulator.step)
+        state, states = env.simulator.start(qpos, qvel), []
         for u in _commands(env):
             state = step(model, state, jnp.asarray(u, jnp.float32))
             states.append(np.concatenate([state.qpos, state.qvel]))
@@ -67,7 +67,7 @@ def test_equals_mujoco_c_with_limits_set_before_each_step(kicked: Any) -> None:
     d.qpos[:], d.qvel[:] = _start(env)
     for u, ours in zip(_commands(env), kicked[True], strict=True):
         d.ctrl[:] = u
-        for _ in range(env.machine.substeps):
+        for _ in range(env.simulator.substeps):
             limits = np.asarray(curve.limits(jnp.asarray(d.qvel)))
             m.actuator_forcerange[:, 0] = np.maximum(own[:, 0], limits[:, 0])
             m.actuator_forcerange[:, 1] = np.minimum(own[:, 1], limits[:, 1])
@@ -81,7 +81,7 @@ def test_the_curve_changes_a_fast_motion(kicked: Any) -> None:
 
 def test_options_by_name_and_their_mistakes() -> None:
     full = open_env("go2", None, ("parameters=full", "torque_speed=true"))
-    assert full.space.size == 25 and full.machine.base.torque_speed is not None
+    assert full.space.size == 25 and full.simulator.base.torque_speed is not None
     for options, said in (
         (("parameter=full",), 'no option "parameter"'),
         (("full",), "write NAME=VALUE"),
@@ -100,6 +100,6 @@ def test_options_by_name_and_their_mistakes() -> None:
 def test_a_search_simulates_the_motors_too() -> None:
     env = make("go2", torque_speed=True)
     pipe = Pipeline(env, PipelineConfig(), start=(0.5, 2.0))
-    assert pipe.machine.base.torque_speed is not None
+    assert pipe.simulator.base.torque_speed is not None
     ant = Pipeline(make("ant"), PipelineConfig())
-    assert ant.machine.base.sense_size == make("ant").machine.base.sense_size > 0
+    assert ant.simulator.base.sense_size == make("ant").simulator.base.sense_size > 0

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from easi_jax.rollout import policy_rollout
+from easi_jax.simulation.rollout import policy_rollout
 from tests.envs.robots import CASES, c_rollout, converged
 from train._robots import search_config
 
@@ -47,7 +47,7 @@ def runs(request: pytest.FixtureRequest) -> Runs:
     factors = 1 + (CHANGE - 1) * np.eye(env.space.size)
     thetas = np.concatenate([nominal[None], nominal * factors])
     with jax.enable_x64(True):
-        machine = converged(env)
+        simulator = converged(env)
         first = env.reset(env.model(), jax.random.key(2)).physics
         start = case.start or (first.qpos, first.qvel)
         start = tuple(np.asarray(x, float) for x in start)
@@ -55,14 +55,14 @@ def runs(request: pytest.FixtureRequest) -> Runs:
         @jax.jit
         def simulate(thetas: jax.Array, ctrl: jax.Array) -> jax.Array:
             def one(theta: jax.Array) -> jax.Array:
-                model = machine.model(theta)
+                model = simulator.model(theta)
 
                 def step(state: Any, u: jax.Array) -> Any:
-                    state = machine.step(model, state, u)
+                    state = simulator.step(model, state, u)
                     return state, jnp.concatenate([state.qpos, state.qvel])
 
                 return jax.lax.scan(
-                    step, machine.start(*map(jnp.asarray, start)), ctrl
+                    step, simulator.start(*map(jnp.asarray, start)), ctrl
                 )[1]
 
             return jax.vmap(one)(thetas)

@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from easi_jax.io.logs import read_logs
-from easi_jax.io.parameter_file import read_parameter_file
-from easi_jax.recording import physics_steps
-from easi_jax.windows import make_windows
+from easi_jax.data.recording import physics_steps
+from easi_jax.data.windows import make_windows
+from easi_jax.io.logs.reader import read_logs
+from easi_jax.io.models.parameter_file import read_parameter_file
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "lift_arm"
 LOGS = [EXAMPLE / "sweep.csv", EXAMPLE / "moves.csv"]

@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from easi_jax.io.logs import read_logs
-from easi_jax.io.parameter_file import read_parameter_file
+from easi_jax.io.logs.reader import read_logs
+from easi_jax.io.models.parameter_file import read_parameter_file
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "lift_arm"

@@ -15,11 +15,11 @@ import yaml
 from PIL import Image
 
 from easi_jax.errors import UserError
-from easi_jax.io import checkpoints
-from easi_jax.io.video import render
-from easi_jax.pipeline import Pipeline, PipelineConfig, seed_keys
+from easi_jax.io.report.video import render
+from easi_jax.io.runs import checkpoints
+from easi_jax.pipeline.stages import Pipeline, PipelineConfig, seed_keys
 from easi_jax.rl.networks import act
-from easi_jax.search import SearchState
+from easi_jax.search.easi import SearchState
 from envs import make
 from tests.commands import command, refused
 from train import easi, evaluate, export, pipeline, udr

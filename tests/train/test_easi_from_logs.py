@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from easi_jax import identify
+from easi_jax.estimation import posterior
 from tests.commands import refused
 from train import _command, easi, evaluate
 
@@ -316,9 +316,9 @@ def test_non_finite_simulations_stop_the_search(files, capsys):
 @pytest.mark.fault("simulations that explode, parameters at absurd corners")
 def test_a_result_that_is_no_number_is_an_error(files, capsys, monkeypatch):
     """Whatever makes it; once it was a singular system, and training went on."""
-    made = identify.gaussian
+    made = posterior.gaussian
     monkeypatch.setattr(
-        identify, "gaussian", lambda space, mean, cov: made(space, mean + np.nan, cov)
+        posterior, "gaussian", lambda space, mean, cov: made(space, mean + np.nan, cov)
     )
     with pytest.raises(SystemExit) as stop:
         call(*arguments(files))
@@ -349,7 +349,7 @@ def test_a_fit_on_some_of_the_logs_ends_where_all_have_it(files, capsys, monkeyp
     found = {}
     for some in (False, True):
         if some:
-            monkeypatch.setattr(identify, "few", lambda _, pieces: pieces.spread(6))
+            monkeypatch.setattr(posterior, "few", lambda _, pieces: pieces.spread(6))
         call(*arguments(files, "--overwrite"))
         said = capsys.readouterr().out
         assert said.count("least-squares finish") == 3

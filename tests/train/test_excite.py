@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from easi_jax.io.logs import read_logs
+from easi_jax.io.logs.reader import read_logs
 from train import excite
 from train._command import main
 

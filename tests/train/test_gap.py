@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from easi_jax.errors import UserError
-from easi_jax.found_effects import FoundEffects, machine_with
-from easi_jax.gap.journal import Journal
-from easi_jax.gap.selection import Selector
-from easi_jax.io.effects_file import read_effects
-from easi_jax.machine import Machine
-from easi_jax.parameters import ParameterSpace
+from easi_jax.gap.forward_selection import Selector
+from easi_jax.io.models.effects_file import read_effects
+from easi_jax.io.runs.step_cache import Journal
+from easi_jax.model.found_effects import FoundEffects
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation.simulator import Simulator
+from easi_jax.simulation.with_effects import simulator_with
 from envs import make
 from tests.gap_cases import Effect, make_case
 from train import gap
@@ -94,9 +95,9 @@ def test_the_repaired_model_loads_and_has_it(case: Any, results: Path) -> None:
     added = m.dof_frictionloss[0] - old.dof_frictionloss[0]
     assert added == pytest.approx(torque, rel=1e-3)
     entries, own = read_effects(results / "effects.yaml")
-    bare = Machine(old, ParameterSpace(()), 0.01)
-    machine = machine_with(bare, FoundEffects(tuple(entries)))
-    effects = machine.model(jnp.asarray(machine.space.nominal)).effects
+    bare = Simulator(old, ParameterSpace(()), 0.01)
+    simulator = simulator_with(bare, FoundEffects(tuple(entries)))
+    effects = simulator.model(jnp.asarray(simulator.space.nominal)).effects
     assert effects is not None
     np.testing.assert_allclose(effects.coulomb, [torque], rtol=1e-5)
     assert set(own) == {r["address"] for r in told["refitted"]}
@@ -274,8 +275,8 @@ def test_a_built_in_robot_keeps_what_its_xml_cannot_say() -> None:
     fixed = beyond_mjcf(make("cartpole").space)
     assert fixed == {"joint.cart.speed_limit": 0.6}
     assert beyond_mjcf(make("ant").space) == {}
-    machine = Machine(env.mj_model, ParameterSpace(()), env.dt, fixed=fixed)
-    model = machine.model(jnp.zeros(0))
+    simulator = Simulator(env.mj_model, ParameterSpace(()), env.dt, fixed=fixed)
+    model = simulator.model(jnp.zeros(0))
     np.testing.assert_allclose(model.speed_limit, env.model().speed_limit)
 
 
@@ -288,4 +289,4 @@ def test_what_a_parameter_sets_is_not_fixed_beside_it() -> None:
     for own, left in ((some, {address}), (space, set())):
         problem = GapProblem(model, own, [], [], "", [], None, [], [])
         assert problem.fixed.keys() == left
-        Machine(model.mj_model, own, 0.02, fixed=problem.fixed)
+        Simulator(model.mj_model, own, 0.02, fixed=problem.fixed)

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import yaml
 
-from easi_jax.gap.places import places
+from easi_jax.data.cleaning import true_readings
+from easi_jax.gap.candidates import places
 from easi_jax.gap.scales import scales_of
 from easi_jax.gap.table import covered
-from easi_jax.io.effects_file import read_effects
-from easi_jax.io.logs import read_logs
-from easi_jax.log_data import true_readings
-from easi_jax.parameters import Parameter, ParameterSpace
+from easi_jax.io.logs.reader import read_logs
+from easi_jax.io.models.effects_file import read_effects
+from easi_jax.model.parameters import Parameter, ParameterSpace
 from tests.commands import command, read, refused
 from tests.gap_cases import Stated, make_case
 from train import gap, udr
@@ -179,19 +179,19 @@ def test_what_the_models_own_steps_do_is_no_effect(
 ) -> None:
     """A model of 2 ms, beside what takes smaller steps, or the same."""
     (tmp_path / "model.xml").write_text(COARSE)
-    machine = mujoco.MjModel.from_xml_string(COARSE)
-    machine.opt.timestep = 0.01 / steps
+    simulator = mujoco.MjModel.from_xml_string(COARSE)
+    simulator.opt.timestep = 0.01 / steps
     for run in range(3):
         rng = np.random.default_rng(run)
         rates, phases = rng.uniform(1.0, 12.0, 6), rng.uniform(0, 6.3, 6)
-        data = mujoco.MjData(machine)
+        data = mujoco.MjData(simulator)
         lines = ["time,qpos.hinge,ctrl.motor"]
         for row in range(600):
             at = 0.01 * row
             data.ctrl[0] = 0.5 * np.sin(rates * at + phases).sum()
             seen = data.qpos[0] + rng.normal(0, 1e-4)
             lines.append(f"{at:.4f},{seen:.9g},{data.ctrl[0]:.9g}")
-            mujoco.mj_step(machine, data, steps)
+            mujoco.mj_step(simulator, data, steps)
         (tmp_path / f"run{run}.csv").write_text("\n".join([*lines, ""]))
     logs = sorted(tmp_path.glob("run*.csv"))
     out = tmp_path / "out"

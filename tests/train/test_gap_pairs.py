@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from easi_jax.gap import analysis
-from easi_jax.gap.places import places
-from easi_jax.io.effects_file import read_effects
+from easi_jax.gap.candidates import places
+from easi_jax.io.models.effects_file import read_effects
 from tests.commands import command, read
 from train import gap
 
@@ -92,10 +92,10 @@ def test_friction_of_one_foot_among_all_effects(tmp_path: Path) -> None:
 def named(left: float, right: float, tmp_path: Path) -> tuple[Any, Path]:
     model = tmp_path / "robot.xml"
     model.write_text(xml(0.6, 0.6))
-    machine = mujoco.MjModel.from_xml_string(xml(left, right))
+    simulator = mujoco.MjModel.from_xml_string(xml(left, right))
     logs = [tmp_path / f"run{i}.csv" for i in range(2)]
     for i, path in enumerate(logs):
-        write_log(path, machine, i)
+        write_log(path, simulator, i)
     out = tmp_path / "out"
     command(gap, "--model", model, "--data", *logs, "--out", out)
     return read(out / "gap.json"), out

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from benchmarks.fuzz_readers import harmless
-from easi_jax.gap.readings import ReadingFault
-from easi_jax.io.gap_figures import residual_maps
-from easi_jax.io.report import Picture
+from easi_jax.gap.sensor_faults import ReadingFault
+from easi_jax.io.report.gap_figures import residual_maps
+from easi_jax.io.report.html import Picture
 from train import _gap_results
 from train.gap import Config
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from easi_jax.gap import analysis
-from easi_jax.gap.places import places
-from easi_jax.io.effects_file import read_effects
+from easi_jax.gap.candidates import places
+from easi_jax.io.models.effects_file import read_effects
 from tests.commands import command, read
 from train import gap
 

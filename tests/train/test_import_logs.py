@@ -14,11 +14,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from easi_jax.data.recording import Run
 from easi_jax.errors import UserError
 from easi_jax.io.importers.minari import read_minari
 from easi_jax.io.importers.streams import Selection
-from easi_jax.io.logs import read_logs
-from easi_jax.recording import Run
+from easi_jax.io.logs.reader import read_logs
 from tests.commands import command, refused
 from tests.documented import ROOT
 from tests.recordings import (

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import pytest
 
 import envs
-from easi_jax import runtime
-from easi_jax.physics import control_step
+from easi_jax.devices import runtime
+from easi_jax.simulation.step import control_step
 from train.info import measures
 
 ROOT = Path(__file__).parents[2]
@@ -80,17 +80,17 @@ def test_each_lost_measure_is_a_no(change, printed, name):
 def test_a_batch_of_simulations_runs_in_one_piece():
     """Else each step of each substep is many calls, and takes five times as long."""
     env = envs.make("cartpole")
-    machine = env.machine
+    simulator = env.simulator
     model = env.model()
     start = env.reset(model, jax.random.key(0)).physics
-    batch = jax.tree.map(lambda x: jnp.stack([x] * machine.batch), start)
+    batch = jax.tree.map(lambda x: jnp.stack([x] * simulator.batch), start)
 
     @jax.jit
     def go(states, ctrl):
-        step = jax.vmap(lambda s: control_step(model, s, ctrl, machine.substeps))
+        step = jax.vmap(lambda s: control_step(model, s, ctrl, simulator.substeps))
         return jax.lax.scan(lambda s, _: (step(s), None), states, None, length=20)[0]
 
-    program = go.lower(batch, jnp.zeros(machine.mj_model.nu))
+    program = go.lower(batch, jnp.zeros(simulator.mj_model.nu))
     text = program.compile(runtime.fast_loops()).as_text()
     assert "xla_cpu_small_call" in text
 

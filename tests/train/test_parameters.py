@@ -6,8 +6,8 @@ from pathlib import Path
 import mujoco
 import pytest
 
-from easi_jax.io.parameter_file import read_parameter_file
-from easi_jax.proposal import propose
+from easi_jax.io.models.parameter_file import read_parameter_file
+from easi_jax.model.parameter_proposal import propose
 from train import parameters
 from train._command import main
 from train._log_problem import load_model

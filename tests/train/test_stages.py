@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from easi_jax.errors import UserError
-from easi_jax.io.metrics import read_metrics
-from easi_jax.io.runs import RunFolder
+from easi_jax.io.runs.folder import RunFolder
+from easi_jax.io.runs.metrics import read_metrics
 from train._stages import found_check, run_stage
 
 
@@ -37,7 +37,7 @@ def test_metrics_of_a_stage_that_goes_on(
                 per_step=per_step,
             )
 
-    from easi_jax.io import checkpoints
+    from easi_jax.io.runs import checkpoints
 
     save = checkpoints.save
 

@@ -18,8 +18,8 @@ from easi_jax.io.importers.pace import read_pace
 from easi_jax.io.importers.ros import read_ros
 from easi_jax.io.importers.streams import Recording, Selection
 from easi_jax.io.importers.table import to_table
-from easi_jax.io.log_tables import write_table
-from easi_jax.io.logs import read_logs
+from easi_jax.io.logs.reader import read_logs
+from easi_jax.io.logs.tables import write_table
 
 Extension = Literal["csv", "parquet", "npz"]
 _KINDS = (

@@ -8,7 +8,7 @@ import mujoco
 from easi_jax.errors import UserError, nearest
 from easi_jax.io.importers.mapping import ImportMapping
 from easi_jax.io.importers.streams import Recording, Stream, listed
-from easi_jax.io.log_columns import LogColumns, log_columns
+from easi_jax.io.logs.columns import LogColumns, log_columns
 
 _KINDS = {
     mujoco.mjtJoint.mjJNT_FREE: "free",

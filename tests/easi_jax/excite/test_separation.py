@@ -6,16 +6,16 @@ import mujoco
 import numpy as np
 import pytest
 
-from easi_jax.configuration import Configuration
+from easi_jax.data.cleaning import rows_of
+from easi_jax.data.recording import Run
 from easi_jax.excite import candidates, choose, drives, play, separation
 from easi_jax.excite import evaluate as ev
 from easi_jax.excite.propose import propose, quick_tests
-from easi_jax.gap.fit import bounds_of, least_squares, lockstep
-from easi_jax.gap.own import own_space
-from easi_jax.gap.residuals import make_residuals, start_sensitivity, velocity_slack
+from easi_jax.gap.batched_least_squares import bounds_of, least_squares, lockstep
 from easi_jax.gap.scales import scales_of
-from easi_jax.log_data import rows_of
-from easi_jax.recording import Run
+from easi_jax.gap.whitening import make_residuals, start_sensitivity, velocity_slack
+from easi_jax.model.joint_space import Configuration
+from easi_jax.model.parameter_proposal import own_space
 
 XML = """
 <mujoco>
@@ -118,7 +118,7 @@ class Case:
             (windows,) = ev.windows_of([drawn], HORIZON, self.scales.longest, 999)
             windows = windows.take(np.arange(0, len(windows), 2))
             p, x = self.predictor.on(windows), self.predictor.neutral
-            slack = velocity_slack([run], p.machine.dt / 2)
+            slack = velocity_slack([run], p.simulator.dt / 2)
             slope = start_sensitivity(p, x, np.array([NOISE, 0.05]), None)
             residuals = make_residuals(
                 windows, [drawn], slope, self.noise, slack, np.zeros(1), np.ones(1)

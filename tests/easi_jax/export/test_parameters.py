@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from easi_jax import distribution
 from easi_jax.errors import UserError
 from easi_jax.export.mjcf import identified_model
 from easi_jax.export.randomization import (
@@ -20,10 +19,11 @@ from easi_jax.export.randomization import (
     read_randomization,
     to_yaml,
 )
-from easi_jax.found_effects import EffectEntry
-from easi_jax.in_mujoco import InMujoco
-from easi_jax.machine import Machine
-from easi_jax.parameters import ParameterSpace, declare
+from easi_jax.model import distribution
+from easi_jax.model.found_effects import EffectEntry
+from easi_jax.model.parameters import ParameterSpace, declare
+from easi_jax.simulation.mujoco_c import InMujoco
+from easi_jax.simulation.simulator import Simulator
 from envs import make
 from train._results import distribution_json, seed_result
 
@@ -52,11 +52,11 @@ def test_the_model_moves_as_identified(robot: str, tmp_path: Path) -> None:
     env = make(robot)
     unit = np.random.default_rng(0).uniform(0.2, 0.8, env.space.size)
     theta = np.asarray(env.space.to_si(unit), float)
-    model = identified_model(source(robot), env.machine, theta)
+    model = identified_model(source(robot), env.simulator, theta)
     assert model.left == (["cart_speed_limit"] if robot == "cartpole" else [])
     (tmp_path / "model.xml").write_text(model.xml)
     got = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
-    want = InMujoco(env.machine).at(np.asarray(env.space.to_unit(theta), float))
+    want = InMujoco(env.simulator).at(np.asarray(env.space.to_unit(theta), float))
     given = mujoco.MjModel.from_xml_path(str(source(robot)))
     given.opt.timestep = want.opt.timestep
     np.testing.assert_allclose(moved(got)[:20], moved(want)[:20], atol=2e-3)
@@ -66,7 +66,7 @@ def test_the_model_moves_as_identified(robot: str, tmp_path: Path) -> None:
 def test_effects_are_in_the_model_where_mjcf_has_a_word() -> None:
     env = make("cartpole")
     theta = np.asarray(env.space.nominal, float)
-    model = identified_model(source("cartpole"), env.machine, theta, [FRICTION, LATE])
+    model = identified_model(source("cartpole"), env.simulator, theta, [FRICTION, LATE])
     assert model.left == ["cart_speed_limit", "sensor_delay@cart"]
     m = mujoco.MjModel.from_xml_string(model.xml)
     own = theta[env.space.names.index("pole_friction")]
@@ -76,7 +76,7 @@ def test_effects_are_in_the_model_where_mjcf_has_a_word() -> None:
 def test_a_foreign_model_is_refused() -> None:
     env = make("cartpole")
     with pytest.raises(UserError, match="not the model"):
-        identified_model(source("ant"), env.machine, np.asarray(env.space.nominal))
+        identified_model(source("ant"), env.simulator, np.asarray(env.space.nominal))
 
 
 def found(space: ParameterSpace, mean: Any, cov: Any) -> dict[str, Any]:
@@ -175,4 +175,4 @@ def test_a_machine_without_the_address_is_refused(given) -> None:
     other = make("ballbalance").mj_model
     with pytest.raises(UserError):
         domain_randomizer(path, other)
-    assert Machine(make("cartpole").mj_model, given[0], 0.02).space.size == 3
+    assert Simulator(make("cartpole").mj_model, given[0], 0.02).space.size == 3

@@ -18,8 +18,8 @@ from benchmarks.export import (
     observations,
     onnx_session,
 )
-from easi_jax.env import start
 from easi_jax.export.policy import interface_of, to_onnx, to_stablehlo
+from easi_jax.simulation.env import start
 from envs import REGISTRY, load, make
 
 ROOT = Path(__file__).parents[3]

@@ -6,15 +6,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from easi_jax.configuration import Configuration
-from easi_jax.gap.layout import Layout
-from easi_jax.gap.places import places
+from easi_jax.data.recording import Run
+from easi_jax.data.windows import fitted_velocity
+from easi_jax.gap.candidates import places
+from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.scales import scales_of
 from easi_jax.gap.window_set import window_set
-from easi_jax.parameters import ParameterSpace
-from easi_jax.recording import Run
-from easi_jax.windows import fitted_velocity
+from easi_jax.model.joint_space import Configuration
+from easi_jax.model.parameters import ParameterSpace
 
 # A second joint, which the first moves, or none.
 ARM = """

@@ -7,17 +7,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from easi_jax.configuration import Configuration
-from easi_jax.gap import measure
-from easi_jax.gap.evidence import (
-    advantage,
-    better,
-    explained,
-    probability,
-    rank,
-    simplest,
-)
-from easi_jax.gap.fit import (
+from easi_jax.data.recording import Run, physics_steps
+from easi_jax.data.windows import fitted_velocity
+from easi_jax.gap import gap_metric as measure
+from easi_jax.gap.batched_least_squares import (
     Bounds,
     Fitted,
     bounds_of,
@@ -25,26 +18,34 @@ from easi_jax.gap.fit import (
     lockstep,
     window_weights,
 )
-from easi_jax.gap.layout import Layout
-from easi_jax.gap.models import Candidate, Model
-from easi_jax.gap.outcome import for_people
-from easi_jax.gap.own_steps import error_of_steps, within_a_step
-from easi_jax.gap.places import places, ripples
+from easi_jax.gap.candidates import places, ripples
+from easi_jax.gap.discretization_error import error_of_steps, within_a_step
+from easi_jax.gap.effect_set import Candidate, Model
+from easi_jax.gap.effect_vector import Layout
+from easi_jax.gap.forward_selection import Selector, as_sine, shortlist
+from easi_jax.gap.model_comparison import (
+    advantage,
+    better,
+    explained,
+    probability,
+    rank,
+    simplest,
+)
 from easi_jax.gap.predictor import BLOCK, Predictor
-from easi_jax.gap.residuals import (
+from easi_jax.gap.result import for_people
+from easi_jax.gap.scales import scales_of
+from easi_jax.gap.sensor_faults import velocity_lags
+from easi_jax.gap.table import Place
+from easi_jax.gap.whitening import (
     Residuals,
     make_residuals,
     start_sensitivity,
     step_groups,
 )
-from easi_jax.gap.scales import scales_of
-from easi_jax.gap.selection import Selector, as_sine, shortlist
-from easi_jax.gap.table import EFFECTS, Place
-from easi_jax.gap.velocities import velocity_lags
 from easi_jax.gap.window_set import window_set
-from easi_jax.parameters import ParameterSpace
-from easi_jax.recording import Run, physics_steps
-from easi_jax.windows import fitted_velocity
+from easi_jax.model.effect_catalog import EFFECTS
+from easi_jax.model.joint_space import Configuration
+from easi_jax.model.parameters import ParameterSpace
 
 PENDULUM = """
 <mujoco>

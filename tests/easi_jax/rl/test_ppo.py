@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from jax.sharding import Mesh
 
+from easi_jax.devices.mesh import make_mesh
 from easi_jax.errors import UserError
-from easi_jax.mesh import make_mesh
 from easi_jax.rl import Ppo, PpoConfig, act, init_seeds, run_seeds
 from easi_jax.rl.probes import Probe, probe_models
 

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from easi_jax.env import EnvState
 from easi_jax.errors import UserError
 from easi_jax.rl import Sac, SacConfig, act
 from easi_jax.rl.episodes import Episodes
 from easi_jax.rl.probes import Probe, probe_models
+from easi_jax.simulation.env import EnvState
 
 OBS = jnp.array([[-1.0], [1.0]])
 GAMMA = 0.8

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from easi_jax.io import checkpoints
-from easi_jax.mesh import make_mesh
+from easi_jax.devices.mesh import make_mesh
+from easi_jax.io.runs import checkpoints
 from easi_jax.rl import Sac, SacConfig, act, evaluate, train_seeds
 from easi_jax.rl.probes import Probe, probe_models
 

@@ -1,0 +1,2 @@
+"""From a recording to pieces: runs, cleaning, noise, resampling, windows, what is held
+out."""

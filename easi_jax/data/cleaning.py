@@ -1,0 +1,259 @@
+"""Measured runs as data of a search: noise, splits, segments, open-loop error."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from easi_jax.data.noise import _JITTER, _USUAL, estimate_noise
+from easi_jax.data.recording import Run
+from easi_jax.data.resampling import Rows, mean_held, resampled
+from easi_jax.data.windows import fitted_velocity
+from easi_jax.model import addresses
+from easi_jax.model.found_effects import EffectEntry
+
+_STEPS_AGREE = 1e-3
+_AGREES = 0.1
+_ODD = 20.0  # times the noise
+_ODD_ALONE = 3.0  # times the largest of the others
+_FEWEST = 5  # rows between two leaps, of which a velocity can be told
+_RETURNS = 0.1  # of a spike, which the reading after it is off at most
+_ODD_ROWS = 3  # left out at either end, at most
+_ODD_MINIMUM = 30  # rows of a run that can tell
+
+
+def without_odd_ends(
+    runs: Sequence[Run], noise: np.ndarray
+) -> tuple[list[Run], list[str]]:
+    """Runs without first or last rows that the rows beside them cannot follow.
+
+    Recorders often start with a stale or half-initialized reading. An end row is left
+    out where its third difference is far beyond the noise ``(2 nv,)`` and beyond every
+    other one of the run, at most `_ODD_ROWS` at either end.
+    """
+    out, odd = [], []
+    for run in runs:
+        first, last = 0, len(run)
+        while first < _ODD_ROWS and _odd_start(run.qpos[first:last], run, noise):
+            first += 1
+        while len(run) - last < _ODD_ROWS and _odd_start(
+            run.qpos[first:last][::-1], run, noise
+        ):
+            last -= 1
+        odd += [f"the first {first} of {run.name}"] * (first > 0)
+        odd += [f"the last {len(run) - last} of {run.name}"] * (last < len(run))
+        out.append(rows_of(run, first, last))
+    if not odd:
+        return out, []
+    return out, [
+        f"rows left out, for the rows beside them do not follow from their "
+        f"positions (a stale first reading?): {', '.join(odd)}"
+    ]
+
+
+def _odd_start(qpos: np.ndarray, run: Run, noise: np.ndarray) -> bool:
+    """Whether the first row of ``qpos (T, nq)`` stands apart from all others."""
+    scalar = run.configuration
+    x = qpos[:, list(scalar.scalar_qpos)]
+    if len(x) < _ODD_MINIMUM:
+        return False
+    jerk = np.abs(np.diff(x, 3, axis=0))
+    limit = np.maximum(
+        _ODD * math.sqrt(20.0) * noise[list(scalar.scalar_qvel)],  # binomial(6, 3)
+        _ODD_ALONE * jerk[_ODD_ROWS + 1 : -_ODD_ROWS].max(0),
+    )
+    return bool(np.any(jerk[0] > limit))
+
+
+def split_at_resets(
+    runs: Sequence[Run], noise: np.ndarray
+) -> tuple[list[Run], list[str]]:
+    """Runs cut where a position leaps from one row to the next, as in a reset.
+
+    A leap lies far outside of the steps before and after it, which neither motion nor
+    an impact does: the positions of an impact still follow from each other. Rows with a
+    wild velocity are left out as well: one that the next row takes back, and that the
+    positions know nothing of. Velocities that were derived are derived again.
+
+    Args:
+        noise: of positions and velocities, ``(2 nv,)``.
+
+    Returns:
+        The runs, and a note where there are more than before.
+    """
+    out, cut = [], []
+    for run in runs:
+        at = _leaps(run, noise)
+        pieces = np.split(np.arange(len(run)), at + 1)
+        whole = [p for p in pieces if len(p) >= _FEWEST]
+        if not len(at) or not whole:
+            out.append(run)
+            continue
+        cut.append(f"{run.name} at {', '.join(f'{t:.6g} s' for t in run.time[at[:3]])}")
+        cut[-1] += ", ..." if len(at) > 3 else ""
+        derived = _derived(run)
+        for k, p in enumerate(whole, 1):
+            part = rows_of(run, int(p[0]), int(p[-1]) + 1)
+            if derived.any():
+                speed = fitted_velocity(part.qpos, part.dt, part.configuration)
+                part = replace(part, qvel=np.where(derived, speed, part.qvel))
+            name = f"{run.name}/{k}" if len(whole) > 1 else run.name
+            out.append(replace(part, name=name))
+    if not cut:
+        return out, []
+    return out, [
+        "readings leap from one row to the next (a reset, or a bad reading), so runs "
+        f"were cut there: {'; '.join(cut)}"
+    ]
+
+
+def _derived(run: Run) -> np.ndarray:
+    """Which velocities were derived from the positions, ``(nv,)``."""
+    if run.qvel_measured:
+        return np.zeros(run.qvel.shape[1], bool)
+    return (run.qvel == fitted_velocity(run.qpos, run.dt, run.configuration)).all(0)
+
+
+def _leaps(run: Run, noise: np.ndarray) -> np.ndarray:
+    """Rows after which a position leaps, or a velocity to and fro."""
+    if len(run) < _ODD_MINIMUM:
+        return np.zeros(0, int)
+    scalar = list(run.configuration.scalar_qvel)
+    step = run.configuration.difference(run.qpos[:-1], run.qpos[1:])[:, scalar]
+    before, after = step[:-2], step[2:]
+    high, low = np.maximum(before, after), np.minimum(before, after)
+    beyond = np.maximum(step[1:-1] - high, low - step[1:-1])
+    usual = np.percentile(np.abs(step), _USUAL, axis=0)
+    limit = np.maximum(_ODD * math.sqrt(6.0) * noise[scalar], _ODD_ALONE * usual)
+    leaps = np.flatnonzero((beyond > limit).any(1)) + 1
+    spikes = _spikes(run, noise[run.qvel.shape[1] :])
+    return np.union1d(leaps, np.union1d(spikes - 1, spikes))
+
+
+def _spikes(run: Run, noise: np.ndarray) -> np.ndarray:
+    """Rows whose measured velocity stands apart; ``noise (nv,)`` of velocities."""
+    step = np.diff(run.qvel, axis=0)
+    there, back = step[:-1], step[1:]
+    usual = np.percentile(np.abs(step), _USUAL, axis=0)
+    limit = np.maximum(_ODD * math.sqrt(6.0) * noise, _ODD_ALONE * usual)
+    moved = run.configuration.difference(run.qpos[:-2], run.qpos[2:]) / (2 * run.dt)
+    off = np.abs(run.qvel[1:-1] - moved)
+    odd = (np.abs(there) > limit) & (np.abs(there + back) < _RETURNS * np.abs(there))
+    return np.flatnonzero((odd & (off > 0.5 * np.abs(there))).any(1)) + 1
+
+
+def to_common_step(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """Runs at the smallest of their control steps, and notes of what was changed.
+
+    Commands are held, and a step gets the mean of what was held in it; positions and
+    velocities are interpolated linearly.
+    """
+    dt = min(run.dt for run in runs)
+    out, notes = [], []
+    for run in runs:
+        sent = run.ctrl if run.sent is None else run.sent
+        if abs(run.dt / dt - 1) <= _STEPS_AGREE:
+            out.append(replace(run, dt=dt, ctrl=sent, sent=None))
+            continue
+        rows = Rows(
+            run.time, np.full(len(run), ""), run.qpos, run.qvel, run.ctrl, run.sensors
+        )
+        even = resampled(rows, dt, run.configuration)
+        qvel = even.qvel
+        if not run.qvel_measured:
+            qvel = fitted_velocity(even.qpos, dt, run.configuration)
+        out.append(
+            replace(
+                run,
+                dt=dt,
+                time=even.time,
+                qpos=even.qpos,
+                qvel=qvel,
+                ctrl=mean_held(run.time, sent, even.time, dt),
+                sent=None,
+                sensors=even.sensors,
+            )
+        )
+        notes.append(
+            f"{run.name}: control step of {run.dt:.6g} s brought to {dt:.6g} s, the "
+            "smallest of all runs, by interpolation"
+        )
+    return out, notes
+
+
+def rows_of(run: Run, first: int, last: int) -> Run:
+    part = slice(first, last)
+    return replace(
+        run,
+        time=run.time[part],
+        qpos=run.qpos[part],
+        qvel=run.qvel[part],
+        ctrl=run.ctrl[part],
+        sent=None if run.sent is None else run.sent[part],
+        sensors={k: v[part] for k, v in run.sensors.items()},
+    )
+
+
+def true_readings(
+    m: mujoco.MjModel, runs: Sequence[Run], entries: Sequence[EffectEntry]
+) -> list[Run]:
+    """Runs rid of what ``entries`` say of the readings: offsets and delays of joints.
+
+    A late reading is that of some time ago, so rows are read as much later, by linear
+    interpolation; the last rows, which nothing follows, are left out.
+
+    Raises:
+        UserError: a joint that the model lacks, or that is no hinge or slide.
+    """
+    bias, late = np.zeros(m.nv), np.zeros(m.nv)
+    for e in entries:
+        named = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SENSOR, e.at) >= 0
+        own = e.kind == "sensor" and named
+        if not e.of_readings or own or e.at.startswith("qvel."):  # such are not used
+            continue
+        (place,) = addresses.places(m, f"joint.{e.at}.damping")
+        dof = int(m.jnt_dofadr[place[2]])
+        bias[dof] += e.columns.get("bias", 0.0)
+        late[dof] += e.columns.get("late", 0.0)
+    if not bias.any() and not late.any():
+        return list(runs)
+    out = []
+    for run in runs:
+        count = len(run) - math.ceil(late.max() / run.dt - _JITTER)
+        qpos, qvel = run.qpos.copy(), run.qvel.copy()
+        for q, d in zip(
+            run.configuration.scalar_qpos, run.configuration.scalar_qvel, strict=True
+        ):
+            row = np.arange(len(run))
+            at = row + late[d] / run.dt
+            qpos[:, q] = np.interp(at, row, run.qpos[:, q]) - bias[d]
+            qvel[:, d] = np.interp(at, row, run.qvel[:, d])
+        out.append(rows_of(replace(run, qpos=qpos, qvel=qvel), 0, max(count, 2)))
+    return out
+
+
+def trusted_velocity(run: Run) -> np.ndarray:
+    """Velocities ``(T, nv)``: those measured where they are the positions' derivative,
+    else that derivative.
+
+    They are where they agree with the fitted one (within a tenth of its RMS or three
+    times its noise), or where they integrate to the positions from row to row (within
+    a tenth): what swings as fast as rows follow each other escapes the fit.
+    """
+    fitted = fitted_velocity(run.qpos, run.dt, run.configuration)
+    if not run.qvel_measured:
+        return fitted
+    nv = run.qvel.shape[1]
+    slack = 3 * estimate_noise(replace(run, qvel_measured=False))[nv:]
+    off = _rms(run.qvel - fitted)
+    agrees = off <= np.maximum(_AGREES * _rms(fitted), slack)
+    moved = run.configuration.difference(run.qpos[:-1], run.qpos[1:]) / run.dt
+    between = 0.5 * (run.qvel[:-1] + run.qvel[1:])
+    agrees |= _rms(between - moved) <= _AGREES * _rms(moved)
+    return np.where(agrees, run.qvel, fitted)
+
+
+def _rms(x: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean(x**2, 0))

@@ -1,0 +1,78 @@
+"""Recordings of a machine: uninterrupted runs at one control step."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from easi_jax.model.joint_space import Configuration
+
+# A logger's clock is no better than this, and half the physics step for a control
+# step of 1.0003 times the model's would double the work for nothing.
+_CLOCK_ERROR = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One uninterrupted recording, one row per control step.
+
+    Attributes:
+        name: unique among the runs that were read together.
+        source: the file it came from.
+        dt: control step, s.
+        time: measured time, s, ``(T,)``.
+        qpos: positions, m, rad and unit quaternions (w x y z), ``(T, nq)``.
+        qvel: velocities, m/s and rad/s, ``(T, nv)``.
+        qvel_measured: True where every velocity comes from the log; else those
+            that are missing are derived from the positions.
+        ctrl: command sent from this row to the next, ``(T, nu)``.
+        sensors: readings by sensor name, ``(T, dim)``; NaN where there was none.
+        configuration: where quaternions lie in ``qpos``.
+        stamps: times of the rows as they were recorded [s]; None where they were even,
+            and nothing was interpolated.
+        sent: mean over each step of the commands held in it, ``(T, nu)``; None where
+            it is ``ctrl``.
+    """
+
+    name: str
+    source: str
+    dt: float
+    time: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    qvel_measured: bool
+    ctrl: np.ndarray
+    configuration: Configuration
+    sensors: Mapping[str, np.ndarray] = field(default_factory=dict)
+    stamps: np.ndarray | None = None
+    sent: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        """Number of rows, T."""
+        return len(self.time)
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """All runs that were read together.
+
+    Attributes:
+        runs: in the order of the files and, inside a file, of their first row.
+        notes: what a user should know of the reading, one line each: columns
+            ignored, rows dropped, runs split, velocities estimated, and values
+            that look wrong.
+    """
+
+    runs: tuple[Run, ...]
+    notes: tuple[str, ...]
+
+
+def physics_steps(control_step: float, timestep: float) -> int:
+    """Physics steps in one control step.
+
+    The smallest whole number that brings ``control_step`` (s) to ``timestep`` (s)
+    or below; an excess of 0.1 %, which is clock error, is let pass. The physics
+    step is then ``control_step / physics_steps(control_step, timestep)``.
+    """
+    return max(1, math.ceil(control_step / timestep * (1.0 - _CLOCK_ERROR)))

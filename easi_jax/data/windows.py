@@ -1,0 +1,161 @@
+"""Cuts runs into open-loop windows and into transitions; nothing crosses a run's end.
+
+The start of a window is that of the log format: the position as measured, and as
+velocity the derivative of a quadratic fitted to the positions around it.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from easi_jax.data.recording import Run
+from easi_jax.model.joint_space import Configuration
+
+FIT_SECONDS = 0.02
+FIT_ROWS = 5
+MIN_STEPS = 10
+
+
+class Windows(NamedTuple):
+    """Open-loop windows of one run: W windows of H control steps.
+
+    Attributes:
+        start_row: row of the run at which each window starts, ``(W,)`` int.
+        start_qpos: measured position there, ``(W, nq)``.
+        start_qvel: fitted velocity there, ``(W, nv)``.
+        ctrl: command of each step, ``(W, H, nu)``.
+        target_qpos: measured position after each step, ``(W, H, nq)``.
+        dt: control step, s.
+    """
+
+    start_row: np.ndarray
+    start_qpos: np.ndarray
+    start_qvel: np.ndarray
+    ctrl: np.ndarray
+    target_qpos: np.ndarray
+    dt: float
+
+
+class Transitions(NamedTuple):
+    """Pairs of successive rows of one run, N = T - 1.
+
+    Attributes:
+        qpos: ``(N, nq)``.
+        qvel: ``(N, nv)``.
+        ctrl: command sent in between, ``(N, nu)``.
+        next_qpos: ``(N, nq)``.
+        next_qvel: ``(N, nv)``.
+    """
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    ctrl: np.ndarray
+    next_qpos: np.ndarray
+    next_qvel: np.ndarray
+
+
+def fitted_velocity(
+    qpos: np.ndarray, dt: float, configuration: Configuration
+) -> np.ndarray:
+    """Velocity as the derivative of a local quadratic in the positions.
+
+    The quadratic is fitted by least squares to the rows within 20 ms of each row
+    and to at least 5; at the ends of the run to those that exist. Orientations
+    are fitted as rotation vectors from the row's own.
+
+    Args:
+        qpos: positions of one run, ``(T, nq)``.
+        dt: control step, s.
+        configuration: where quaternions lie in ``qpos``.
+
+    Returns:
+        ``(T, nv)``, m/s and rad/s. Of two rows the slope; of one row zeros.
+    """
+    rows = len(qpos)
+    if rows < 2:
+        return np.zeros((rows, configuration.nv))
+    row = np.arange(rows)
+    low, high = _fitted_rows(rows, row, dt)
+    velocity = np.zeros((rows, configuration.nv))
+    shapes = {(int(a), int(b)) for a, b in zip(low - row, high - row, strict=True)}
+    for first, last in shapes:
+        chosen = row[(low - row == first) & (high - row == last)]
+        weights = _derivative_weights(first, last) / dt
+        for offset, weight in zip(range(first, last + 1), weights, strict=True):
+            step = configuration.difference(qpos[chosen], qpos[chosen + offset])
+            velocity[chosen] += weight * step
+    return velocity
+
+
+def make_windows(run: Run, horizon_s: float, every_s: float | None = None) -> Windows:
+    """Windows of ``run`` for open-loop prediction.
+
+    Args:
+        run: the recording.
+        horizon_s: length of a window, s; rounded to control steps, at least 10.
+        every_s: time from one start to the next, s; half a horizon by default.
+
+    Returns:
+        Windows that lie wholly inside the run, the first at its first row; none
+        where the run is shorter than a window.
+
+    Raises:
+        ValueError: a length that is not positive.
+    """
+    if horizon_s <= 0 or (every_s is not None and every_s <= 0):
+        raise ValueError("horizon and spacing of windows must be positive")
+    steps = max(MIN_STEPS, round(horizon_s / run.dt))
+    spacing = steps / 2 if every_s is None else every_s / run.dt
+    stride = max(1, round(spacing))
+    start = np.arange(0, max(len(run) - steps, 0), stride)
+    row = start[:, None] + np.arange(steps)
+    velocity = fitted_velocity(run.qpos, run.dt, run.configuration)
+    return Windows(
+        start_row=start,
+        start_qpos=run.qpos[start],
+        start_qvel=velocity[start],
+        ctrl=run.ctrl[row],
+        target_qpos=run.qpos[row + 1],
+        dt=run.dt,
+    )
+
+
+def transitions(run: Run) -> Transitions:
+    """Every pair of successive rows of ``run``, with the command in between."""
+    return Transitions(
+        qpos=run.qpos[:-1],
+        qvel=run.qvel[:-1],
+        ctrl=run.ctrl[:-1],
+        next_qpos=run.qpos[1:],
+        next_qvel=run.qvel[1:],
+    )
+
+
+def velocity_weights(rows: int, row: int, dt: float) -> tuple[int, np.ndarray]:
+    """How `fitted_velocity` weighs the positions around a row of a run.
+
+    Returns:
+        First row that it reads, counted from ``row``, and the weights [1/s] of that and
+        the following rows.
+    """
+    low, high = (int(x) - row for x in _fitted_rows(rows, np.array(row), dt))
+    return low, _derivative_weights(low, high) / dt
+
+
+def _fitted_rows(
+    rows: int, row: np.ndarray, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """First and last row of each row's own span: within reach, inside the run, at
+    least `FIT_ROWS` rows."""
+    reach = max(int(FIT_SECONDS / dt + 1e-6), FIT_ROWS // 2)
+    low = np.minimum(np.maximum(row - reach, 0), max(rows - FIT_ROWS, 0))
+    high = np.maximum(np.minimum(row + reach, rows - 1), min(FIT_ROWS, rows) - 1)
+    return low, high
+
+
+def _derivative_weights(first: int, last: int) -> np.ndarray:
+    """Weights of rows ``first..last`` that give the slope at 0 per row."""
+    offset = np.arange(first, last + 1, dtype=float)
+    degree = min(2, len(offset) - 1)
+    powers = np.vander(offset, degree + 1, increasing=True)
+    return np.linalg.pinv(powers)[1]

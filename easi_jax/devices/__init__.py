@@ -1,0 +1,1 @@
+"""How programs run: the runtime made ready, the mesh of devices, several processes."""

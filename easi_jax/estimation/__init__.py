@@ -1,0 +1,1 @@
+"""Parameters, and how sure they are, from pieces of recordings."""

@@ -1,0 +1,154 @@
+"""Which parameters, and which combinations of them, data determine."""
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from easi_jax.estimation.normal_equations import _NUMERIC
+from easi_jax.model.parameters import ParameterSpace
+
+_WEAK = 0.5  # std of a log ratio beyond which a direction is called undetermined
+_ALONE = 0.998  # of a parameter's own direction unseen: it leaves no trace
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What data of this kind can determine, near one parameter vector.
+
+    Attributes:
+        names: parameters.
+        std: Cramer-Rao standard deviation of the log ratio (or, for a linear
+            parameter, as a share of its initial range); inf where undetermined.
+        rank: number of determined directions.
+        undetermined: each a dict name -> coefficient: the parameters that can move
+            together, in these proportions of their logarithms, unseen.
+        determined: per parameter, whether the data fix it by itself.
+        covariance: Cramer-Rao bound within the determined directions, unit
+            coordinates, ``(n, n)``.
+        null: orthonormal basis of the undetermined directions, scaled coordinates,
+            ``(n, n - rank)``.
+        scale: unit coordinate -> scaled coordinate factors, ``(n,)``.
+    """
+
+    names: tuple[str, ...]
+    std: np.ndarray
+    rank: int
+    undetermined: tuple[dict[str, float], ...]
+    determined: np.ndarray
+    covariance: np.ndarray
+    null: np.ndarray
+    scale: np.ndarray
+
+    def error(self, off: np.ndarray) -> float:
+        """RMS of the part of ``off (n,)``, scaled coordinates (log ratios), that lies
+        along the determined directions; NaN where there are none."""
+        seen = off - self.null @ (self.null.T @ off)
+        return float(np.sqrt((seen**2).sum() / self.rank)) if self.rank else np.nan
+
+
+def identifiability(
+    space: ParameterSpace, hessian: np.ndarray, weak: float = _WEAK
+) -> Identifiability:
+    """Reads the Fisher information ``hessian (n, n)`` (unit coordinates).
+
+    Directions are judged in log ratios, where one unit is a factor e.
+    """
+    scale = space.log_width  # d log(xi) / d unit, or 1 for linear parameters
+    info = np.asarray(hessian, np.float64) / np.outer(scale, scale)
+    info = 0.5 * (info + info.T)
+    values, vectors = np.linalg.eigh(info)
+    top = max(values[-1], 1e-300)
+    seen = (values > (_NUMERIC**2) * top) & (values > 1.0 / weak**2)
+    null = vectors[:, ~seen]
+    safe = np.where(seen, values, np.inf)
+    cov = (vectors / safe) @ vectors.T
+    leak = np.sqrt((null**2).sum(1)) if null.size else np.zeros(len(scale))
+    std = np.sqrt(np.diag(cov))
+    determined = (leak < 0.05) & (std < weak)
+    std = np.where(leak < 0.05, std, np.inf)
+    return Identifiability(
+        names=space.names,
+        std=std,
+        rank=int(seen.sum()),
+        undetermined=tuple(
+            {
+                space.names[i]: float(v[i])
+                for i in np.argsort(-np.abs(v))
+                if abs(v[i]) > 0.05
+            }
+            for v in _readable_basis(null, forces(space))
+        ),
+        determined=determined,
+        covariance=cov / np.outer(scale, scale),
+        null=null,
+        scale=scale,
+    )
+
+
+def forces(space: ParameterSpace) -> np.ndarray:
+    """1 where a unit holds a mass or a force: what one common factor would scale."""
+    bases = (re.findall(r"[A-Za-z]+", u.split("/")[0]) for u in space.units)
+    return np.array([float(bool({"kg", "N", "Nm"} & set(b))) for b in bases])
+
+
+def _readable_basis(null: np.ndarray, common: np.ndarray) -> list[np.ndarray]:
+    """A basis of a subspace in the order in which people think of it.
+
+    Parameters without any trace; the common scale of all masses and forces, if it is
+    there; what is left, as sparse as can be.
+    """
+    n, count = null.shape
+    singles = np.flatnonzero((null**2).sum(1) > _ALONE)[:count]
+    parts = [np.eye(n)[i] for i in singles]
+    scale = common.copy()
+    scale[singles] = 0.0
+    missed = scale - null @ (null.T @ scale)
+    found = scale.sum() >= 2 and len(parts) < count
+    found = found and np.linalg.norm(missed) < 0.05 * np.linalg.norm(scale)
+    if found:
+        parts.append(scale)
+    if not parts:
+        return _sparse_basis(null)
+    if len(parts) == count:
+        return parts
+    used = np.linalg.qr(np.stack(parts, 1))[0]
+    left = np.linalg.svd(null - used @ (used.T @ null))[0][:, : count - len(parts)]
+    others = _sparse_basis(left)
+    if found:
+        others = [_without(v, scale) for v in others]
+    return [*parts, *others]
+
+
+def _without(v: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """``v`` less the multiple of ``scale`` that leaves the smallest sum of powers."""
+    tries = [v - v[i] * scale for i in np.flatnonzero(scale)]
+    best = min(tries, key=lambda x: float(np.abs(x).sum()))
+    return best / np.max(np.abs(best))
+
+
+def _sparse_basis(null: np.ndarray) -> list[np.ndarray]:
+    """A readable basis of a subspace: each vector rid of the others' pivots."""
+    rows = null.T.copy()
+    done: list[int] = []
+    for i in range(len(rows)):
+        free = np.abs(rows[i]).copy()
+        free[done] = 0
+        pivot = int(np.argmax(free))
+        rows[i] /= rows[i, pivot]
+        for k in range(len(rows)):
+            if k != i:
+                rows[k] -= rows[k, pivot] * rows[i]
+        done.append(pivot)
+    return [r / np.max(np.abs(r)) for r in rows]
+
+
+def describe(direction: dict[str, float]) -> str:
+    """A sentence about one undetermined direction."""
+    if len(direction) == 1:
+        return f"{next(iter(direction))} leaves no trace in these data"
+    rounded = {k: round(v, 2) for k, v in direction.items()}
+    if all(abs(v - 1) < 0.05 for v in direction.values()):
+        return f"{', '.join(rounded)} times one common factor change nothing"
+    terms = ", ".join(f"{k}^{v:g}" for k, v in rounded.items())
+    return f"moving together as {terms} changes nothing that these data show"

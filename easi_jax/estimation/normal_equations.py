@@ -1,0 +1,257 @@
+"""What measured segments say about the parameters: Fisher information.
+
+Derivatives of the simulation are forward-mode or, beyond three degrees of freedom,
+central differences: derivatives of an arm of six compile for minutes, and batches of
+larger robots simulate many times faster than derivatives go through them
+(`easi_jax.simulation.cpu.batch_last`). The start state of each segment is unknown
+within its noise and eliminated (Schur complement). The inverse is the Cramer-Rao bound.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from easi_jax.data.segments import Segments
+from easi_jax.devices.mesh import make_mesh, replicated, sharded_map
+from easi_jax.devices.runtime import on_cpu
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation import open_loop
+from easi_jax.simulation.simulator import Simulator
+
+RESOLVED = 1e-5  # smallest eigenvalue of a float32 correlation matrix worth its name
+_LANES = 64  # simulations at once of a smaller robot, whose loop is one piece then
+# Of an initial range, for differences along a parameter: of 0.01 a bend of a drive's
+# limit looks like knowledge where there is none, of 0.001 rounding does.
+_STEP = 0.004
+_MOVE = 1e-4  # at least, along a start [m, rad, m/s, rad/s]
+_NUMERIC = 1e-4  # relative singular value that single precision cannot resolve
+
+
+@flax.struct.dataclass
+class Normal:
+    """Normal equations of one Gauss-Newton step, the starts eliminated.
+
+    Attributes:
+        hessian: ``(n, n)``, information in unit coordinates.
+        gradient: ``(n,)``.
+        costs: half the weighted squared error of each piece, ``(M,)``; inf where the
+            simulation is not finite, which leaves no other trace here.
+        start_step: ``(M, 2 nv)`` correction of each start at zero parameter step.
+        start_gain: ``(M, 2 nv, n)``: correction per unit of parameter step.
+    """
+
+    hessian: jax.Array
+    gradient: jax.Array
+    costs: jax.Array
+    start_step: jax.Array
+    start_gain: jax.Array
+
+
+def shift_start(simulator: Simulator, seg: Segments, delta: jax.Array) -> Segments:
+    """Segments with starts moved by tangent vectors ``(M, 2 nv)``."""
+    nv = simulator.mj_model.nv
+    move = jax.vmap(simulator.move)
+    return replace(
+        seg, qpos=move(seg.qpos, delta[:, :nv]), qvel=seg.qvel + delta[:, nv:]
+    )
+
+
+@dataclass(frozen=True)
+class PairedFit:
+    """Predicted against measured segments, each start free within its noise.
+
+    Attributes:
+        simulator, space: what is simulated, and its parameters.
+        segments: M of H control steps.
+        noise: standard deviations of measured positions and velocities, ``(2 nv,)``.
+        mesh: devices that share the segments; all of them by default.
+        free_starts: whether starts are free within the noise, or known exactly.
+        steps: control steps of each piece that are simulated, all by default; the
+            others are to weigh nothing.
+    """
+
+    simulator: Simulator
+    space: ParameterSpace
+    segments: Segments
+    noise: jax.Array
+    mesh: Mesh | None = None
+    free_starts: bool = True
+    steps: int | jax.Array | None = None
+
+    def normal(self, unit: jax.Array, delta: jax.Array, weight: jax.Array) -> Normal:
+        """Gauss-Newton system at parameters ``unit (n,)`` and start shifts ``delta``.
+
+        Args:
+            delta: ``(M, 2 nv)``.
+            weight: of each measured number, ``(M, H, 2 nv)``.
+        """
+        if self.simulator.by_differences:
+            units, deltas = self.around(unit, delta)
+            return self.sweep(units, deltas, weight)[0]
+
+        def one(item: Any) -> Any:
+            s, d, w = item
+            r, jac = self._pushed(unit, d, s)
+            return self._equations(r, jac, d, w)
+
+        return self._summed(self._each(one, 1, delta, weight))
+
+    def around(self, unit: jax.Array, delta: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Points whose `sweep` holds the derivatives at ``unit (n,)`` and ``delta
+        (M, 2 nv)``: themselves, then steps up, then steps down; ``(K, n)``,
+        ``(K, M, 2 nv)``."""
+        n, m, nv2 = self.space.size, self._directions, delta.shape[1]
+        low, high = self.space.unit_bounds
+        ways = jnp.eye(m, n + nv2) * self._steps()
+        ways = jnp.concatenate([jnp.zeros((1, n + nv2)), ways, -ways])
+        # Between bounds a parameter may have less than its step to go.
+        units = jnp.clip(unit + ways[:, :n], low, high)
+        return units, delta + ways[:, None, n:]
+
+    def sweep(
+        self, units: jax.Array, deltas: jax.Array, weight: jax.Array
+    ) -> tuple[Normal, jax.Array]:
+        """Simulates every piece from several points ``(K, n)``, ``(K, M, 2 nv)``.
+
+        One simulation for derivatives and for trials, so that it is compiled once.
+
+        Returns:
+            The system of `normal`, where the first points are those of `around`; the
+            `costs` ``(K, M)``.
+        """
+        n, m = self.space.size, self._directions
+
+        def one(item: Any) -> Any:
+            s, d, w = item
+            r = jax.vmap(lambda u, x: self._residual(u, x, s))(units, d)
+            up, down = slice(1, m + 1), slice(m + 1, 2 * m + 1)
+            gone = jnp.concatenate(
+                [
+                    jnp.diagonal(units[up][:n] - units[down][:n]),
+                    jnp.diagonal((d[up] - d[down])[n:]),
+                ]
+            )
+            safe = jnp.where(gone > 0, gone, 1.0)
+            jac = jnp.moveaxis(r[up] - r[down], 0, -1) / safe
+            cost = jax.vmap(lambda a, b: self._cost(a, b, w))(r, d)
+            return self._equations(r[0], jac, d[0], w), cost
+
+        shifts = jnp.swapaxes(deltas, 0, 1)
+        equations, cost = self._each(one, units.shape[0], shifts, weight)
+        return self._summed(equations), cost.T
+
+    def _steps(self) -> jax.Array:
+        along = jnp.full(self.space.size, _STEP)
+        return jnp.concatenate([along, jnp.maximum(self.noise, _MOVE)])
+
+    def _equations(self, r: jax.Array, jac: jax.Array, d: jax.Array, w: Any) -> Any:
+        """One piece's part of `Normal`, from its residual and slopes."""
+        n, nv2, noise = self.space.size, len(d), self.noise
+        root = jnp.sqrt(w) / noise
+        # A piece of weight zero may hold anything; one that the simulation does not
+        # get through has no slopes.
+        on = (w > 0) & jnp.isfinite(r).all() & jnp.isfinite(jac).all()
+        rw = jnp.where(on, r * root, 0.0).reshape(-1)
+        jw = jnp.where(on[..., None], jac * root[..., None], 0.0)
+        jw = jw.reshape(rw.shape[0], -1)
+        a, b = jw[:, :n], jw[:, n:]
+        hess, grad = a.T @ a, a.T @ rw
+        cost = self._cost(r, d, w)
+        if not self.free_starts:
+            return hess, grad, cost, jnp.zeros(nv2), jnp.zeros((nv2, n))
+        # The start was measured too: its own shift costs d / noise.
+        fxx = b.T @ b + jnp.diag(1 / noise**2)
+        fxu, gx = b.T @ a, b.T @ rw + d / noise**2
+        sol = jnp.linalg.solve(fxx, jnp.concatenate([fxu, gx[:, None]], 1))
+        hess, grad = hess - fxu.T @ sol[:, :n], grad - fxu.T @ sol[:, n]
+        return hess, grad, cost, -sol[:, n], -sol[:, :n]
+
+    def _summed(self, parts: Any) -> Normal:
+        hess, grad, cost, step, gain = parts
+        return Normal(hess.sum(0), grad.sum(0), cost, step, gain)
+
+    def _cost(self, r: jax.Array, d: jax.Array, w: jax.Array) -> jax.Array:
+        square = jnp.where(w > 0, w * (r / self.noise) ** 2, 0.0).sum()
+        total = 0.5 * (square + jnp.sum((d / self.noise) ** 2))
+        return jnp.where(jnp.isfinite(total), total, jnp.inf)
+
+    def costs(self, unit: jax.Array, delta: jax.Array, weight: jax.Array) -> jax.Array:
+        """The costs of `normal`, for several points at once.
+
+        Args:
+            unit: ``(K, n)``.
+            delta: ``(K, M, 2 nv)``.
+            weight: of each measured number, ``(M, H, 2 nv)``.
+
+        Returns:
+            ``(K, M)``; inf where the simulation is not finite.
+        """
+
+        def one(item: Any) -> jax.Array:
+            s, d, w = item
+
+            def cost(u: jax.Array, x: jax.Array) -> jax.Array:
+                return self._cost(self._residual(u, x, s), x, w)
+
+            return jax.vmap(cost)(unit, d)
+
+        shifts = jnp.swapaxes(delta, 0, 1)
+        return self._each(one, unit.shape[0], shifts, weight).T
+
+    @property
+    def points(self) -> int:
+        """Simulations of each piece that `normal` takes, a derivative as one."""
+        return 1 + self._directions * (2 if self.simulator.by_differences else 1)
+
+    @property
+    def _directions(self) -> int:
+        starts = 2 * self.simulator.mj_model.nv if self.free_starts else 0
+        return self.space.size + starts
+
+    def _each(self, one: Any, points: int, *items: jax.Array) -> Any:
+        """``one`` of every segment with its ``items``, shared among the devices.
+
+        ``points``: simulations that ``one`` makes of a segment.
+        """
+        mesh = self.mesh or make_mesh()
+        share = -(-self.segments.count // mesh.size)
+        wide = self.simulator.wide or not on_cpu()
+        at_once = self.simulator.batch if wide else _LANES
+        wanted = at_once // points
+        batch = min(share, max(1, wanted))
+        rounds = -(-share // batch)
+        batch = -(-share // rounds)  # even ones: a shorter last one compiles again
+
+        def local(block: Any) -> Any:
+            return jax.lax.map(one, block, batch_size=batch)
+
+        given = (self.segments, *items)
+        out = sharded_map(local, mesh, given, multiple=batch)
+        # Whole before anybody sums it: in the same order whoever holds the devices.
+        return replicated(out, mesh)
+
+    def _pushed(
+        self, unit: jax.Array, d: jax.Array, s: Segments
+    ) -> tuple[jax.Array, jax.Array]:
+        """Residual ``(H, 2 nv)`` of one segment and its slopes ``(..., directions)``
+        along parameters and, where starts are free, along the start; forward-mode."""
+        n = self.space.size
+
+        def f(x: jax.Array) -> jax.Array:
+            shift = d + x[n:] if self.free_starts else d
+            return self._residual(unit + x[:n], shift, s)
+
+        zero = jnp.zeros(self._directions)
+        r, push = f(zero), lambda v: jax.jvp(f, (zero,), (v,))[1]
+        return r, jnp.moveaxis(jax.vmap(push)(jnp.eye(len(zero))), 0, -1)
+
+    def _residual(self, unit: jax.Array, d: jax.Array, s: Segments) -> jax.Array:
+        """Predicted minus measured, ``(H, 2 nv)``, of one segment; its start moved."""
+        one = jax.tree.map(lambda x: x[None], s)
+        moved = shift_start(self.simulator, one, d[None])
+        model = self.simulator.model(self.space.to_si(unit))
+        return -open_loop.errors_from(self.simulator, model, moved, one, self.steps)[0]

@@ -1,0 +1,148 @@
+"""A few last Gauss-Newton steps of a fit, on more pieces than it was found with.
+
+What makes a fit long, its many trials, jumps and restarts, has to find the valley; a
+tenth of a long recording shows where that is. How far along it the best place lies is a
+matter of all the data, and near it a few steps are enough.
+"""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from easi_jax.data.segments import Segments
+from easi_jax.estimation.levenberg_marquardt import (
+    RefineResult,
+    excess,
+    moved,
+    newton_step,
+    not_held_back,
+    raised_to_range,
+    step_weights,
+)
+from easi_jax.estimation.normal_equations import Normal, PairedFit
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation.simulator import Simulator
+
+_LOOKS = 8  # at most: at the fit, then after each step
+_SETTLED = 0.01  # of the cost, that the next step is foretold to gain
+_STEPPING, _RAISING, _FINISHED = range(3)
+_PULL = 0.1  # information added to a unit coordinate, for what the data do not show
+_DAMPING = 1e-6  # of a step, relative to the information
+_FALLS_BY, _RISES_BY = 0.1, 1e4  # after a step that helped, and one that did not
+
+
+@flax.struct.dataclass
+class _Look:
+    """Where it looks, and the best place so far."""
+
+    k: jax.Array
+    phase: jax.Array
+    unit: jax.Array
+    starts: jax.Array
+    damping: jax.Array
+    best: tuple[jax.Array, jax.Array, Normal]  # parameters, starts, what is seen there
+    used: jax.Array  # pieces that the simulation gets through at the fit
+    least: jax.Array  # cost of the best place
+    seen: jax.Array  # information at the place looked at last
+    cost: jax.Array
+
+
+def polish(
+    simulator: Simulator,
+    space: ParameterSpace,
+    unit: jax.Array,
+    segments: Segments,
+    noise: jax.Array,
+    mesh: Mesh | None = None,
+    misfit: jax.Array | None = None,
+) -> RefineResult:
+    """A fit ``unit (n,)`` after steps on ``segments``, starts free; pure, for use
+    inside jit.
+
+    Args:
+        segments: those that count now, all M of them; the fit may come from others.
+        noise: standard deviations of the measurement, ``(2 nv,)``, above zero.
+        misfit: as in `easi_jax.estimation.levenberg_marquardt.refine`.
+
+    Returns:
+        The place of least cost among the fit's own, its starts as they were measured,
+        and those after each step; information, starts and costs, ``(8,)`` and infinite
+        where it had settled, are those of ``segments``. A piece that the simulation
+        does not get through at ``unit`` counts nothing; at a place where one of the
+        others explodes the cost is infinite.
+    """
+    paired = PairedFit(simulator, space, segments, noise, mesh)
+    weight = step_weights(segments, noise, misfit)
+    low, high = space.unit_bounds
+    given = unit
+    unmoved = jnp.zeros((segments.count, noise.shape[0]))
+
+    def going(c: _Look) -> jax.Array:
+        return c.phase < _FINISHED
+
+    def look(c: _Look) -> _Look:
+        eq = paired.normal(c.unit, c.starts, weight * c.used[:, None, None])
+        stepping = c.phase == _STEPPING
+        used = jnp.where(c.k == 0, jnp.isfinite(eq.costs), c.used)
+        cost = jnp.where(used, eq.costs, 0.0).sum()
+        better = stepping & ((c.k == 0) | (cost < c.least))
+        best = jax.tree.map(
+            lambda new, old: jnp.where(better, new, old),
+            (c.unit, c.starts, eq),
+            c.best,
+        )
+        damping = c.damping * jnp.where(better, _FALLS_BY, _RISES_BY)
+        at, starts, told = best
+        free = not_held_back(space, at, told.gradient)
+        held = told.hessian + _PULL * jnp.eye(space.size)
+        du = newton_step(held, told.gradient, free, damping)
+        new = jnp.clip(moved(space, at, du), low, high)
+        here = jnp.arange(_LOOKS) == c.k
+        follow = starts + told.start_step + told.start_gain @ (new - at)
+        gain = -0.5 * told.gradient @ du
+        done = ~stepping | (better & (gain < _SETTLED)) | (c.k + 1 >= _LOOKS)
+        raised = raised_to_range(space, at)
+        below = (raised != at).any() & stepping
+        over = jnp.where(below, _RAISING, _FINISHED)
+        return _Look(
+            k=c.k + 1,
+            phase=jnp.where(done, over, _STEPPING),
+            unit=jnp.where(done, raised, new),
+            starts=jnp.where(done, starts, follow),
+            damping=damping,
+            best=best,
+            used=used,
+            least=jnp.where(better, cost, c.least),
+            seen=eq.hessian,
+            cost=jnp.where(here & stepping, cost, c.cost),
+        )
+
+    like = jax.eval_shape(paired.normal, given, unmoved, weight)
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    begin = _Look(
+        k=jnp.asarray(0),
+        phase=jnp.asarray(_STEPPING),
+        unit=given,
+        starts=unmoved,
+        damping=jnp.asarray(_DAMPING),
+        best=(given, unmoved, nothing),
+        used=jnp.ones(segments.count, bool),
+        least=jnp.asarray(jnp.inf),
+        seen=nothing.hessian,
+        cost=jnp.full(_LOOKS, jnp.inf),
+    )
+    end = jax.lax.while_loop(going, look, begin)
+    unit, starts, told = end.best
+    raised = raised_to_range(space, unit)
+    whole = paired.points * segments.count * segments.horizon
+    return RefineResult(
+        unit=unit,
+        hessian=told.hessian,
+        cost=end.cost,
+        delta=starts,
+        raised=raised,
+        raised_hessian=jnp.where((raised != unit).any(), end.seen, told.hessian),
+        excess=excess(jnp.where(end.used, told.costs, jnp.inf), weight),
+        simulated=1.0 * whole * end.k,
+    )

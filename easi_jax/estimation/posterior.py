@@ -1,0 +1,374 @@
+"""From the end of a search to an honest distribution over parameters."""
+
+from dataclasses import replace
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from easi_jax.data.segments import Segments
+from easi_jax.estimation.levenberg_marquardt import (
+    RefineResult,
+    excess,
+    refine,
+    step_weights,
+)
+from easi_jax.estimation.normal_equations import RESOLVED, PairedFit
+from easi_jax.estimation.pieces import effective_noise, finish_pieces, finish_rest
+from easi_jax.estimation.polish import polish
+from easi_jax.estimation.profile_score import Adjusted, adjust
+from easi_jax.model.distribution import Distribution, gaussian
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation.simulator import Simulator
+
+RESTARTS = 2  # of the finish on noisy data, where it has more than one minimum
+_SHARP = 1.0 / 3.0  # of a value: its standard deviation where logarithms will do
+_KNOWN = 0.5  # of the initial range's top: a standard deviation that says something
+_HIDDEN = 0.1  # of what a model errs by, that a parameter takes up unseen
+_INITIAL_VARIANCE = 1.0 / 12.0  # of a uniform initial range, unit coordinates
+
+
+@flax.struct.dataclass
+class Estimate:
+    """What a search, and the refinement after it, say about the parameters.
+
+    Attributes:
+        distribution: the Gaussian that training samples from.
+        search_mean: mean found by the adversarial search, unit coordinates, ``(n,)``.
+        search_cov: its covariance, ``(n, n)``.
+        hessian: Fisher information of the data at the final mean, ``(n, n)``.
+        noise: standard deviations that the information was computed with.
+        cost: weighted error after each step of refinement (empty without).
+        delta: corrections of the pieces' starts within their noise, ``(M, 2 nv)``.
+        fit: where the data alone lead, unit coordinates, ``(n,)``; the search's mean
+            where nothing was refined.
+        excess: weighted squared error there beyond what the noise makes, ``()``
+            (`easi_jax.estimation.levenberg_marquardt.excess`).
+        simulated: control steps simulated since the search, ``()``; a derivative
+            counts as one more.
+    """
+
+    distribution: Distribution
+    search_mean: jax.Array
+    search_cov: jax.Array
+    hessian: jax.Array
+    noise: jax.Array
+    cost: jax.Array
+    delta: jax.Array
+    fit: jax.Array
+    excess: jax.Array
+    simulated: jax.Array
+
+
+def estimate(
+    simulator: Simulator,
+    space: ParameterSpace,
+    mean: jax.Array,
+    cov: jax.Array,
+    pieces: Segments,
+    noise: jax.Array,
+    refined: bool,
+    informed: bool = True,
+    mesh: Mesh | None = None,
+    misfit: jax.Array | None = None,
+    robust: int | jax.Array = 6,
+    free_starts: bool = True,
+    near: bool | jax.Array = False,
+    restarts: int = 0,
+    adjusted: bool = False,
+    rest: Segments | None = None,
+) -> Estimate:
+    """The result of a search at ``mean``, ``cov`` (unit coordinates); pure.
+
+    The covariance joins two sources: the search's own spread, and what the data leave
+    open, ``(F + prior)^-1`` with F the Fisher information of ``pieces`` and the initial
+    range as prior. A direction that the data do not show keeps the initial spread,
+    whatever the search has drifted to. Where the fit leaves more than the noise
+    explains, the model lacks something, and the information counts for less
+    (`_trusted`). Without ``informed`` it is the search's own covariance alone. ``misfit
+    (2 nv,)`` is what the model itself errs by in every step, on top of the noise; it,
+    ``robust``, ``free_starts`` and ``near`` go to
+    `easi_jax.estimation.levenberg_marquardt.refine`, which starts from so many draws of
+    the search's spread as well as ``restarts`` says. With ``adjusted``, what the fitted
+    starts add to the score is taken off (`easi_jax.estimation.profile_score`); not
+    where starts are exact, nor where slopes are differences
+    (`Simulator.by_differences`). ``rest`` is more of the
+    recording, ``pieces`` among it: the fit ends on that (`easi_jax.estimation.polish`).
+    What may be as good as zero is stated as `_near_zero` says.
+    """
+    assumed = effective_noise(simulator, pieces, noise)
+    if refined:
+        fit = refine(
+            simulator,
+            space,
+            mean,
+            pieces,
+            assumed,
+            mesh=mesh,
+            misfit=misfit,
+            robust=robust,
+            free_starts=free_starts,
+            near=near,
+            others=_draws(mean, cov, restarts) if restarts else None,
+        )
+        if adjusted and free_starts and not simulator.by_differences:
+            given = simulator, space, fit.unit, pieces, assumed, mesh, misfit
+            fit = _adjusted(fit, adjust(*given))
+        if rest is not None:
+            given = simulator, space, fit.unit, cov, rest, noise, informed, mesh, misfit
+            more = polished(*given)
+            simulated = fit.simulated + more.simulated
+            return replace(more, search_mean=mean, simulated=simulated)
+        return _of_fit(space, fit, mean, cov, assumed, informed)
+    weight = step_weights(pieces, assumed, misfit)
+    zero = jnp.zeros((pieces.count, len(noise)))
+    paired = PairedFit(simulator, space, pieces, assumed, mesh, free_starts)
+    eq = paired.normal(mean, zero, weight)
+    left = excess(eq.costs, weight)
+    open_cov, seen, _ = _posterior(eq.hessian * _trusted(left))
+    spread = open_cov + seen @ cov @ seen.T
+    simulated = jnp.asarray(1.0 * paired.points * pieces.count * pieces.horizon)
+    return Estimate(
+        distribution=gaussian(space, mean, spread if informed else cov),
+        search_mean=mean,
+        search_cov=cov,
+        hessian=eq.hessian,
+        noise=assumed,
+        cost=jnp.zeros(0),
+        delta=eq.start_step,
+        fit=mean,
+        excess=left,
+        simulated=simulated,
+    )
+
+
+def polished(
+    simulator: Simulator,
+    space: ParameterSpace,
+    center: jax.Array,
+    cov: jax.Array,
+    rest: Segments,
+    noise: jax.Array,
+    informed: bool = True,
+    mesh: Mesh | None = None,
+    misfit: jax.Array | None = None,
+) -> Estimate:
+    """The `estimate` of a fit at ``center (n,)`` after `easi_jax.estimation.polish`;
+    pure.
+
+    Args:
+        cov: of the search, ``(n, n)``.
+        rest: pieces of the whole recording, R of them: cost, corrections of starts
+            ``(R, 2 nv)`` and information are theirs.
+        noise, informed, misfit: as in `estimate`.
+    """
+    assumed = effective_noise(simulator, rest, noise)
+    fit = polish(simulator, space, center, rest, assumed, mesh, misfit)
+    return _of_fit(space, fit, center, cov, assumed, informed)
+
+
+def _of_fit(
+    space: ParameterSpace,
+    fit: RefineResult,
+    mean: jax.Array,
+    cov: jax.Array,
+    noise: jax.Array,
+    informed: bool,
+) -> Estimate:
+    """What is stated of a fit, after a search that ended at ``mean``, ``cov``."""
+
+    def said(trusted: Any) -> tuple[jax.Array, jax.Array]:
+        open_cov, _, shown = _posterior(fit.raised_hessian * trusted)
+        return _near_zero(space, fit.unit, fit.raised, open_cov, shown)
+
+    center = said(1.0)[0]  # what predicts best, whatever it stands in for
+    spread = said(_trusted(fit.excess))[1]
+    return Estimate(
+        distribution=gaussian(space, center, spread if informed else cov),
+        search_mean=mean,
+        search_cov=cov,
+        hessian=fit.hessian,
+        noise=noise,
+        cost=fit.cost,
+        delta=fit.delta,
+        fit=fit.unit,
+        excess=fit.excess,
+        simulated=fit.simulated,
+    )
+
+
+def finish(
+    simulator: Simulator,
+    space: ParameterSpace,
+    mean: jax.Array,
+    cov: jax.Array,
+    trajectories: Segments,
+    noise: jax.Array,
+    noisy: bool,
+    refined: bool,
+    informed: bool = True,
+    mesh: Mesh | None = None,
+    restarts: int | None = None,
+    steps: int | None = None,
+    most: int | None = None,
+) -> Estimate:
+    """`estimate` from whole trajectories ``(B, T, 1, ...)``; pure, for use inside jit.
+
+    Args:
+        noisy: whether any of ``noise (2 nv,)`` is above zero; otherwise starts are
+            exact.
+        refined, informed: as in `estimate`.
+        restarts: more starts; not given: `RESTARTS` with noise, none for larger robots.
+        steps, most: as in `finish_pieces` and `finish_rest`.
+    """
+    if restarts is None:
+        restarts = RESTARTS if noisy and not simulator.wide else 0
+    return estimate(
+        simulator,
+        space,
+        mean,
+        cov,
+        finish_pieces(simulator, trajectories, steps, most),
+        noise,
+        refined,
+        informed,
+        mesh,
+        free_starts=noisy,
+        restarts=restarts,
+        adjusted=True,
+        rest=finish_rest(simulator, trajectories, noisy, steps, most),
+    )
+
+
+def _adjusted(fit: RefineResult, new: Adjusted) -> RefineResult:
+    """The fit with its score adjusted, where the simulation gets that far."""
+    found = replace(
+        fit,
+        unit=new.unit,
+        hessian=new.hessian,
+        delta=new.delta,
+        raised=new.raised,
+        raised_hessian=new.raised_hessian,
+    )
+    fine = jnp.isfinite(new.left[1])
+    found = jax.tree.map(lambda x, y: jnp.where(fine, x, y), found, fit)
+    return replace(found, simulated=fit.simulated + new.simulated)
+
+
+def _trusted(excess: jax.Array) -> jax.Array:
+    """Share of the information that is left where the model errs beyond the noise.
+
+    What a model lacks makes errors that no parameter takes up, and others that one
+    does: it shows as a wrong value, the same one in every piece, so that more data do
+    not help. A parameter is taken to hide a share `_HIDDEN` of what is left over.
+    """
+    return 1.0 / (1.0 + _HIDDEN * excess)
+
+
+def widened(excess: jax.Array) -> jax.Array:
+    """How many times wider spreads are for what the model errs by beyond the noise."""
+    return 1.0 / jnp.sqrt(_trusted(excess))
+
+
+def _posterior(hessian: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """``(F + prior)^-1``, the filter of directions that the data show, and the
+    variance of each parameter along those alone, ``(n,)``.
+
+    F spans ten decades, and single precision leaves noise where it should be zero that
+    a plain inverse would take for knowledge. So F is scaled to a unit diagonal, what is
+    below `RESOLVED` there counts as not seen, and seen and unseen are inverted apart.
+    """
+    size = jnp.sqrt(jnp.maximum(jnp.diag(hessian), 1.0 / _INITIAL_VARIANCE))
+    scaled = hessian / size[:, None] / size
+    values, vectors = jnp.linalg.eigh(0.5 * (scaled + scaled.T))
+    seen = values > RESOLVED
+    prior = vectors.T @ (vectors / (_INITIAL_VARIANCE * size**2)[:, None])
+    total = jnp.where(seen[:, None] == seen, prior, 0.0)
+    total = total + jnp.diag(jnp.where(seen, values, 0.0))
+    root = jnp.sqrt(jnp.diag(total))
+    back = vectors / size[:, None] / root
+    inverse = jnp.linalg.inv(total / root[:, None] / root)
+    cov = back @ inverse @ back.T
+    shown = jnp.sum((back * seen) @ inverse * (back * seen), 1)
+    return cov, jnp.eye(hessian.shape[0]) - cov / _INITIAL_VARIANCE, shown
+
+
+def _draws(mean: jax.Array, cov: jax.Array, count: int) -> jax.Array:
+    """``count`` draws of a Gaussian, ``(count, n)``; always the same ones."""
+    values, vectors = jnp.linalg.eigh(0.5 * (cov + cov.T))
+    root = vectors * jnp.sqrt(jnp.maximum(values, 0.0))
+    return mean + jax.random.normal(jax.random.key(0), (count, mean.size)) @ root.T
+
+
+def _near_zero(
+    space: ParameterSpace,
+    unit: jax.Array,
+    raised: jax.Array,
+    cov: jax.Array,
+    shown: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Mean and covariance where a logarithmic parameter may be as good as zero.
+
+    The likelihood is a Gaussian in the SI value, not in its logarithm. Where its
+    standard deviation is no small part of the value, mean and variance of the logarithm
+    are those under that likelihood and the initial range as prior. The others follow
+    the SI value along the covariance, ``cov`` at ``raised``: ``unit`` with what lies
+    below its initial range raised to the low end, for further down the logarithm has no
+    slope and its spread would mean nothing. ``shown (n,)`` are variances along what the
+    data show: a direction that they do not show makes nothing as good as zero.
+    """
+    width = jnp.asarray(space.log_width)
+    std = jnp.sqrt(jnp.diag(cov))
+    # What the data and the priors of the other parameters say of each.
+    precision = 1.0 / jnp.maximum(shown, 1e-12) - 1.0 / _INITIAL_VARIANCE
+    alone = 1.0 / jnp.sqrt(jnp.maximum(precision, 1e-3))
+    value = jnp.exp(width * (unit - raised))  # in the SI value at `raised`
+    error = width * alone
+    top = jnp.exp(width * (1.0 - raised))  # of the initial range
+    # What lies below its range has no slope there to be known by.
+    known = (error < _KNOWN * top) | (unit < raised)
+    weak = space.log & known & (error > _SHARP * value)
+    mean, x_std, log_mean, log_std = _of_logarithm(raised, width, value, error)
+    moved = jnp.where(weak, (mean - value) / width, 0.0)
+    # The others follow the weak ones all together (these may be known by their sum
+    # only): what moves with them, and what is left once they are known.
+    among = jnp.where(weak[:, None] & weak, cov, 0.0)
+    follow = jnp.where(weak[:, None], 0.0, cov @ _inverse(among, std))
+    rest = jnp.where(weak[:, None] | weak, 0.0, cov - follow @ among @ follow.T)
+    # The weak ones' own spread is that of the logarithm, but the others follow the SI
+    # value; among themselves they keep their correlations.
+    wide = follow * (x_std / width / std) + jnp.diag(jnp.where(weak, log_std / std, 0))
+    return (
+        jnp.where(weak, log_mean, unit + follow @ moved),
+        rest + wide @ among @ wide.T,
+    )
+
+
+def _inverse(cov: jax.Array, std: jax.Array) -> jax.Array:
+    """``cov^-1`` in the directions that single precision tells from none: what the
+    data know by its sum alone may be one direction short."""
+    values, vectors = jnp.linalg.eigh(cov / std[:, None] / std)
+    inverse = jnp.where(values > RESOLVED, 1.0 / values, 0.0)
+    return (vectors * inverse) @ vectors.T / std[:, None] / std
+
+
+def _of_logarithm(
+    at: jax.Array, width: jax.Array, value: jax.Array, error: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Mean and standard deviation of x, then of u, all ``(n,)``.
+
+    x = exp(width (u - at)) is a Gaussian of mean ``value`` and standard deviation
+    ``error``, and u was one about 0.5 before.
+    """
+    u = jnp.linspace(-8.0, 4.0, 2401)
+    x = jnp.exp(width[:, None] * (u - at[:, None]))
+    score = -0.5 * ((x - value[:, None]) / error[:, None]) ** 2
+    p = jax.nn.softmax(score - 0.5 * (u - 0.5) ** 2 / _INITIAL_VARIANCE, axis=1)
+
+    def moments(v: jax.Array) -> tuple[jax.Array, jax.Array]:
+        mean = (p * v).sum(1)
+        return mean, jnp.sqrt((p * (v - mean[:, None]) ** 2).sum(1))
+
+    return *moments(x), *moments(jnp.broadcast_to(u, x.shape))

@@ -1,0 +1,394 @@
+"""Parameters whose score is zero on average: starts that are fitted, paid for.
+
+`easi_jax.estimation.levenberg_marquardt` fits the start of every piece with the
+parameters. Each start takes its share of the noise, and where motion is no straight
+line within the noise, the
+parameters pay: at low speed a fitted start chooses the sign of a speed, and friction
+comes out too high and too sure, however many pieces there are (the incidental
+parameters of Neyman and Scott, 1948). The cure is the adjusted profile score of
+McCullagh and Tibshirani (1990): at each parameter vector, what the score would be on
+average if the model with the fitted starts were the truth is simulated, and taken off.
+What is left is zero at the result. The noise of the simulated average is small, since
+the same draws also give the score at their true starts, whose average is zero. In a
+direction where it is not, or where scores with fitted starts scatter more than their
+information says, the result is as much less sure (Godambe, 1960).
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from easi_jax.data.segments import Segments
+from easi_jax.estimation.levenberg_marquardt import (
+    DUG,
+    EDGE,
+    beyond_edge,
+    jumps,
+    moved,
+    newton_step,
+    not_held_back,
+    raised_to_range,
+    step_weights,
+)
+from easi_jax.estimation.normal_equations import RESOLVED, PairedFit, shift_start
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation.simulator import Simulator
+
+_DRAWS = 2  # of the noise, for every piece
+_ROUNDS = 20  # at most
+_TURNS = 4  # looks at each start, a Gauss-Newton step between each two
+_FARTHEST = 4.0  # standard deviations that a start may be off
+_PULL = 12.0  # information of a uniform initial range, unit coordinates
+_LONGEST = 4.0  # times the Newton step: the average changes with the parameters, too
+_SHORT = 0.2  # a step which still loses what was known: it stays as it is
+_SHORTEST = 0.02
+_SHALLOW = 0.1  # of what its information foretells, that the cost rises beyond a dip
+_LOST = 0.2  # of what was known of a parameter: less must not be left by a step
+_SETTLED = 1e-2  # half the squared score that is left, in its standard deviations
+_NOISE, _FIRST, _MOVING, _RAISED, _DONE = range(5)
+
+
+@flax.struct.dataclass
+class Score:
+    """The profile score of all pieces.
+
+    Attributes:
+        hessian: information, ``(n, n)``.
+        gradient: of the cost with fitted starts, ``(n,)``.
+        bias: what it is on average, ``(n,)``.
+        scatter: covariance of their difference, as the draws show it, ``(n, n)``.
+        cost, expected: half the weighted squared error, and its average, ``()``.
+        delta: fitted shifts of the starts, ``(M, 2 nv)``.
+    """
+
+    hessian: jax.Array
+    gradient: jax.Array
+    bias: jax.Array
+    scatter: jax.Array
+    cost: jax.Array
+    expected: jax.Array
+    delta: jax.Array
+
+    @property
+    def surplus(self) -> jax.Array:
+        """Cost above its average, ``()``."""
+        return self.cost - self.expected
+
+
+@flax.struct.dataclass
+class Adjusted:
+    """Result of `adjust`.
+
+    Attributes:
+        unit: parameters, unit coordinates, ``(n,)``.
+        hessian: information at them, less what their score scatters beyond it,
+            ``(n, n)``.
+        delta: shifts of the starts, ``(M, 2 nv)``.
+        raised: ``unit``, logarithmic parameters raised to the low end of their range.
+        raised_hessian: information there.
+        left: half the squared score that is left, in its standard deviations, ``()``,
+            at the start and at the result, ``(2,)``.
+        simulated: control steps simulated, ``()``; a derivative counts as one more.
+    """
+
+    unit: jax.Array
+    hessian: jax.Array
+    delta: jax.Array
+    raised: jax.Array
+    raised_hessian: jax.Array
+    left: jax.Array
+    simulated: jax.Array
+
+
+@flax.struct.dataclass
+class _Carry:
+    """Of the rounds of `adjust`."""
+
+    phase: jax.Array  # what is looked at: the noise, the start, steps, what is raised
+    k: jax.Array
+    at: jax.Array  # where the score is looked at next
+    spread: jax.Array
+    here: Any  # the best so far, and its score
+    held: jax.Array  # what stays as it is
+    length: jax.Array
+    left: jax.Array
+    seen: Any  # the score at the place looked at last
+
+
+class ProfileFit(PairedFit):
+    """`PairedFit` with each start at its best, and what that does to the score."""
+
+    def score(
+        self,
+        unit: jax.Array,
+        weight: jax.Array,
+        draws: jax.Array,
+        spread: jax.Array,
+    ) -> Score:
+        """The score at ``unit (n,)``.
+
+        Args:
+            weight: of each measured number, ``(M, H, 2 nv)``.
+            draws: standard normal, ``(M, K, H + 1, 2 nv)``: of each start, then of
+                what is measured after each step.
+            spread: standard deviations of the noise of starts, then of what comes
+                after, ``(2, 2 nv)``.
+        """
+
+        def one(item: Any) -> Any:
+            s, w, e = item
+            at = jax.tree.map(lambda x: x[None], s)
+
+            def fitted(s: Segments) -> Any:
+                def turn(d: jax.Array, _: Any) -> Any:
+                    r, jac = self._pushed(unit, d, s)
+                    parts = self._equations(r, jac, d, w)
+                    ahead = jnp.clip(d + parts[3], -most, most)
+                    return ahead, (d, r, jac, parts)
+
+                _, turns = jax.lax.scan(
+                    turn, jnp.zeros(most.shape), None, length=_TURNS
+                )
+                return jax.tree.map(lambda x: x[-1], turns)
+
+            def draw(real: Any, item: Any) -> Any:
+                """The measured piece, then those that ``e`` would have made of it."""
+                k, e = item
+                d, r, jac = real
+                first, later = e[0] * spread[0], e[1:] * spread[1]
+                new = shift_start(self.simulator, at, (d + first)[None])
+                new = self._measured(jax.tree.map(lambda x: x[0], new), r + later)
+                new = jax.tree.map(lambda x, y: jnp.where(k, x, y), new, s)
+                *found, parts = fitted(new)
+                # The truth of what is made is known: its score is zero on average.
+                known = self._equations(-later, jac, -first, w)[1]
+                fine = jnp.isfinite(parts[2]) & (parts[2] > 0)
+                over = jnp.where(fine, parts[1] - known, 0.0)
+                real = jax.tree.map(lambda x, y: jnp.where(k, x, y), real, tuple(found))
+                return real, (*parts[:3], over, known)
+
+            none = jax.eval_shape(lambda: fitted(s)[:3])
+            none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), none)
+            drawn = jnp.arange(1 + len(e)) > 0
+            e = jnp.concatenate([0.0 * e[:1], e])
+            real, (hess, *rest) = jax.lax.scan(draw, none, (drawn, e))
+            grad, cost, over, known = rest
+            over, known = over[1:], known[1:]
+            bias, expected = over.mean(0), cost[1:].mean()
+            scatter = _scatter(over + known) + _scatter(over) / len(over)
+            return hess[0], grad[0], bias, scatter, cost[0], expected, real[0]
+
+        most = _FARTHEST * self.noise
+        hess, grad, bias, scatter, cost, expected, delta = self._each(
+            one, 1 + self._directions, weight, draws
+        )
+        return Score(
+            hessian=hess.sum(0),
+            gradient=grad.sum(0),
+            bias=bias.sum(0),
+            scatter=scatter.sum(0),
+            cost=cost.sum(),
+            expected=expected.sum(),
+            delta=delta,
+        )
+
+    def _measured(self, s: Segments, error: jax.Array) -> Segments:
+        """One piece with what was measured moved by tangents ``error (H, 2 nv)``."""
+        nv = self.simulator.mj_model.nv
+        move = jax.vmap(self.simulator.move)
+        return replace(
+            s,
+            next_qpos=move(s.next_qpos, error[:, :nv]),
+            next_qvel=s.next_qvel + error[:, nv:],
+        )
+
+
+def less_scatter(hessian: jax.Array, scatter: jax.Array, count: int) -> jax.Array:
+    """Information ``(n, n)`` of a score that scatters more than its ``hessian``.
+
+    ``H S^-1 H``, where ``scatter`` S exceeds H by more than its own noise makes of
+    ``count`` pieces (the largest eigenvalue of a Wishart matrix); H elsewhere.
+    """
+    size = jnp.sqrt(jnp.maximum(jnp.diag(hessian), 1e-30))
+    scaled, spread = (
+        0.5 * (x + x.T) / size[:, None] / size for x in (hessian, scatter)
+    )
+    values, vectors = jnp.linalg.eigh(scaled)
+    seen = values > RESOLVED
+    white = jnp.where(seen, vectors / jnp.sqrt(jnp.where(seen, values, 1.0)), 0.0)
+    times, axes = jnp.linalg.eigh(white.T @ spread @ white)
+    noise = (1.0 + jnp.sqrt(len(size) / count)) ** 2
+    over = jnp.maximum(times / noise, 1.0)
+    along = scaled @ white @ axes
+    rest = scaled - (along * (1.0 - 1.0 / over)) @ along.T
+    return jnp.where(jnp.isfinite(rest).all(), rest, scaled) * size[:, None] * size
+
+
+def _scatter(x: jax.Array) -> jax.Array:
+    """Covariance of one of the draws ``x (K, n)``, ``(n, n)``."""
+    off = x - x.mean(0)
+    return off.T @ off / (len(x) - 1)
+
+
+def adjust(
+    simulator: Simulator,
+    space: ParameterSpace,
+    unit: jax.Array,
+    segments: Segments,
+    noise: jax.Array,
+    mesh: Mesh | None = None,
+    misfit: jax.Array | None = None,
+) -> Adjusted:
+    """From a best fit ``unit (n,)`` to where its score less the average is zero; pure.
+
+    Noise that was assumed too high is taken as high as the fit's cost shows.
+
+    Args:
+        noise: standard deviations of the measurement, ``(2 nv,)``, above zero.
+        misfit: what the model itself errs by in every step, as in
+            `easi_jax.estimation.levenberg_marquardt.refine`.
+    """
+    fit = ProfileFit(simulator, space, segments, noise, mesh)
+    weight = step_weights(segments, noise, misfit)
+    shape = (segments.count, _DRAWS, segments.horizon + 1, len(noise))
+    draws = jax.random.normal(jax.random.key(0), shape)
+    off = jnp.zeros_like(noise) if misfit is None else misfit
+    later = jnp.where(jnp.isfinite(off), jnp.hypot(noise, off), 0.0)
+    spread = jnp.stack([noise, later])
+    low, high = space.unit_bounds
+
+    def newton(u: jax.Array, s: Score, held: jax.Array) -> tuple[Any, Any]:
+        """The step, and what is left."""
+        a = s.gradient - s.bias
+        free = not_held_back(space, u, a) & ~held
+        step = newton_step(s.hessian + _PULL * jnp.eye(space.size), a, free)
+        left = -0.5 * a @ step
+        return step, jnp.where(jnp.isfinite(left), left, jnp.inf)
+
+    def worth(s: Score) -> jax.Array:
+        return less_scatter(s.hessian, s.scatter, segments.count)
+
+    def told(u: jax.Array, hessian: jax.Array) -> jax.Array:
+        """Information of each parameter, of a logarithm by its SI value, ``(n,)``."""
+        down = jnp.where(space.log, jnp.exp(-2.0 * space.log_width * u), 1.0)
+        return jnp.diag(hessian) * down
+
+    def in_dip(u: jax.Array, found: Score) -> jax.Array:
+        """Which parameters' cost hardly rises far above ``u (n,)``."""
+        n = space.size
+        up = jnp.minimum(u + jumps(space)[1][:n], high)
+        hops = jnp.where(jnp.eye(n, dtype=bool), up, u)
+        starts = jnp.broadcast_to(found.delta, (n, *found.delta.shape))
+        rise = fit.costs(hops, starts, weight).sum(1) - found.cost
+        told = jnp.diag(found.hessian)
+        foretold = 0.5 * told * (up - u) ** 2
+        shallow = (rise < _SHALLOW * foretold) & (rise < DUG)
+        return (told > _PULL) & shallow
+
+    def over(left: jax.Array, k: jax.Array, length: jax.Array) -> jax.Array:
+        return (left < _SETTLED) | (k > _ROUNDS) | (length < _SHORTEST)
+
+    def round_(carry: _Carry) -> _Carry:
+        c = carry
+        s = fit.score(c.at, weight, draws, c.spread)
+        share = s.cost / jnp.maximum(s.expected, 1e-30)
+        quiet = c.spread * jnp.sqrt(jnp.clip(share, 0.0, 1.0))
+        # Beyond a limit that was met there is no score, which makes nothing right.
+        u, found = c.here
+        known = told(u, found.hessian)
+        lost = told(c.at, s.hessian) < _LOST * known
+        lost &= (jnp.diag(found.hessian) > _PULL) & (c.phase == _MOVING)
+        short = c.length < _SHORT
+        held = jnp.where(short, c.held | lost, c.held)
+        before = newton(u, found, held)[1]
+        left = newton(c.at, s, held)[1]
+        better = (c.phase == _FIRST) | (c.phase == _MOVING) & (left < before)
+        better &= ~lost.any()
+        here = jax.tree.map(lambda x, y: jnp.where(better, x, y), (c.at, s), c.here)
+        u = here[0]
+        step, rest = newton(u, here[1], held)
+        # A step that gains little may have been too short.
+        longer = jnp.where(left < 0.25 * before, 1.0, 2.0)
+        length = c.length * jnp.where(better, longer, 1.0 / 3.0)
+        length = jnp.where(short & lost.any(), 1.0, length)
+        length = jnp.where(c.phase == _MOVING, jnp.minimum(length, _LONGEST), 1.0)
+        ended = (c.phase >= _FIRST) & over(rest, c.k, length)
+        phase = jnp.where(c.phase < _MOVING, c.phase + 1, c.phase)
+        phase = jnp.where(ended, _RAISED, phase)
+        phase = jnp.where(c.phase == _RAISED, _DONE, phase)
+        ahead = jnp.clip(moved(space, u, length * step), low, high)
+        return _Carry(
+            phase=phase,
+            k=c.k + 1,
+            at=jnp.where(
+                phase == _MOVING,
+                ahead,
+                jnp.where(phase == _RAISED, raised_to_range(space, u), c.at),
+            ),
+            spread=jnp.where(c.phase == _NOISE, quiet, c.spread),
+            here=here,
+            held=held,
+            length=length,
+            left=jnp.where(
+                c.phase == _RAISED,
+                c.left,
+                jnp.where(c.phase == _FIRST, rest, c.left.at[1].set(rest)),
+            ),
+            seen=s,
+        )
+
+    begin = raised_to_range(space, unit)
+    shapes = jax.eval_shape(lambda: fit.score(begin, weight, draws, spread))
+    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+    def search(found: _Carry, again: jax.Array) -> tuple[_Carry, jax.Array]:
+        """From ``unit``; then from what was found, with that beyond its limit which
+        was held, or costs next to nothing there."""
+        edges = found.held | in_dip(*found.here)
+        begun = jnp.where(again, beyond_edge(found.here[0], edges, high), begin)
+        phase = jnp.where(edges.any(), _FIRST, _DONE)
+        start = replace(
+            found,
+            phase=jnp.where(again, phase, _NOISE),
+            k=jnp.asarray(0),
+            at=begun,
+            here=(begun, none),
+            held=jnp.zeros(space.size, bool),
+            length=jnp.asarray(1.0),
+        )
+        end = jax.lax.while_loop(lambda c: c.phase < _DONE, round_, start)
+        # The limit stays where it says clearly more than that it may not be met.
+        freed = end.here[1].surplus < found.here[1].surplus + EDGE
+        freed = ~again | edges.any() & freed
+        first = jnp.where(again, found.left[0], end.left[0])
+        end = replace(end, left=end.left.at[0].set(first))
+        return jax.tree.map(lambda x, y: jnp.where(freed, x, y), end, found), end.k
+
+    nothing = _Carry(
+        phase=jnp.asarray(_NOISE),
+        k=jnp.asarray(0),
+        at=begin,
+        spread=spread,
+        here=(begin, none),
+        held=jnp.zeros(space.size, bool),
+        length=jnp.asarray(1.0),
+        left=jnp.full(2, jnp.inf),
+        seen=none,
+    )
+    end, rounds = jax.lax.scan(search, nothing, jnp.array([False, True]))
+    u, found = end.here
+    points = (1 + _DRAWS) * _TURNS * fit.points * rounds.sum()
+    points += len(rounds) * space.size  # of `in_dip`
+    return Adjusted(
+        unit=u,
+        hessian=worth(found),
+        delta=found.delta,
+        raised=raised_to_range(space, u),
+        raised_hessian=worth(end.seen),
+        left=end.left,
+        simulated=1.0 * segments.count * segments.horizon * points,
+    )

@@ -1,0 +1,59 @@
+"""The long vector of all effects at all places, and how it becomes physics."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from easi_jax.gap.table import Column, Place
+from easi_jax.model import effects
+from easi_jax.model.effects import Effects
+
+
+class Layout:
+    """The long vector of all columns, and how it becomes `Effects`."""
+
+    def __init__(self, m: mujoco.MjModel, found: Sequence[Place]) -> None:
+        self.columns: list[Column] = []
+        self._index: dict[tuple[str, tuple[int, ...]], int] = {}
+        for place in found:
+            for c in place.columns:
+                key = (c.field, c.index)
+                if key not in self._index:
+                    self._index[key] = len(self.columns)
+                    self.columns.append(c)
+        self._none = effects.none(m)
+        self.neutral = np.array([c.neutral for c in self.columns], np.float64)
+
+    def __len__(self) -> int:
+        return len(self.columns)
+
+    def where(self, place: Place) -> np.ndarray:
+        """Indices of a place's columns in the vector."""
+        return np.array([self._index[(c.field, c.index)] for c in place.columns], int)
+
+    def effects(self, x: jax.Array) -> Effects:
+        """The effects of a vector ``(n,)``; pure.
+
+        A number without an index in a field of several is what all of them have on top
+        of their own.
+        """
+        changed = {}
+        by_field: dict[str, list[int]] = {}
+        for i, c in enumerate(self.columns):
+            by_field.setdefault(c.field, []).append(i)
+        for name, rows in by_field.items():
+            leaf = jnp.asarray(getattr(self._none, name), jnp.float32)
+            values = x[np.array(rows)].astype(jnp.float32)
+            own = [k for k, i in enumerate(rows) if self.columns[i].index]
+            if own:
+                of_each = [self.columns[rows[k]].index for k in own]
+                index = tuple(np.array(k) for k in zip(*of_each, strict=True))
+                leaf = leaf.at[index].set(values[np.array(own)])
+            for k in {*range(len(rows))} - {*own}:
+                same = values[k] - self.columns[rows[k]].neutral
+                leaf = leaf + same if leaf.ndim else values[k]
+            changed[name] = leaf
+        return self._none.replace(**changed)  # type: ignore[attr-defined]

@@ -1,0 +1,388 @@
+"""Which effects a model lacks: forward selection, backward elimination, rivals.
+
+Every candidate is fitted together with the model's own parameters and the effects found
+so far. Candidates are judged by what they predict of blocks of windows left out of the
+fit (by the fit's own derivatives, which for least squares needs no fit anew), never by
+the fitting error, and never by the held-out data.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from easi_jax.gap.batched_least_squares import (
+    Asks,
+    Bounds,
+    Fitted,
+    difference,
+    least_squares,
+    lockstep,
+)
+from easi_jax.gap.effect_set import Candidate, Model
+from easi_jax.gap.model_comparison import better, contains, rank
+from easi_jax.gap.predictor import BLOCK, Predictor
+from easi_jax.gap.table import Place
+from easi_jax.gap.whitening import Residuals
+from easi_jax.io.runs.step_cache import Arrays, Journal
+from easi_jax.progress import Progress, silent
+
+_SHORTLIST = 7  # names that are fitted in full at each stage
+_STARTS = 2  # of each
+_SCREENED = 2  # blocks of windows that a larger robot's effects are first tried on
+_TRIED = ("cost", "which", "end")
+_HOPELESS = 4.0  # times the best promise; beyond, only the first few are fitted
+
+_FELT = 1e-3  # of the most that a number of an effect changes
+
+
+class Selector:
+    """Fits sets of effects to some windows.
+
+    Its ``residuals`` have to be set before it fits, and ``floor``, the gap of a perfect
+    model, before it chooses. ``journal`` keeps what takes long.
+
+    ``steps``, where set, is an error of all predictions ``(count, H, nv)`` of which a
+    share is nobody's fault. That share is one number more at the end of the vectors.
+
+    Args:
+        predictor: predictions.
+        blocks: blocks of windows that are fitted.
+        count: windows in them that count.
+        bounds: of the whole vector.
+        group: block of cross-validation that each window is in, ``(count,)``.
+        own: indices of the model's own parameters that may be refitted.
+        progress: told how far long stages are.
+    """
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        blocks: np.ndarray,
+        count: int,
+        bounds: Bounds,
+        group: np.ndarray,
+        own: Sequence[int],
+        progress: Progress = silent,
+    ) -> None:
+        self.predictor, self.progress = predictor, progress
+        self.residuals: Residuals
+        self.floor = 0.0
+        self.journal = Journal()
+        self.blocks, self.count, self.bounds = blocks, count, bounds
+        self.group, self.own = group, tuple(own)
+        self.weight = np.ones(count)
+        self.steps: np.ndarray | None = None
+
+    @property
+    def neutral(self) -> np.ndarray:
+        """The vector of the model as given."""
+        more = [] if self.steps is None else [0.0]
+        return np.r_[self.predictor.neutral, more]
+
+    def plain(self, x: np.ndarray) -> np.ndarray:
+        """Vectors without the share."""
+        return x[..., : len(self.predictor.neutral)]
+
+    def errors(self, x: np.ndarray, some: np.ndarray | None = None) -> np.ndarray:
+        """Errors of the fitted windows under vectors ``(B, n)``, ``(B, W, H, nv)``;
+        ``some``: of those in some of the blocks, by their place among them."""
+        every = np.arange(len(self.blocks)) if some is None else some
+        found = self.predictor.errors(self.plain(x), self.blocks[every])
+        at = self.windows_of(every)
+        found = found[:, : len(at)]
+        if self.steps is not None:
+            found -= x[:, -1, None, None, None] * self.steps[at]
+        return found
+
+    def windows_of(self, some: np.ndarray) -> np.ndarray:
+        """Fitted windows in some of the blocks; the last block may not be full."""
+        at = (BLOCK * some[:, None] + np.arange(BLOCK)).reshape(-1)
+        return at[at < self.count]
+
+    def simulate(self, x: np.ndarray, some: np.ndarray | None = None) -> np.ndarray:
+        """Whitened errors ``(B, W, m)`` of vectors ``(B, n)``; ``some`` as in
+        `errors`."""
+        at = None if some is None else self.windows_of(some)
+        grouped = self.residuals.grouped(self.errors(x, some))
+        return self.residuals.whitened(grouped, at)
+
+    def columns(self, place: Place, fitted: bool = True) -> np.ndarray:
+        """Entries of the whole vector that belong to a place."""
+        index = self.predictor.layout.where(place) + self.predictor.own
+        return index[np.array(place.fitted)] if fitted else index
+
+    def active(self, places: Sequence[Place]) -> list[int]:
+        """Entries that a fit of these effects moves."""
+        found = [int(i) for p in places for i in self.columns(p)]
+        share = [] if self.steps is None else [len(self.predictor.neutral)]
+        return sorted({*self.own, *found, *share})
+
+    def started(self, x: np.ndarray, candidate: Candidate) -> np.ndarray:
+        """A vector with a candidate at its starting values."""
+        out = x.copy()
+        out[self.columns(candidate.place, fitted=False)] = candidate.start
+        return out
+
+    def without(self, x: np.ndarray, place: Place, kept: Sequence[Place]) -> np.ndarray:
+        """A vector with an effect taken out, shared columns of ``kept`` left."""
+        mine = set(self.columns(place, fitted=False).tolist())
+        for other in kept:
+            mine -= set(self.columns(other, fitted=False).tolist())
+        out = x.copy()
+        index = sorted(mine)
+        out[index] = self.predictor.neutral[index]
+        return out
+
+    def model(self, places: list[Place], fit: Fitted) -> Model:
+        """A fit with its cross-validated loss."""
+        unlikely = sum(p.unlikely(fit.x[self.columns(p, fitted=False)]) for p in places)
+        windows = self.cross_validated(fit)
+        loss, gap = self._of_blocks(windows)
+        felt = {p.key: self._felt(p, fit) for p in places}
+        return Model(places, fit, loss, gap, self.own, unlikely, windows, felt)
+
+    def _felt(self, place: Place, fit: Fitted) -> int:
+        """Fitted numbers of an effect that change predictions at all."""
+        at = np.searchsorted(fit.active, self.columns(place))
+        change = np.sqrt((fit.slope[..., at] ** 2).sum((0, 1)))
+        change = change * self.bounds.size[self.columns(place)]
+        if not np.isfinite(change).all() or not change.any():
+            return sum(place.fitted)
+        return int((change > _FELT * change.max()).sum())
+
+    def fit(self, places: list[Place], x: np.ndarray) -> Model:
+        """The best fit of some effects from ``x``."""
+        problem = least_squares(x[None], self.active(places), self.bounds, self.weight)
+        return self.model(places, self._solved([problem])[0])
+
+    def _solved(self, problems: Sequence[Asks]) -> list[Fitted]:
+        def solve() -> Arrays:
+            name = "fitting effects" if len(problems) > 1 else "fitting"
+            with self.progress(name, len(problems)) as shown:
+                found = lockstep(problems, self.simulate, ended=shown.advance)
+            return {f"{i}.{k}": v for i, f in enumerate(found) for k, v in f.arrays()}
+
+        kept = self.journal.remember(solve)
+        return [
+            Fitted.of({k: kept[f"{i}.{k}"] for k in Fitted.__dataclass_fields__})
+            for i in range(len(problems))
+        ]
+
+    def cross_validated(self, fit: Fitted) -> np.ndarray:
+        """Squared error of each window by a fit without its block, weighted,
+        ``(2, W)``: of whitened errors, and in units of the gap; inf where a prediction
+        is not finite.
+
+        One Gauss-Newton step from the whole fit, exact where errors are linear.
+        """
+        w, r, j = self.weight, fit.residual, fit.slope
+        if not (np.isfinite(r).all() and np.isfinite(j).all()):
+            return np.full((2, len(w)), np.inf)
+        a = j.shape[-1]
+        out = np.zeros((2, len(w)))
+        size = self.bounds.size[fit.active]
+        j = j * size
+        normal = np.einsum("w,wma,wmb->ab", w, j, j, optimize=True)
+        gradient = np.einsum("w,wma,wm->a", w, j, r, optimize=True)
+        ridge = 1e-9 * np.diag(np.diag(normal) + 1e-30)
+        x = fit.x[fit.active]
+        stuck = (x <= self.bounds.low[fit.active]) | (x >= self.bounds.high[fit.active])
+        free = ~stuck
+        for b in range(int(self.group.max()) + 1):
+            at = self.group == b
+            jb, rb, wb = j[at], r[at], w[at]
+            if a and free.any():
+                left = normal - np.einsum("w,wma,wmb->ab", wb, jb, jb, optimize=True)
+                pull = gradient - np.einsum("w,wma,wm->a", wb, jb, rb, optimize=True)
+                inner = (left + ridge)[np.ix_(free, free)]
+                move = np.zeros(a)
+                move[free] = -np.linalg.lstsq(inner, pull[free], rcond=1e-10)[0]
+                rb = rb + jb @ move
+            raw = np.einsum("wij,wj->wi", self.residuals.plain[at], rb)
+            out[:, at] = np.stack([wb * (e**2).mean(1) for e in (rb, raw)])
+        return out
+
+    def _of_blocks(self, windows: np.ndarray) -> np.ndarray:
+        """Means over each block, ``(2, blocks)``, of weighted ``(2, W)``."""
+        total = np.maximum(np.bincount(self.group, self.weight), 1e-30)
+        return np.array([np.bincount(self.group, x) / total for x in windows])
+
+    # -- stages ----------------------------------------------------------------
+
+    def screened(
+        self, base: Model, candidates: Sequence[Candidate]
+    ) -> list[tuple[float, Candidate]]:
+        """Candidates with the cost that one Gauss-Newton step promises, best first."""
+        kept = self.journal.remember(lambda: self._tried(base, candidates))
+        out = [
+            (float(cost), replace(candidates[i], ends=tuple(end)))
+            for cost, i, end in zip(*(kept[k] for k in _TRIED), strict=True)
+        ]
+        return sorted(out, key=lambda item: item[0])
+
+    def _tried(self, base: Model, candidates: Sequence[Candidate]) -> Arrays:
+        """Costs, indices and ends of the candidates that predict finite numbers."""
+        x = base.fit.x
+        some = np.arange(len(self.blocks))
+        if self.predictor.simulator.wide:
+            # A short list of names needs no more, and takes minutes as it is.
+            some = some[:: max(1, len(some) // _SCREENED)]
+        seen = self.windows_of(some)
+        w = self.weight[seen]
+        asks, spans = [], []
+        for c in candidates:
+            y = self.started(x, c)
+            cols = self.columns(c.place)
+            if c.place.effect == "torque_ripple":
+                cols = cols[[0, 2]]  # amplitude and phase; cycles come from the grid
+            moved, step = difference(y, cols, self.bounds)
+            asks.append(np.concatenate([y[None], moved]))
+            spans.append((cols, step))
+        got, at = self._many(np.concatenate(asks), some), 0
+        known = base.fit.slope[seen] * self.bounds.size[base.fit.active]
+        costs, which, ends = [], [], []
+        for i, (c, ask) in enumerate(zip(candidates, asks, strict=True)):
+            cols, step = spans[i]
+            part = got[at : at + len(ask)]
+            at += len(ask)
+            r = part[0]
+            if not np.isfinite(part).all():
+                continue
+            new = np.moveaxis((part[1:] - r) / step[:, None, None], 0, -1)
+            j = np.concatenate([known, new * np.abs(step)], -1)
+            cost, move = _promised(r, j, w)
+            index = np.concatenate([base.fit.active, cols])
+            size = np.concatenate([self.bounds.size[base.fit.active], np.abs(step)])
+            end = ask[0].copy()
+            end[index] += move * size
+            if c.place.effect == "torque_ripple":
+                end[cols] = as_sine(ask[0][cols], end[cols])
+            # Not the others: a force limit that is off lies outside its bounds.
+            end[index] = np.clip(
+                end[index], self.bounds.low[index], self.bounds.high[index]
+            )
+            costs.append(cost)
+            which.append(i)
+            ends.append(end)
+        shape = (len(ends), len(base.fit.x))
+        found = np.array(costs), np.array(which, int), np.reshape(ends, shape)
+        return dict(zip(_TRIED, found, strict=True))
+
+    def _many(self, x: np.ndarray, some: np.ndarray, most: int = 256) -> np.ndarray:
+        got = []
+        with self.progress("trying effects", len(x)) as shown:
+            for i in range(0, len(x), most):
+                got.append(self.simulate(x[i : i + most], some))
+                shown.advance(len(got[-1]))
+        return np.concatenate(got)
+
+    def fitted(
+        self, places: list[Place], x: np.ndarray, chosen: Sequence[Candidate]
+    ) -> list[Model]:
+        """Each candidate beside ``places``, the best of its starts, by name."""
+        problems = [
+            least_squares(
+                np.array([self.started(x, c), *([c.ends] if c.ends else [])]),
+                self.active([*places, c.place]),
+                self.bounds,
+                self.weight,
+            )
+            for c in chosen
+        ]
+        fits = self._solved(problems)
+        best: dict[str, tuple[float, Place, Fitted]] = {}
+        for c, f in zip(chosen, fits, strict=True):
+            key = c.place.key
+            if key not in best or f.cost < best[key][0]:
+                best[key] = (f.cost, c.place, f)
+        return [self.model([*places, p], f) for _, p, f in best.values()]
+
+    def expanded(
+        self, base: Model, candidates: Sequence[Candidate]
+    ) -> tuple[list[Model], list[str]]:
+        """A model with one effect more, the most promising ones, best first; and the
+        names of all by what they promise."""
+        screened = self.screened(base, candidates)
+        models = self.fitted(base.places, base.fit.x, shortlist(screened))
+        names = dict.fromkeys(c.place.key for _, c in screened)
+        return sorted(models, key=rank), [*names]
+
+    def richer(self, model: Model, candidates: Sequence[Candidate]) -> Model:
+        """The model with effects replaced by ones that contain them and do better."""
+        for place in list(model.places):
+            more = [c for c in candidates if contains(c.place, place)]
+            if not more:
+                continue
+            kept = [p for p in model.places if p is not place]
+            found = self.fitted(kept, model.fit.x, more)
+            best = min(found, key=lambda m: m.loss.mean())
+            # Of one nature at one place: also a small gain says which.
+            if better(best, model, 0.0):
+                order = [best.places[-1] if p is place else p for p in model.places]
+                model = replace(best, places=order)
+        return model
+
+    def needed(self, model: Model) -> Model:
+        """The model less the effects that it predicts as well without."""
+        while len(model.places) > 1:
+            shorter = []
+            for place in model.places:
+                kept = [p for p in model.places if p is not place]
+                shorter.append(self.fit(kept, self.without(model.fit.x, place, kept)))
+            best = min(shorter, key=lambda m: m.loss.mean())
+            if better(model, best, self.floor):
+                break
+            model = best
+        return model
+
+
+def as_sine(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Amplitude and phase where a step from a small sine of phase 0 leads: it is linear
+    in the sine's and the cosine's share, not in the phase."""
+    cosine = start[0] * (end[1] - start[1])
+    return np.array([np.hypot(end[0], cosine), np.arctan2(cosine, end[0])])
+
+
+def shortlist(screened: Sequence[tuple[float, Candidate]]) -> list[Candidate]:
+    """The most promising names with the best starts of each, and the special cases of
+    those names, which promise less but ask for less."""
+    chosen = _promising(screened)
+    general = [mine[0].place for mine in chosen.values()]
+    for _, c in screened:
+        if any(contains(g, c.place) for g in general):
+            mine = chosen.setdefault(c.place.key, [])
+            if c not in mine and len(mine) < _STARTS:
+                mine.append(c)
+    return [c for mine in chosen.values() for c in mine]
+
+
+def _promising(
+    screened: Sequence[tuple[float, Candidate]],
+) -> dict[str, list[Candidate]]:
+    chosen: dict[str, list[Candidate]] = {}
+    first = screened[0][0] if screened else 0.0
+    for cost, c in screened:
+        mine = chosen.get(c.place.key)
+        if mine is None:
+            hopeless = cost > _HOPELESS * first and len(chosen) >= _SHORTLIST // 2
+            if len(chosen) == _SHORTLIST or hopeless:
+                continue
+            mine = chosen.setdefault(c.place.key, [])
+        if len(mine) < _STARTS:
+            mine.append(c)
+    return chosen
+
+
+def _promised(
+    residual: np.ndarray, slope: np.ndarray, weight: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Cost after a Gauss-Newton step, and the step."""
+    root = np.sqrt(weight)[:, None]
+    r = (root * residual).reshape(-1)
+    j = (root[..., None] * slope).reshape(-1, slope.shape[-1])
+    normal, gradient = j.T @ j, j.T @ r
+    curvature = np.diag(normal)
+    ridge = 1e-6 * np.diag(curvature + curvature.max() + 1e-30)
+    step = -np.linalg.solve(normal + ridge, gradient)
+    return float(0.5 * r @ r + 0.5 * gradient @ step), step

@@ -1,0 +1,214 @@
+"""The gap: open-loop prediction error in units of the motion, and its noise floor."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from easi_jax.data.recording import Run
+from easi_jax.gap.whitening import noise_rows
+from easi_jax.gap.window_set import WindowSet
+from easi_jax.model.quantities import joint_name
+
+_VISIBLE = 5.0  # times the noise
+_ODD = 3.0  # times the error of other runs
+_FOLLOWED = 1.5  # times the floor: a run that the model predicts
+_DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class Channels:
+    """Positions that are compared.
+
+    Attributes:
+        names: of each degree of freedom, ``(nv,)``.
+        joints: the joint that each belongs to.
+        units: m or rad.
+        scale: errors are divided by it; infinite where left out, ``(nv,)``.
+        ignored: reason for each that is left out.
+    """
+
+    names: tuple[str, ...]
+    joints: tuple[str, ...]
+    units: tuple[str, ...]
+    scale: np.ndarray
+    ignored: dict[str, str]
+
+
+def channels(
+    m: mujoco.MjModel,
+    names: Sequence[str],
+    runs: Sequence[Run],
+    noise: np.ndarray,
+    steps: int,
+) -> Channels:
+    """What the gap of these runs is made of.
+
+    A channel's scale is its standard deviation over all rows, or for one without bounds
+    (a free base's x and y, a hinge that turns on) the RMS of its change over ``steps``
+    control steps.
+    """
+    nv = m.nv
+    parts, changes = [], []
+    for run in runs:
+        origin = np.broadcast_to(runs[0].qpos[0], run.qpos.shape)
+        parts.append(run.configuration.difference(origin, run.qpos))
+        if len(run) > steps:
+            changes.append(
+                run.configuration.difference(run.qpos[:-steps], run.qpos[steps:])
+            )
+    everything = np.concatenate(parts)
+    change = np.sqrt(np.mean(np.concatenate(changes) ** 2, 0))
+    spread = everything.std(0)
+    joints, units, unbounded = [], [], np.zeros(nv, bool)
+    for j in range(m.njnt):
+        kind, d = int(m.jnt_type[j]), int(m.jnt_dofadr[j])
+        name = joint_name(m, j)
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            joints += [name] * 6
+            units += ["m"] * 3 + ["rad"] * 3
+            unbounded[d : d + 2] = True
+        elif kind == mujoco.mjtJoint.mjJNT_BALL:
+            joints += [name] * 3
+            units += ["rad"] * 3
+        else:
+            hinge = kind == mujoco.mjtJoint.mjJNT_HINGE
+            joints.append(name)
+            units.append("rad" if hinge else "m")
+            turns = np.ptp(everything[:, d]) > 2 * np.pi
+            unbounded[d] = hinge and not m.jnt_limited[j] and turns
+    scale = np.where(unbounded, change, spread)
+    quiet = change < _VISIBLE * noise
+    ignored = {
+        names[d]: (
+            f"moves by {change[d]:.2g} {units[d]} over a horizon, less than "
+            f"{_VISIBLE:g} times its noise of {noise[d]:.2g} {units[d]}"
+        )
+        for d in np.flatnonzero(quiet).tolist()
+    }
+    scale = np.where(quiet | (scale <= 0), np.inf, scale)
+    return Channels(tuple(names), tuple(joints), tuple(units), scale, ignored)
+
+
+def gap(square: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """The gap from mean squares ``(..., nv)`` of each channel."""
+    used = np.isfinite(scale)
+    return np.sqrt(np.mean(square[..., used] / scale[used] ** 2, -1))
+
+
+def squares(errors: np.ndarray) -> np.ndarray:
+    """Mean squares of each window and channel, ``(W, nv)``, of ``(W, H, nv)``."""
+    return np.mean(errors.astype(np.float64) ** 2, 1)
+
+
+def odd_runs(
+    square: np.ndarray, scale: np.ndarray, run: np.ndarray
+) -> dict[int, float]:
+    """Runs whose windows are predicted far worse than those of the other runs.
+
+    Args:
+        square: mean squares of each window, ``(W, nv)``.
+        run: which run each window is of, ``(W,)``.
+
+    Returns:
+        For each such run its median error over that of the others; empty where there
+        are fewer than three runs.
+    """
+    error = gap(square, scale)
+    typical = {int(r): float(np.median(error[run == r])) for r in np.unique(run)}
+    if len(typical) < 3:
+        return {}
+    out = {}
+    for r, mine in typical.items():
+        others = float(np.median([x for k, x in typical.items() if k != r]))
+        if mine > _ODD * others:
+            out[r] = mine / max(others, 1e-30)
+    return out
+
+
+def odd_of_two(
+    square: np.ndarray, scale: np.ndarray, run: np.ndarray, floor: float
+) -> dict[int, float]:
+    """Of two runs the one that the other's model does not predict.
+
+    Whichever is odd, the model follows the other one down to its noise, ``floor``, and
+    misses this one by far. Arguments and result: `odd_runs`.
+    """
+    error = gap(square, scale)
+    first, second = (int(r) for r in np.unique(run))
+    a, b = (float(np.median(error[run == r])) for r in (first, second))
+    odd, mine, other = (first, a, b) if a > b else (second, b, a)
+    if other < _FOLLOWED * floor and mine > _ODD * _FOLLOWED * max(other, floor):
+        return {odd: mine / max(other, 1e-30)}
+    return {}
+
+
+def resampled(count: int, seed: int) -> np.ndarray:
+    """Bootstrap weights of windows, ``(draws, W)``; neighbors overlap, so in pairs."""
+    rng = np.random.default_rng(seed)
+    pairs = -(-count // 2)
+    picks = rng.integers(0, pairs, (_DRAWS, pairs))
+    out = np.zeros((_DRAWS, 2 * pairs))
+    for k in range(2):
+        np.add.at(out, (np.arange(_DRAWS)[:, None], 2 * picks + k), 1.0)
+    return out[:, :count] / np.maximum(out[:, :count].sum(1, keepdims=True), 1.0)
+
+
+def interval(
+    square: np.ndarray, scale: np.ndarray, seed: int = 0
+) -> tuple[float, float]:
+    """95 % interval of the gap of windows with mean squares ``(W, nv)``."""
+    drawn = gap(resampled(len(square), seed) @ square, scale)
+    low, high = np.quantile(drawn, (0.025, 0.975))
+    return float(low), float(high)
+
+
+def floor_squares(
+    windows: WindowSet, runs: Sequence[Run], slope: np.ndarray, noise: np.ndarray
+) -> np.ndarray:
+    """Expected mean squares of a perfect model, ``(W, nv)``.
+
+    The noise of the start state, through the fit of its velocity and the prediction,
+    and that of the target; the exact expectation of drawing both.
+
+    Args:
+        slope: of errors with the start state, ``(2 nv, W, H, nv)``.
+        noise: of measured positions, ``(nv,)``.
+    """
+    nv, steps = len(noise), slope.shape[2]
+    out = np.zeros((len(windows), nv))
+    for w in range(len(windows)):
+        run, row = runs[windows.run[w]], int(windows.row[w])
+        origin, weights = noise_rows(run, row, steps)
+        for c in range(nv):
+            a = slope[nv + c, w][:, :, None] * weights  # (H, nv, rows)
+            a[:, :, origin] += slope[c, w]
+            a[np.arange(steps), c, origin + np.arange(1, steps + 1)] -= 1.0
+            out[w] += noise[c] ** 2 * (a**2).sum(-1).mean(0)
+    return out
+
+
+def drawn_noise(
+    windows: WindowSet,
+    runs: Sequence[Run],
+    noise: np.ndarray,
+    steps: int,
+    draws: int,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Noise of start states ``(draws, W, 2 nv)`` and of targets ``(draws, W, H, nv)``.
+
+    Both come from the same noisy rows: the velocity is fitted to some of the targets.
+    """
+    nv = len(noise)
+    offsets = np.zeros((draws, len(windows), 2 * nv))
+    targets = np.zeros((draws, len(windows), steps, nv))
+    for w in range(len(windows)):
+        run, row = runs[windows.run[w]], int(windows.row[w])
+        origin, weights = noise_rows(run, row, steps)
+        rows = noise * rng.normal(size=(draws, len(weights), nv))
+        offsets[:, w, :nv] = rows[:, origin]
+        offsets[:, w, nv:] = np.einsum("k,dkc->dc", weights, rows)
+        targets[:, w] = rows[:, origin + 1 : origin + 1 + steps]
+    return offsets, targets

@@ -1,0 +1,186 @@
+"""Whether a set of effects is better than another, by their cross-validated losses."""
+
+from collections.abc import Sequence
+from math import erf, sqrt
+
+import numpy as np
+
+from easi_jax.gap.effect_set import Model
+from easi_jax.gap.table import Place
+from easi_jax.model.effect_catalog import RARE
+
+_SURE = 1.7  # standard errors by which an effect has to help
+_LIKELY = 1.0  # by either measure
+HELPS = 0.05  # share of the squared gap by which each of its numbers has to help
+_LARGE = 0.3
+GOAL = 1.25  # times the floor: a gap that is as good as closed
+_PLAIN = 2.0  # times as far above the floor: a gap beyond doubt
+_CLOSER = 3.0  # times as much has to be gained where it is
+_TINY = 1e-300
+_RARE = 0.1  # relative loss by which a rare effect has to be better than others
+_ALIKE = 0.02  # relative difference of losses that says nothing
+_AS_GOOD = 1.5  # standard errors within which the simpler of two candidates wins
+_NEARLY = 0.7  # share of what the best explains
+_FEW = 0.25  # share of the windows
+_LEAST = 3  # windows that can tell
+
+
+def advantage(a: np.ndarray, b: np.ndarray) -> float:
+    """By how many standard errors losses ``a`` are below ``b``, block by block."""
+    d = b - a
+    error = d.std(ddof=1) / sqrt(len(d)) if len(d) > 1 else np.inf
+    return float(d.mean() / max(error, 1e-12 * max(abs(b.mean()), 1e-30)))
+
+
+def rank(model: Model) -> float:
+    """Cross-validated loss, with a handicap for what machines rarely have."""
+    return float(model.loss.mean()) * (1.0 + _RARE * model.unlikely)
+
+
+def better(model: Model, base: Model, floor: float) -> bool:
+    """Whether a model predicts better than a smaller one by more than chance.
+
+    Losses are compared in units of the noise and of the gap. On average over both the
+    gain has to be sure, and in one of them as large as the share that each number of
+    the model has to earn, in the other a third of that. With an effect that machines
+    rarely have, both have to be sure, and twice as large, since such effects mend a
+    little of everything. A large gain may also be sure by its ratios: where a few
+    blocks hold most of the error, differences scatter as much as they are large.
+    Where the gap is all but closed, small gains count for nothing: no machine quite
+    follows any physics.
+
+    An effect that acts in a few windows only, such as a force limit, leaves most blocks
+    as they are; it has to help in those windows, one by one.
+
+    Args:
+        floor: the gap of a perfect model.
+    """
+    helps = HELPS * max(1, len(model.fit.active) - len(base.fit.active))
+    if base.gap.mean() < (GOAL * floor) ** 2:
+        helps *= _CLOSER
+    known = {p.key for p in base.places}
+    rare = any(p.effect in RARE for p in model.places if p.key not in known)
+    both = ((model.loss, base.loss), (model.gap, base.gap))
+    gain = [1 - a.mean() / max(b.mean(), 1e-300) for a, b in both]
+    large = min(gain) > _LARGE
+    sure = [_sure(a, b, large) for a, b in both]
+    acting = _acting(model, base)
+    if len(acting):
+        single = zip(model.windows[:, acting], base.windows[:, acting], strict=True)
+        # Windows overlap by a half.
+        ones = [_sure(a, b, large) / sqrt(2) for a, b in single]
+        sure = [max(pair) for pair in zip(sure, ones, strict=True)]
+    if rare:
+        return min(sure) > _SURE and min(gain) > 2 * helps
+    likely = min(sure) > _LIKELY and sum(sure) > 2 * _SURE
+    return likely and max(gain) > helps and min(gain) > helps / 3
+
+
+def _sure(a: np.ndarray, b: np.ndarray, by_ratio: bool) -> float:
+    """`advantage` of losses, or of their logarithms where that is more."""
+    plain = advantage(a, b)
+    if not by_ratio:
+        return plain
+    return max(plain, advantage(np.log(a + _TINY), np.log(b + _TINY)))
+
+
+def _acting(model: Model, base: Model) -> np.ndarray:
+    """Windows whose predictions differ by more than noise, where they are few; else
+    none."""
+    mine, other = model.fit.residual, base.fit.residual
+    if mine.shape != other.shape or not mine.size:
+        return np.zeros(0, int)
+    return _few(((mine - other) ** 2).mean(-1) > 1.0)
+
+
+def _few(windows: np.ndarray) -> np.ndarray:
+    """Indices of windows ``(W,)``, where those are few that can tell; else none."""
+    found = np.flatnonzero(windows)
+    few = _LEAST <= len(found) <= _FEW * len(windows)
+    return found if few else found[:0]
+
+
+def size_of(model: Model) -> int:
+    """Fitted numbers of its last effect that can be felt."""
+    place = model.places[-1]
+    return model.felt.get(place.key, sum(place.fitted))
+
+
+# An effect that contains another as a special case.
+_CONTAINS = {
+    "stribeck_friction": "coulomb_friction",
+    "joint_stiffness": "constant_force",
+}
+
+
+def contains(a: Place, b: Place) -> bool:
+    """Whether effect ``a`` is ``b`` and more, at the same place."""
+    return a.at == b.at and a.kind == b.kind and _CONTAINS.get(a.effect) == b.effect
+
+
+def _within(a: Model, b: Model) -> bool:
+    """Whether a model is another with one effect less general."""
+    mine, theirs = ({p.key: p for p in x.places} for x in (a, b))
+    only = [p for k, p in mine.items() if k not in theirs]
+    rest = [p for k, p in theirs.items() if k not in mine]
+    return len(only) == len(rest) == 1 and contains(rest[0], only[0])
+
+
+def simplest(models: Sequence[Model], base: Model) -> Model:
+    """The best of models sorted by loss, or a simpler one that is as good.
+
+    One that the best contains as a special case comes first also where it is only
+    nearly as good: the rest is asked for once other effects are in (`Selector.richer`).
+    """
+    best = models[0]
+    for m in models[1:]:
+        if _within(m, best):
+            whole = base.loss.mean() - best.loss.mean()
+            if base.loss.mean() - m.loss.mean() > _NEARLY * whole:
+                best = m
+        elif len(m.fit.active) < len(best.fit.active):
+            close = m.loss.mean() < (1 + HELPS) * best.loss.mean()
+            if close and advantage(best.loss, m.loss) < _AS_GOOD:
+                best = m
+    return best
+
+
+def probability(model: Model, rival: Model) -> float:
+    """That a model is better than a rival, by their cross-validated losses.
+
+    In units of the noise and of the gap, on average over both, as `better` asks; where
+    only a few windows tell the two apart, also by those, one by one. What fits as well
+    with more numbers is less likely by a half standard error for each; what only adds
+    to the model counts less, however well it does.
+    """
+    t = 0.0
+    for mine, theirs in ((model.loss, rival.loss), (model.gap, rival.gap)):
+        d = theirs - mine
+        error = max(d.std(ddof=1) / sqrt(len(d)), _ALIKE * mine.mean())
+        t += 0.5 * float(d.mean()) / max(error, _TINY)
+    apart = _few(np.abs(model.windows - rival.windows).max(0, initial=0.0) > 1.0)
+    if len(apart):
+        mine, theirs = (np.log(x.windows[:, apart] + _TINY) for x in (model, rival))
+        # Windows overlap by a half.
+        single = np.mean(list(map(advantage, mine, theirs))) / sqrt(2)
+        t = max(t, float(single), key=abs)
+    t += 0.5 * (size_of(rival) - size_of(model))
+    if contains(rival.places[-1], model.places[-1]):
+        t = max(t, -1.0) + 1.0
+    return 0.5 * (1 + erf(t / sqrt(2)))
+
+
+def explained(before: float, after: float, floor: float) -> float:
+    """How far to trust that an effect is what it seems, by the share that it and those
+    after it close of the gap ``before`` it: the rest may be of something that they
+    stand in for.
+
+    Squared, which is what makes the confidence come true (`benchmarks.gap`). Where
+    little more than noise was left before it, it may mend what no effect is.
+    """
+    clear = (before - floor) / (_PLAIN * (GOAL - 1) * floor)
+    clear = min(max(clear, 0.0), 1.0)
+    if after <= GOAL * floor:
+        return clear
+    left = (after - floor) / max(before - floor, after - floor)
+    return clear * (1.0 - left) ** 2

@@ -1,0 +1,186 @@
+"""What the gap workflow found, as values."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from easi_jax.gap.effect_set import Model
+from easi_jax.gap.error_localization import Conditions
+from easi_jax.gap.forward_selection import Selector
+from easi_jax.gap.gap_metric import Channels
+from easi_jax.gap.table import Place
+from easi_jax.gap.window_set import WindowSet
+from easi_jax.model.parameters import ParameterSpace
+
+
+@dataclass(frozen=True)
+class Part:
+    """One actuator of an effect that all have.
+
+    Attributes:
+        place: the same effect there.
+        gap_after: held-out gap with the effect at it and those before it.
+    """
+
+    place: Place
+    gap_after: float
+
+
+@dataclass(frozen=True)
+class Found:
+    """One effect that the model lacks.
+
+    Attributes:
+        place: which, and where.
+        values: of its parameters, with their standard deviations.
+        confidence: probability of this name against its rivals, an unknown effect
+            among them.
+        indistinguishable: rivals that predict the held-out data as well.
+        gap_after: held-out gap with it and those before it.
+        deviations: standard deviation of each of the place's columns that the fit
+            moved, by its number among them.
+        parts: of a shared effect (`Place.shared`), the actuators that it is seen at.
+    """
+
+    place: Place
+    values: dict[str, tuple[float, float, str]]
+    confidence: float
+    indistinguishable: list[str]
+    gap_after: float
+    deviations: dict[int, float] = field(default_factory=dict)
+    parts: tuple[Part, ...] = ()
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Held-out gap of one model.
+
+    Attributes:
+        gap: in units of the motion.
+        interval: its 95 % interval, by bootstrap over windows.
+        si: RMS error of each degree of freedom, ``(nv,)``.
+        square: mean squares of each window, ``(W, nv)``.
+        errors: of every step, ``(W, H, nv)``.
+        conditions: what was going on in the rows that the errors belong to.
+    """
+
+    gap: float
+    interval: tuple[float, float]
+    si: np.ndarray
+    square: np.ndarray
+    errors: np.ndarray
+    conditions: Conditions
+
+
+@dataclass
+class Outcome:
+    """What the workflow found; see the log format's ``gap.json``.
+
+    Attributes:
+        x: the whole vector at the end, and ``active`` its entries that the last fit
+            moved.
+        disagreeing: runs that the model predicts far worse than the others, with how
+            many times.
+        horizon: of the predictions [s].
+        record_next: what to record to tell names apart, a sentence for each pair.
+    """
+
+    verdict: str
+    found: list[Found]
+    refitted: list[dict]
+    before: Figures
+    refit: Figures
+    after: Figures
+    floor: float
+    floor_si: np.ndarray
+    channels: Channels
+    held: WindowSet
+    x: np.ndarray
+    active: list[int]
+    notes: list[str] = field(default_factory=list)
+    disagreeing: dict[str, float] = field(default_factory=dict)
+    record_next: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+    horizon: float = 0.0
+
+
+def for_people(
+    place: Place, got: dict[str, tuple[float, float, str]]
+) -> dict[str, tuple[float, float, str]]:
+    """Parameters as the table states them, from those that are fitted."""
+    out = dict(got)
+    if place.effect == "joint_stiffness":
+        (k, dk, unit), (s, ds, _) = got["stiffness"], got["rest"]
+        rest = s / k if k > 0 else 0.0
+        relative = math.hypot(ds / s if s else 0.0, dk / k if k > 0 else 0.0)
+        length = "rad" if "rad" in unit else "m"
+        out["rest"] = (rest, abs(rest) * relative, length)
+    if place.effect == "stribeck_friction":
+        (kinetic, dk, unit), (extra, de, _) = got["kinetic"], got["static"]
+        out["static"] = (kinetic + extra, math.hypot(dk, de), unit)
+    if place.effect == "torque_ripple":
+        phase, dp, unit = got["phase"]
+        out["phase"] = (math.remainder(phase, 2 * math.pi), dp, unit)
+    return out
+
+
+class Numbers:
+    """What a model was fitted to.
+
+    Args:
+        selector: that fitted it.
+        model: the fit.
+    """
+
+    def __init__(self, selector: Selector, model: Model) -> None:
+        self.selector, self.model = selector, model
+        active = model.fit.active.tolist()
+        std = _deviations(selector, model).tolist()
+        self._std = dict(zip(active, std, strict=True))
+
+    def deviations(self, place: Place) -> dict[int, float]:
+        """Of a place's columns that the fit moved, by number."""
+        index = self.selector.columns(place, fitted=False).tolist()
+        return {k: self._std[i] for k, i in enumerate(index) if i in self._std}
+
+    def values(self, place: Place) -> dict[str, tuple[float, float, str]]:
+        """Parameters of an effect as the table names them: value, standard deviation,
+        unit."""
+        index = self.selector.columns(place, fitted=False)
+        std = self.deviations(place)
+        got = {}
+        for k, (i, c) in enumerate(zip(index, place.columns, strict=True)):
+            if c.parameter:
+                value = c.of * float(self.model.fit.x[i])
+                got[c.parameter] = (value, c.of * std.get(k, 0.0), c.unit)
+        return for_people(place, got)
+
+    def refitted(self, space: ParameterSpace) -> list[dict]:
+        """The model's own parameters that the fit moved."""
+        return [
+            {
+                "address": address,
+                "from": float(space.parameters[i].nominal),
+                "to": float(self.model.fit.x[i]),
+                "std": self._std[i],
+            }
+            for i in self.model.own
+            for address in space.parameters[i].addresses
+        ]
+
+
+def _deviations(selector: Selector, model: Model) -> np.ndarray:
+    """Standard deviations of a fit's active entries, from its windows."""
+    f, w = model.fit, selector.weight
+    if not len(f.active):
+        return np.zeros(0)
+    size = selector.bounds.size[f.active]
+    j = f.slope * size
+    normal = np.einsum("w,wma,wmb->ab", w, j, j, optimize=True)
+    score = np.einsum("w,wma,wm->wa", w, j, f.residual, optimize=True)
+    inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
+    # Windows as they scatter, and no better than what their noise allows.
+    scattered = inverse @ (score.T @ score) @ inverse
+    cov = np.where(np.diag(scattered) > np.diag(inverse), scattered, inverse)
+    return np.sqrt(np.maximum(np.diag(cov), 0.0)) * size

@@ -1,0 +1,285 @@
+"""Readings that disagree with the positions beside them: late, or off by a constant.
+
+They say nothing of the plant, and no prediction of motion shows them: a velocity that a
+drive has filtered, and the named sensors of the model whose readings follow from
+positions and velocities alone (encoders at another place, gyroscopes, positions of
+sites ...).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import sqrt
+
+import mujoco
+import numpy as np
+
+from easi_jax.data.recording import Run
+from easi_jax.data.windows import fitted_velocity
+
+_LONGEST = 0.1  # s
+_LATE = 0.003  # s; less is the velocity fit's own doing
+_ALIKE = 0.5  # share of the squared difference that the shift has to explain
+PIECES = 10
+
+_LONGEST = 0.1  # s
+_OFF = 3.0  # standard errors
+_SMALL = 0.01  # of what moves: a constant below it is no news
+_OWN_STEPS = 1.5  # physics steps: readings taken before a step are that late
+_SAME_STEP = 1e-6
+_GEOMETRY = 0.5  # of the confidence, where the model's lengths may be wrong instead
+_NO_NUMBER = {"CLOCK", "USER", "PLUGIN"}
+_KINDS = {mujoco.mjtDataType.mjDATATYPE_REAL, mujoco.mjtDataType.mjDATATYPE_POSITIVE}
+_STAGES = {mujoco.mjtStage.mjSTAGE_POS, mujoco.mjtStage.mjSTAGE_VEL}
+
+
+@dataclass(frozen=True)
+class ReadingFault:
+    """An effect in a reading.
+
+    Attributes:
+        effect: ``sensor_delay`` or ``sensor_bias``.
+        at: ``qvel.JOINT``, or the sensor's name.
+        columns, std: its numbers, by columns of
+            `easi_jax.model.found_effects.EffectEntry`.
+        parameters: by the table's names: value, standard deviation, unit.
+        confidence: share of pieces of the data that show it by themselves, one more of
+            either kind counted (Laplace).
+    """
+
+    effect: str
+    at: str
+    columns: Mapping[str, float]
+    std: Mapping[str, float]
+    parameters: Mapping[str, tuple[float, float, str]]
+    confidence: float
+
+    @property
+    def place(self) -> str:
+        """In words."""
+        if self.at.startswith("qvel."):
+            return f'measured velocity of "{self.at.removeprefix("qvel.")}"'
+        return f'sensor "{self.at}"'
+
+
+def reading_faults(m: mujoco.MjModel, runs: Sequence[Run]) -> list[ReadingFault]:
+    """What is wrong with the velocities and the named sensors of ``runs``."""
+    joints = {int(d): m.joint(j).name for j, d in enumerate(m.jnt_dofadr)}
+    out = [
+        _late(f"qvel.{joints[dof]}", lag.seconds, lag.std, lag.confidence)
+        for dof, lag in velocity_lags(runs).items()
+        if dof in joints
+    ]
+    asked = [i for i in range(m.nsensor) if m.sensor(i).name and _follows(m, i)]
+    named = {m.sensor(i).name for i in asked}
+    used = [r for r in runs if abs(r.dt / runs[0].dt - 1) < _SAME_STEP]
+    right = [_expected(m, r) if named & set(r.sensors) else np.empty(0) for r in used]
+    for i in asked:
+        name, part = m.sensor(i).name, _columns(m, i)
+        both = [
+            (np.asarray(run.sensors[name], float), all_right[:, part])
+            for run, all_right in zip(used, right, strict=True)
+            if name in run.sensors
+        ]
+        if both:
+            out += _faults(m, i, both, used[0].dt)
+    return out
+
+
+def _columns(m: mujoco.MjModel, i: int) -> slice:
+    return slice(m.sensor_adr[i], m.sensor_adr[i] + m.sensor_dim[i])
+
+
+def _late(at: str, seconds: float, std: float, confidence: float) -> ReadingFault:
+    told = {"delay": (seconds, std, "s")}
+    columns, stds = {"late": seconds}, {"late": std}
+    return ReadingFault("sensor_delay", at, columns, stds, told, confidence)
+
+
+def _follows(m: mujoco.MjModel, i: int) -> bool:
+    """Whether the reading is numbers that positions and velocities determine."""
+    return (
+        mujoco.mjtStage(int(m.sensor_needstage[i])) in _STAGES
+        and mujoco.mjtDataType(int(m.sensor_datatype[i])) in _KINDS
+        and _kind(m, i) not in _NO_NUMBER
+    )
+
+
+def _faults(
+    m: mujoco.MjModel, i: int, both: Sequence[tuple[np.ndarray, np.ndarray]], dt: float
+) -> list[ReadingFault]:
+    """Of one sensor, from its readings and what they should be, ``(T, dim)`` each."""
+    name = m.sensor(i).name
+    shifts = round(_LONGEST / dt) + 1
+    pieces = _pieces(both, shifts)
+    if pieces is None:
+        return []
+    moved, off = pieces
+    # A constant is no lateness: `off (rows, shifts, dim)` without its mean.
+    middle = np.nanmean(off, 0)
+    parts = np.array_split(off - middle, PIECES)
+    costs = np.array([np.nansum(p**2, (0, 2)) for p in parts])
+    found = []
+    least = _OWN_STEPS * m.opt.timestep
+    lag = shift_of(costs.sum(0), dt, least)
+    if lag is not None:
+        alone = [shift_of(c, dt, least) for c in costs]
+        found.append(_late(name, lag, *alike(alone, dt)))
+    best = 0 if lag is None else min(round(lag / dt), shifts - 1)
+    rest = off[:, best]
+    means = np.array([np.nanmean(p, 0) for p in np.array_split(rest, PIECES)])
+    bias = middle[best]
+    error = np.nanstd(means, 0, ddof=1) / np.sqrt(PIECES)
+    large = np.abs(bias) > np.maximum(_OFF * error, _SMALL * moved)
+    large &= bias**2 > 0.5 * np.nanmean(rest**2, 0)
+    if large.any():
+        shown = np.abs(means) > 0.5 * np.abs(bias)
+        sure = (int((shown & (means * bias > 0))[:, large].all(1).sum()) + 1) / (
+            PIECES + 2
+        )
+        if _kind(m, i) not in _OF_JOINTS:
+            sure *= _GEOMETRY
+        unit = _unit(m, i)
+        many = len(bias) > 1
+        words = [f"bias.{k}" if many else "bias" for k in range(len(bias))]
+        value = {w: float(b) for w, b in zip(words, bias, strict=True)}
+        std = {w: float(e) for w, e in zip(words, error, strict=True)}
+        told = {w: (value[w], std[w], unit) for w in words}
+        found.append(ReadingFault("sensor_bias", name, value, std, told, sure))
+    return found
+
+
+def _pieces(
+    both: Sequence[tuple[np.ndarray, np.ndarray]], shifts: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """How much the reading should move ``(dim,)``, and what it is off by, for each
+    shift by which it may be late, ``(rows, shifts, dim)``; None where too little."""
+    expected, off = [], []
+    for read, right in both:
+        told = read[shifts:]
+        n = len(told)
+        if n < shifts:
+            continue
+        late = [told - right[shifts - s : shifts - s + n] for s in range(shifts)]
+        expected.append(right)
+        off.append(np.stack(late, 1))
+    if not off:
+        return None
+    every = np.concatenate(off)
+    every = every[np.isfinite(every).all((1, 2))]
+    if len(every) < 2 * PIECES:
+        return None
+    return np.concatenate(expected).std(0), every
+
+
+def _expected(m: mujoco.MjModel, run: Run) -> np.ndarray:
+    """What positions and speeds make of all sensors, ``(T, nsensordata)``."""
+    speed = fitted_velocity(run.qpos, run.dt, run.configuration)
+    data = mujoco.MjData(m)
+    out = np.zeros((len(run), m.nsensordata))
+    for row in range(len(run)):
+        data.qpos, data.qvel = run.qpos[row], speed[row]
+        mujoco.mj_fwdPosition(m, data)
+        mujoco.mj_sensorPos(m, data)
+        mujoco.mj_fwdVelocity(m, data)
+        mujoco.mj_sensorVel(m, data)
+        out[row] = data.sensordata
+    return out
+
+
+_LENGTHS = {"FRAMEPOS", "SUBTREECOM", "RANGEFINDER", "TENDONPOS", "TENDONLIMITPOS"}
+_ANGULAR = {"GYRO", "FRAMEANGVEL", "BALLANGVEL"}
+_SPEEDS = {"VELOCIMETER", "FRAMELINVEL", "SUBTREELINVEL", "TENDONVEL"}
+_OF_JOINTS = {"JOINTPOS", "JOINTVEL", "JOINTLIMITPOS", "JOINTLIMITVEL"}
+
+
+def _kind(m: mujoco.MjModel, i: int) -> str:
+    return mujoco.mjtSensor(int(m.sensor_type[i])).name.removeprefix("mjSENS_")
+
+
+def _unit(m: mujoco.MjModel, i: int) -> str:
+    kind = _kind(m, i)
+    if kind in _OF_JOINTS:
+        slide = m.jnt_type[m.sensor_objid[i]] == mujoco.mjtJoint.mjJNT_SLIDE
+        return ("m" if slide else "rad") + ("/s" if kind.endswith("VEL") else "")
+    for kinds, unit in ((_LENGTHS, "m"), (_ANGULAR, "rad/s"), (_SPEEDS, "m/s")):
+        if kind in kinds:
+            return unit
+    return ""
+
+
+@dataclass(frozen=True)
+class Lag:
+    """How late a measured velocity is.
+
+    Attributes:
+        seconds: of all data.
+        std: standard error, from pieces of the data.
+        confidence: share of the pieces that are late by themselves, one more of either
+            kind counted (Laplace).
+    """
+
+    seconds: float
+    std: float
+    confidence: float
+
+
+def velocity_lags(runs: Sequence[Run]) -> dict[int, Lag]:
+    """Lag of each measured velocity (place in qvel) behind the positions.
+
+    A filtered velocity is the derivative of the positions of some time ago. The lag is
+    the shift at which both agree best; only where it explains most of the difference.
+    """
+    measured = [r for r in runs if r.qvel_measured]
+    if not measured:
+        return {}
+    dt = measured[0].dt
+    shifts = round(_LONGEST / dt) + 1
+    found = {}
+    for dof in range(measured[0].qvel.shape[1]):
+        costs = _costs(measured, dof, shifts)
+        lag = shift_of(costs.sum(0), dt)
+        if lag is not None:
+            found[dof] = Lag(lag, *alike([shift_of(c, dt) for c in costs], dt))
+    return found
+
+
+def alike(alone: Sequence[float | None], dt: float) -> tuple[float, float]:
+    """Standard error and confidence of a lag, from those of single pieces."""
+    late = [x for x in alone if x is not None]
+    spread = float(np.std(late, ddof=1)) if len(late) > 1 else dt
+    std = max(spread, 0.1 * dt) / sqrt(max(len(late), 1))
+    return std, (len(late) + 1) / (len(alone) + 2)
+
+
+def _costs(runs: Sequence[Run], dof: int, shifts: int) -> np.ndarray:
+    """Squared differences by pieces of the data and shifts, ``(pieces, shifts)``."""
+    rows = []
+    for run in runs:
+        fitted = fitted_velocity(run.qpos, run.dt, run.configuration)[:, dof]
+        told = run.qvel[shifts:, dof]
+        n = len(told)
+        if n < shifts:
+            continue
+        rows.append(
+            [(told - fitted[shifts - s : shifts - s + n]) ** 2 for s in range(shifts)]
+        )
+    if not rows:
+        return np.zeros((1, shifts))
+    pieces = np.array_split(np.concatenate(rows, 1), PIECES, axis=1)
+    return np.array([p.sum(1) for p in pieces])
+
+
+def shift_of(cost: np.ndarray, dt: float, least: float = 0.0) -> float | None:
+    """The shift of least cost [s]; None where it is no better than none.
+
+    Args:
+        cost: squared differences by shift, ``(shifts,)``.
+        least: what is no news [s].
+    """
+    best = int(np.argmin(cost))
+    lag = float(best)
+    if 0 < best < len(cost) - 1:
+        a, b, c = cost[best - 1 : best + 2]
+        lag += 0.5 * (a - c) / max(a - 2 * b + c, 1e-300)
+    enough = lag * dt > max(_LATE, 0.5 * dt, least)
+    return float(lag * dt) if enough and cost[best] < _ALIKE * cost[0] else None

@@ -1,0 +1,1 @@
+"""Reads logs: tables with one row per control step."""

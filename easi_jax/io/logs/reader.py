@@ -1,0 +1,322 @@
+"""Reads measured logs into runs, and writes runs as logs.
+
+The format is one table with a row per control step; see ``docs/your_own_robot.md``.
+"""
+
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from easi_jax.data.recording import Log, Run
+from easi_jax.data.resampling import (
+    EVEN,
+    Rows,
+    is_even,
+    mean_held,
+    recordings,
+    resampled,
+)
+from easi_jax.data.windows import fitted_velocity
+from easi_jax.errors import UserError
+from easi_jax.io.logs import checks as log_checks
+from easi_jax.io.logs.columns import LogColumns, check_columns, log_columns
+from easi_jax.io.logs.mapping import LogMapping, read_mapping
+from easi_jax.io.logs.tables import Table, read_table, write_table
+from easi_jax.model.joint_space import Configuration
+
+PathLike = str | os.PathLike[str]
+
+HOLE_STEPS = 3.0
+
+
+def read_logs(
+    paths: PathLike | Sequence[PathLike],
+    mj_model: mujoco.MjModel,
+    mapping: PathLike | None = None,
+) -> Log:
+    """Reads logs of the machine ``mj_model`` describes.
+
+    Rows with a non-finite time, position or command are dropped and split the run,
+    as does a hole longer than three control steps. The control step is the median
+    of a recording's time differences; rows that are irregular in time are brought
+    to it, commands held and positions interpolated. Quaternions are normalized and
+    made continuous in sign, wrapped positions of hinges without limits unrolled.
+
+    Args:
+        paths: one or more files: ``.csv``, ``.npz`` or ``.parquet``.
+        mj_model: names and ranges of joints, actuators and sensors.
+        mapping: mapping file for all of ``paths``, for logs in a foreign format.
+
+    Returns:
+        At least one run, each of at least two rows; notes on all that a user
+        should know.
+
+    Raises:
+        UserError: a file that cannot be used, in one line that says why.
+    """
+    if isinstance(paths, str | os.PathLike):
+        paths = [paths]
+    files = [Path(path) for path in paths]
+    if not files:
+        raise UserError("no log given")
+    places = [os.path.realpath(path) for path in files]
+    for path, place in zip(files, places, strict=True):
+        if places.count(place) > 1:
+            raise UserError(f"{path} is given more than once")
+    columns = log_columns(mj_model)
+    names = LogMapping(source="") if mapping is None else read_mapping(mapping)
+    stems = [path.stem for path in files]
+    runs: list[Run] = []
+    notes: list[str] = []
+    for path in files:
+        alone = stems.count(path.stem) == 1
+        name = path.stem if alone else path.as_posix()
+        reader = _Reader(mj_model, columns, names, path, name)
+        runs += reader.read()
+        notes += reader.notes
+    return Log(tuple(runs), tuple(notes))
+
+
+def write_log(
+    path: PathLike,
+    mj_model: mujoco.MjModel,
+    runs: Run | Iterable[Run],
+    *,
+    velocities: bool = True,
+    digits: int | None = None,
+) -> None:
+    """Writes runs as one log that :func:`read_logs` reads back.
+
+    Args:
+        path: ends in ``.csv``, ``.npz`` or ``.parquet``; appears whole or not at
+            all.
+        mj_model: the model whose joints and actuators name the columns.
+        runs: one or more; several get a ``run`` column with their names.
+        velocities: whether ``qvel`` columns are written.
+        digits: significant digits of a CSV; None for all that round-trip.
+
+    Raises:
+        UserError: another extension, no run, or a place that cannot be written.
+        ValueError: arrays that do not fit the model, or names given twice.
+    """
+    chosen = [runs] if isinstance(runs, Run) else list(runs)
+    if not chosen:
+        raise UserError(f"{path}: no run to write")
+    if len({run.name for run in chosen}) < len(chosen):
+        raise ValueError("two runs of one name cannot be written to one log")
+    columns = log_columns(mj_model)
+    out: dict[str, np.ndarray] = {
+        "time": np.concatenate([run.time for run in chosen]),
+    }
+    if len(chosen) > 1:
+        out["run"] = np.repeat([r.name for r in chosen], [len(r) for r in chosen])
+    blocks = [(columns.qpos, [run.qpos for run in chosen])]
+    if velocities:
+        blocks.append((columns.qvel, [run.qvel for run in chosen]))
+    blocks.append((columns.ctrl, [run.ctrl for run in chosen]))
+    for name in chosen[0].sensors:
+        blocks.append((columns.sensors[name], [run.sensors[name] for run in chosen]))
+    for names, arrays in blocks:
+        values = np.concatenate(arrays)
+        out |= dict(zip(names, values.T, strict=True))
+    write_table(path, out, digits)
+
+
+class _Reader:
+    """Reads one file; collects what is to be said about it."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        columns: LogColumns,
+        mapping: LogMapping,
+        path: Path,
+        name: str,
+    ):
+        self.model = model
+        self.columns = columns
+        self.mapping = mapping
+        self.path = path
+        self.name = name
+        self.configuration = Configuration.of(model)
+        self.notes: dict[str, None] = {}  # in order, each once
+        self.uneven: list[tuple[float, str]] = []
+
+    def note(self, text: str) -> None:
+        self.notes[f"{self.path}: {text}"] = None
+
+    def read(self) -> list[Run]:
+        table = self.mapping.rename(read_table(self.path))
+        for text in table.notes:
+            self.note(text)
+        ignored = check_columns(self.path, table.columns, self.columns)
+        if ignored:
+            self.note(f"columns ignored: {', '.join(ignored)}")
+        raw = self._arrays(table)
+        if len(raw.time) < 2:
+            rows = "a single row" if len(raw.time) else "no rows"
+            raise UserError(f"{self.path} has {rows}; a log needs at least two")
+        log_checks.check_sizes(self.path, self.columns, raw.qpos, raw.qvel, raw.ctrl)
+        good = np.isfinite(raw.time)
+        good &= np.isfinite(raw.qpos).all(1) & np.isfinite(raw.ctrl).all(1)
+        if not good.all():
+            first = int(np.flatnonzero(~good)[0]) + 1
+            self.note(
+                f"{np.sum(~good)} of {len(good)} rows dropped for a non-finite time, "
+                f"position or command (the first is row {first})"
+            )
+        qpos, notes = log_checks.normalized(
+            self.path, self.model, raw.qpos, raw.label, good
+        )
+        raw = raw._replace(qpos=qpos)
+        for text in (
+            *notes,
+            *log_checks.ranges(self.model, qpos[good], raw.ctrl[good]),
+        ):
+            self.note(text)
+        runs: list[Run] = []
+        for label, rows in recordings(raw.label):
+            name = f"{self.name}/{label}" if label else self.name
+            runs += self._recording(name, raw, rows, good[rows])
+        if not runs:
+            raise UserError(
+                f"{self.path}: no two successive rows are whole and within "
+                f"{HOLE_STEPS:.0f} control steps of each other"
+            )
+        if self.uneven:
+            worst, name = max(self.uneven)
+            self.note(
+                f"time steps differ from the control step by up to {100 * worst:.0f} % "
+                f"({name}); brought to it by interpolation in {len(self.uneven)} of "
+                f"{len(runs)} runs"
+            )
+        estimated = [
+            group[0].removesuffix(".0")
+            for group in self.columns.joints
+            if group[0] not in table.columns
+        ]
+        if estimated:
+            self.note(f"velocities estimated from positions: {', '.join(estimated)}")
+        return runs
+
+    def _arrays(self, table: Table) -> Rows:
+        rows = table.rows("time")
+
+        def column(name: str) -> np.ndarray:
+            if name not in table.columns:
+                return np.full(rows, np.nan)
+            values = self.mapping.apply(name, table.numbers(name))
+            if len(values) != rows:
+                raise UserError(
+                    f'{self.path}: column "{name}" has {len(values)} rows '
+                    f"where time has {rows}"
+                )
+            return values
+
+        def block(names: Sequence[str]) -> np.ndarray:
+            columns = [column(name) for name in names]
+            return np.stack(columns, 1) if columns else np.zeros((rows, 0))
+
+        label = np.full(rows, "")
+        if "run" in table.columns:
+            label = table.labels("run")
+            if len(label) != rows:
+                raise UserError(
+                    f'{self.path}: column "run" has {len(label)} rows '
+                    f"where time has {rows}"
+                )
+        sensors: dict[str, np.ndarray] = {}
+        for name, names in self.columns.sensors.items():
+            given = [n for n in names if n in table.columns]
+            if len(given) == len(names):
+                sensors[name] = block(names)
+            elif given:
+                self.note(f"sensor {name} ignored: it has {len(names)} columns")
+        return Rows(
+            time=column("time"),
+            label=label,
+            qpos=block(self.columns.qpos),
+            qvel=block(self.columns.qvel),
+            ctrl=block(self.columns.ctrl),
+            sensors=sensors,
+        )
+
+    def _recording(
+        self, name: str, raw: Rows, rows: np.ndarray, good: np.ndarray
+    ) -> list[Run]:
+        """The runs of one recording: ``rows`` of the file, ``good`` the usable."""
+        timed = rows[np.isfinite(raw.time[rows])]
+        if len(timed) < 2:
+            self.note(f"{name} left out: it has a single row")
+            return []
+        with np.errstate(over="ignore"):
+            gaps = np.diff(raw.time[timed])
+        back = np.flatnonzero(gaps <= 0)
+        if len(back):
+            a, b = timed[back[0]], timed[back[0] + 1]
+            raise UserError(
+                f"{self.path}: time goes back or stands still from row {a + 1} "
+                f"({raw.time[a]:.9g} s) to row {b + 1} ({raw.time[b]:.9g} s); several "
+                'recordings in one file need a "run" column'
+            )
+        # nine digits: equal rates stay equal under the rounding of time stamps
+        dt = float(f"{np.median(gaps):.9g}")
+        rate_note = log_checks.rate(self.path, dt, self.model.opt.timestep)
+        if rate_note:
+            self.note(rate_note)
+        # a piece ends before every row that cannot follow the one before it
+        time = raw.time[rows]
+        with np.errstate(over="ignore", invalid="ignore"):
+            follows = np.diff(time) <= dt * (HOLE_STEPS + EVEN)
+        follows &= good[1:] & good[:-1]
+        pieces = np.split(np.arange(len(rows)), np.flatnonzero(~follows) + 1)
+        pieces = [piece for piece in pieces if good[piece[0]]]
+        holes = int(np.sum(good[1:] & good[:-1] & ~follows))
+        if holes:
+            self.note(f"{name}: holes longer than {HOLE_STEPS:.0f} steps: {holes}")
+        runs: list[Run] = []
+        single = sum(len(piece) < 2 for piece in pieces)
+        if single:
+            self.note(f"{name}: rows left out because alone between holes: {single}")
+        for piece in pieces:
+            if len(piece) >= 2:
+                suffix = f"#{len(runs) + 1}" if len(pieces) - single > 1 else ""
+                runs.append(self._run(name + suffix, raw.take(rows[piece]), dt))
+        if len(runs) > 1:
+            self.note(f"{name} split into {len(runs)} runs")
+        return runs
+
+    def _run(self, name: str, rows: Rows, dt: float) -> Run:
+        stamps = sent = None
+        if not is_even(rows.time, dt):
+            stamps, held = rows.time, rows.ctrl
+            worst = float(np.abs(np.diff(rows.time) / dt - 1).max())
+            self.uneven.append((worst, name))
+            rows = resampled(rows, dt, self.configuration)
+            sent = mean_held(stamps, held, rows.time, dt)
+        fitted = fitted_velocity(rows.qpos, dt, self.configuration)
+        given = np.isfinite(rows.qvel)
+        columns_given = given.any(0)
+        lacking = int(np.sum(~given[:, columns_given].all(1)))
+        if lacking:
+            self.note(f"{name}: velocities missing in {lacking} rows are estimated")
+        return Run(
+            name=name,
+            source=str(self.path),
+            dt=dt,
+            time=rows.time,
+            qpos=rows.qpos,
+            qvel=np.where(given, rows.qvel, fitted),
+            qvel_measured=bool(given.all()),
+            ctrl=rows.ctrl,
+            configuration=self.configuration,
+            sensors=rows.sensors,
+            stamps=stamps,
+            sent=sent,
+        )
+
+
+__all__ = ["Log", "Run", "read_logs", "write_log"]

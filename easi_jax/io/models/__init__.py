@@ -1,0 +1,1 @@
+"""Reads and writes models, parameter files and effects files."""

@@ -1,0 +1,118 @@
+"""Figures of the gap workflow: traces before and after, the gap step by step."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from easi_jax.io.report.figure_style import (
+    BLUE,
+    DASHED,
+    FAINT,
+    INK,
+    VERMILION,
+    grid,
+    labelled_map,
+    legend_above,
+    styled,
+    svg,
+    tell,
+    with_unit,
+)
+
+_DASHES: Any = {"color": VERMILION, "lw": 1.3, "ls": (0, (4, 2))}
+
+
+@styled
+def traces(
+    time: np.ndarray,
+    measured: np.ndarray,
+    before: np.ndarray,
+    after: np.ndarray,
+    names: Sequence[str],
+    units: Sequence[str],
+) -> str:
+    """Measured and predicted motion in some windows, one row of axes per channel.
+
+    Args:
+        time: ``(H + 1,)`` [s].
+        measured, before, after: ``(windows, H + 1, channels)``.
+    """
+    windows, _, count = measured.shape
+    figure, axes = grid(count * windows, windows, 1.9)
+    handles = []
+    for c in range(count):
+        for w in range(windows):
+            axis = axes[c * windows + w]
+            for label, motion, style in (
+                ("measured", measured, {"color": INK, "lw": 2.2}),
+                ("model as given", before, _DASHES),
+                ("repaired", after, {"color": BLUE, "lw": 1.3}),
+            ):
+                y = motion[w, :, c]
+                lines = axis.plot(time, y, label=label, **style)
+                handles += lines if w == c == 0 else []
+                end = with_unit(f"{y[-1]:.4g}", units[c])
+                tell(axis, time, y, f"{names[c]}, {label}: {end} at the end")
+            if w == 0:
+                axis.set_ylabel(with_unit(names[c], units[c]))
+            if c == count - 1:
+                axis.set_xlabel("time in the window [s]")
+    legend_above(figure, handles)
+    return svg(figure)
+
+
+@styled
+def gap_steps(
+    labels: Sequence[str], gaps: Sequence[float], low: float, high: float, floor: float
+) -> str:
+    """The held-out gap as given, refitted and after each effect, and the noise floor.
+
+    Args:
+        low, high: 95 % interval of the last.
+    """
+    figure, (axis,) = grid(1, 1, 0.42 * len(labels) + 0.9)
+    y = np.arange(len(labels))[::-1]
+    colors = [VERMILION, *([FAINT] * (len(labels) - 2)), BLUE][: len(labels)]
+    axis.barh(y, gaps, color=colors, height=0.6)
+    axis.plot([low, high], [y[-1], y[-1]], color=INK, lw=2)
+    axis.axvline(floor, **DASHED)
+    axis.text(floor, len(labels) - 0.45, " noise floor", color=INK, va="bottom")
+    axis.set_yticks(y, labels)
+    axis.set_xlabel("gap on held-out data (share of the motion)")
+    axis.set_ylim(-0.6, len(labels) - 0.1)
+    axis.grid(visible=False, axis="y")
+    return svg(figure)
+
+
+@styled
+def residual_maps(
+    joints: Sequence[str],
+    conditions: Sequence[str],
+    before: np.ndarray,
+    after: np.ndarray,
+    floor: np.ndarray,
+) -> str:
+    """Errors of joints under conditions, in units of the noise floor, two maps.
+
+    Args:
+        before, after: ``(joints, conditions)``; NaN where it did not occur.
+        floor: of each joint, ``(joints,)``, in the same units.
+    """
+    figure, axes = grid(2, 2, 0.42 * len(joints) + 1.9)
+    maps = [np.maximum(x / floor[:, None], 1e-3) for x in (before, after)]
+    most = max(float(np.nanmax(maps[0])), 2.0)
+    for axis, shown, title in zip(
+        axes, maps, ("model as given", "repaired"), strict=True
+    ):
+        axis.imshow(
+            np.log10(shown), cmap="YlOrRd", vmin=0.0, vmax=np.log10(most), aspect="auto"
+        )
+        dark = np.log10(shown) > 0.6 * np.log10(most)
+        labels = {
+            (i, j): (f"{shown[i, j]:.2g}", bool(dark[i, j]))
+            for i, j in np.argwhere(np.isfinite(shown)).tolist()
+        }
+        labelled_map(axis, labels, joints, conditions)
+        axis.set_title(title)
+    return svg(figure)

@@ -1,0 +1,274 @@
+"""One self-contained ``report.html`` for people: no network, light and dark, prints."""
+
+import dataclasses
+import html
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import jinja2
+import numpy as np
+
+from easi_jax.io.files import atomic_write, to_plain
+from easi_jax.io.report.figure_style import BLUE, FAINT, GREEN, GRID, INK, VERMILION
+
+Flag = Literal["determined", "not determined", "at bound"]
+
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+# Colors that need another shade on a dark page.
+_THEMED = {
+    INK: "--ink",
+    FAINT: "--faint",
+    GRID: "--line",
+    BLUE: "--blue",
+    VERMILION: "--vermilion",
+    GREEN: "--green",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class ParameterRow:
+    """One identified parameter, in SI units.
+
+    Attributes:
+        name: as declared.
+        addresses: places in the model that it sets.
+        unit: ``""`` where it has none.
+        initial: range the search started from.
+        mean: of the distribution found.
+        std: of the distribution found.
+        flag: what may be believed of it.
+        truth: where it is known.
+        bounds: where it may go; given with the flag ``at bound``.
+    """
+
+    name: str
+    addresses: tuple[str, ...]
+    unit: str
+    initial: tuple[float, float]
+    mean: float
+    std: float
+    flag: Flag
+    truth: float | None = None
+    bounds: tuple[float, float] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """A table of results; numbers are shown with four digits.
+
+    Attributes:
+        title: heading.
+        columns: heads.
+        rows: cells; strings stay as they are.
+        note: one sentence below, such as what was held out.
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    note: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """A figure of ``easi_jax.io.report.figures``.
+
+    Attributes:
+        title: heading.
+        svg: its SVG text; trusted, so it must not come from outside.
+        alt: what it shows, for who cannot see it.
+        caption: one sentence below.
+    """
+
+    title: str
+    svg: str
+    alt: str
+    caption: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnostic:
+    """One check of the run.
+
+    Attributes:
+        label: such as ``non-finite simulations``.
+        value: what was found.
+        ok: False draws the eye.
+        note: what it means or what to do.
+    """
+
+    label: str
+    value: str | float | int
+    ok: bool = True
+    note: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """Everything a report shows; empty sections are left out.
+
+    Attributes:
+        title: such as ``EASI on Cartpole``.
+        headline: the result in one sentence or a few.
+        command: that made it.
+        parameters: one row each.
+        undetermined: directions that the data do not determine, one sentence each.
+        tables: held-out errors, returns and the like.
+        pictures: figures in their order.
+        diagnostics: checks of the run.
+        notes: remarks from reading logs and from resuming.
+        config: the run's configuration.
+        versions: as ``easi_jax.io.runs.versions.versions`` gives them.
+    """
+
+    title: str
+    headline: Sequence[str]
+    command: str = ""
+    parameters: Sequence[ParameterRow] = ()
+    undetermined: Sequence[str] = ()
+    tables: Sequence[Table] = ()
+    pictures: Sequence[Picture] = ()
+    diagnostics: Sequence[Diagnostic] = ()
+    notes: Sequence[str] = ()
+    config: Any = None
+    versions: Mapping[str, Any] | None = None
+
+
+def write_report(path: Path, report: Report) -> None:
+    """Writes ``report`` as one HTML file, atomically.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    atomic_write(path, render(report))
+
+
+def render(report: Report) -> str:
+    """The HTML text of ``report``."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"cell": cell, "numeric": _numeric}
+    environment.tests["numeric"] = _numeric
+    return environment.get_template("report.html.j2").render(
+        report=report,
+        parameters=[_parameter_cells(row) for row in report.parameters],
+        has_truth=any(row.truth is not None for row in report.parameters),
+        pictures=[(p, inline_svg(p, i)) for i, p in enumerate(report.pictures)],
+        config=list(flatten(to_plain(report.config))),
+        versions=list(flatten(to_plain(report.versions))),
+    )
+
+
+def quantity(mean: float, std: float) -> str:
+    """``0.2996 ± 0.0012``: two digits of the deviation, the mean to the same place."""
+    if not (math.isfinite(mean) and math.isfinite(std)):
+        return f"{cell(mean)} ± {cell(std)}"
+    if std <= 0:
+        return f"{cell(mean)} ± 0"
+    largest = max(abs(mean), std)
+    power = math.floor(math.log10(largest))
+    shift = power if power < -3 or power > 5 else 0
+    place = 1 - math.floor(math.log10(std)) + shift
+    digits = max(0, place)
+    scale = 10.0**shift
+    text = f"{mean / scale:.{digits}f} ± {std / scale:.{digits}f}"
+    return f"({text})·{_power(shift)}" if shift else text
+
+
+def cell(value: Any) -> str:
+    """A table cell: four digits for numbers, words for what is not finite."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, int | np.integer):
+        return str(value)
+    if not isinstance(value, str) and hasattr(value, "__float__"):
+        return _four_digits(float(value))
+    return str(value)
+
+
+def inline_svg(picture: Picture, index: int) -> str:
+    """The picture's SVG for use inside a page.
+
+    Its names become unique within the page, its size and colors the page's.
+    """
+    text = picture.svg[picture.svg.index("<svg") :]
+    prefix = f"p{index}-"
+    text = re.sub(r'\bid="', f'id="{prefix}', text)
+    text = re.sub(r"url\(#", f"url(#{prefix}", text)
+    text = re.sub(r'href="#', f'href="#{prefix}', text)
+    for color, name in _THEMED.items():
+        text = text.replace(color, f"var({name})")
+    root, rest = text.split(">", 1)
+    root = re.sub(r'\s(width|height)="[^"]*"', "", root)
+    label = html.escape(picture.alt, quote=True)
+    return f'{root} role="img" aria-label="{label}">{rest}'
+
+
+def flatten(tree: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Dotted names and values of a nested mapping."""
+    if isinstance(tree, Mapping):
+        for key, value in tree.items():
+            yield from flatten(value, f"{prefix}.{key}" if prefix else str(key))
+    elif prefix:
+        values = tree if isinstance(tree, list) else [tree]
+        # In full, where cell() would round: these are to be copied.
+        texts = [repr(v) if isinstance(v, float) else cell(v) for v in values]
+        yield prefix, ", ".join(texts)
+
+
+def _parameter_cells(row: ParameterRow) -> dict[str, Any]:
+    error = ""
+    if row.truth is not None and row.truth != 0:
+        error = f"{100 * (row.mean / row.truth - 1):+.1f} %"
+    flag = row.flag
+    note = ""
+    if flag == "at bound" and row.bounds is not None:
+        low, high = row.bounds
+        lower = abs(row.mean - low) <= abs(row.mean - high)
+        note = f"lower bound {cell(low)}" if lower else f"upper bound {cell(high)}"
+    return {
+        "name": row.name,
+        "addresses": row.addresses,
+        "unit": row.unit,
+        "initial": f"{cell(row.initial[0])} to {cell(row.initial[1])}",
+        "value": quantity(row.mean, row.std),
+        "truth": cell(row.truth),
+        "error": error,
+        "flag": flag,
+        "kind": {"determined": "good", "at bound": "bad"}.get(flag, "unsure"),
+        "note": note,
+    }
+
+
+def _numeric(text: str) -> bool:
+    return re.match(r"\(?[-+]?\d|-$|not a number$|-?infinite$", text) is not None
+
+
+def _four_digits(value: float) -> str:
+    if math.isnan(value):
+        return "not a number"
+    if math.isinf(value):
+        return "infinite" if value > 0 else "-infinite"
+    if value == 0:
+        return "0"
+    # The power of the rounded number: 9999.6 has that of 10000.
+    power = int(f"{value:.3e}".split("e")[1])
+    if 3 <= power < 6:
+        return f"{value:.0f}"
+    if -4 < power < 3:
+        return f"{value:.{3 - power}f}".rstrip("0").rstrip(".")
+    return f"{value / 10.0**power:.4g}·{_power(power)}"
+
+
+def _power(exponent: int) -> str:
+    return f"10{str(exponent).translate(_SUPERSCRIPT)}"

@@ -1,0 +1,459 @@
+"""Physical effects that a model lacks, as values in the physics step.
+
+An `Effects` holds one number for every effect at every place of a model; all at zero
+strength (`none`) it changes nothing. Static ones (masses, armature, gravity, force
+limits, contacts of the whole model) are written into the model once by `with_effects`;
+the others act in each physics step (`in_step`, `body_resistance`, `pair_contacts`) and
+on the way of a command to its actuator (`commands`).
+Names and meanings: `easi_jax.gap.table`.
+"""
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+from mujoco.mjx._src.types import DisableBit, IntegratorType
+
+from easi_jax.model import backlash
+from easi_jax.model.backlash import MotorState
+from easi_jax.model.contact_pairs import pair_ids
+from easi_jax.model.quantities import scalar_places
+from easi_jax.model.set_const import set_const
+
+_NO_LIMIT = 1e9
+_TINY = 1e-9
+
+
+@flax.struct.dataclass
+class Effects:
+    """Strength of every effect at every place; SI units.
+
+    Attributes:
+        coulomb: dry friction, ``(nv,)``; hinges and slides, as all of its size.
+        static: what friction at rest has beyond ``coulomb``, ``(nv,)``.
+        stribeck: speed at which that has fallen to 1/e, ``(nv,)``.
+        damping: torque per speed, ``(nv,)``.
+        drag: torque per squared speed, ``(nv,)``.
+        stiffness: of a spring, ``(nv,)``.
+        spring: torque of that spring at position zero, ``(nv,)``.
+        constant: torque that never changes, ``(nv,)``.
+        ripple: amplitude of a torque periodic in position, ``(nv,)``.
+        cycles: of the ripple per 2 pi of position, ``(nv,)``.
+        phase: of the ripple at position zero, ``(nv,)`` [rad].
+        armature: inertia beyond the model's, ``(nv,)``.
+        gain: factor on a command within its range, ``(nu,)``.
+        delay: of a command, ``(nu,)`` [s].
+        lag: time constant of a first-order response to a command, ``(nu,)`` [s].
+        limit: largest force, ``(nu,)``.
+        deadband: commands up to this have no effect, ``(nu,)``.
+        jump: share of ``deadband`` that a larger command has at once, ``(nu,)``.
+        mass: beyond the model's, ``(nbody,)``.
+        spread: 0: ``mass`` is a point at the body's center of mass; 1: it is spread
+            like the body's own, ``(nbody,)``.
+        com: shift of the center of mass in the body's frame, ``(nbody, 3)``.
+        force: on the body's center of mass, world frame, ``(nbody, 3)``.
+        resistance: force on the body's center of mass per squared speed, against it,
+            ``(nbody,)``.
+        tilt: roll and pitch of the base, ``(2,)`` [rad].
+        friction: factor on every contact's sliding friction, ``()``.
+        softness: factors on stiffness and damping of every contact, ``(2,)``.
+        slip: factor on the sliding friction of a pair of geoms, ``(P,)``
+            (`easi_jax.model.contact_pairs`).
+        give: factors on stiffness and damping of a pair's contacts, ``(P, 2)``.
+        bias: reading less truth, ``(nv,)``.
+        late: how late a reading is, ``(nv,)`` [s].
+        width: total play between a drive and its joint, ``(nv,)``.
+        rotor: inertia of the drive's side, part of the joint's, ``(nv,)``.
+        felt: inertia that a torque at the joint alone meets, ``(nv,)``; no effect, but
+            what `backlash` goes by.
+    """
+
+    coulomb: jax.Array
+    static: jax.Array
+    stribeck: jax.Array
+    damping: jax.Array
+    drag: jax.Array
+    stiffness: jax.Array
+    spring: jax.Array
+    constant: jax.Array
+    ripple: jax.Array
+    cycles: jax.Array
+    phase: jax.Array
+    armature: jax.Array
+    gain: jax.Array
+    delay: jax.Array
+    lag: jax.Array
+    limit: jax.Array
+    deadband: jax.Array
+    jump: jax.Array
+    mass: jax.Array
+    spread: jax.Array
+    com: jax.Array
+    force: jax.Array
+    resistance: jax.Array
+    tilt: jax.Array
+    friction: jax.Array
+    softness: jax.Array
+    slip: jax.Array
+    give: jax.Array
+    bias: jax.Array
+    late: jax.Array
+    width: jax.Array
+    rotor: jax.Array
+    effective_inertia: jax.Array
+
+    if TYPE_CHECKING:  # made by flax
+
+        def replace(self, **changes: Any) -> "Effects": ...
+
+
+@flax.struct.dataclass
+class CommandMemory:
+    """What the way of a command to its actuator remembers.
+
+    Attributes:
+        past: commands of the last steps, oldest first, ``(n, nu)``.
+        response: what has arrived through the lag, ``(nu,)``.
+        known: whether there was a command yet, ``()`` bool.
+    """
+
+    past: jax.Array
+    response: jax.Array
+    known: jax.Array
+
+
+def none(m: mujoco.MjModel) -> Effects:
+    """No effect anywhere."""
+    dof, act, body = jnp.zeros(m.nv), jnp.zeros(m.nu), jnp.zeros(m.nbody)
+    ones, pairs = jnp.ones, len(pair_ids(m))
+    return Effects(
+        coulomb=dof,
+        static=dof,
+        stribeck=ones(m.nv),
+        damping=dof,
+        drag=dof,
+        stiffness=dof,
+        spring=dof,
+        constant=dof,
+        ripple=dof,
+        cycles=ones(m.nv),
+        phase=dof,
+        armature=dof,
+        gain=ones(m.nu),
+        delay=act,
+        lag=act,
+        limit=jnp.full(m.nu, _NO_LIMIT),
+        deadband=act,
+        jump=act,
+        mass=body,
+        spread=body,
+        com=jnp.zeros((m.nbody, 3)),
+        force=jnp.zeros((m.nbody, 3)),
+        resistance=body,
+        tilt=jnp.zeros(2),
+        friction=ones(()),
+        softness=ones(2),
+        slip=ones(pairs),
+        give=ones((pairs, 2)),
+        bias=dof,
+        late=dof,
+        width=dof,
+        rotor=dof,
+        effective_inertia=jnp.asarray(backlash.felt_inertia(m), jnp.float32),
+    )
+
+
+_STATIC = ("mass", "spread", "com", "armature", "limit", "gain", "tilt", "friction")
+IN_CONTACTS = ("softness", "slip", "give")
+_ON_COMMANDS = ("delay", "lag", "deadband", "jump")
+
+
+def has_step_effects(present: tuple[str, ...] | None) -> bool:
+    """Whether some of these fields (None: all) act in the steps themselves."""
+    return present is None or any(name not in _STATIC for name in present)
+
+
+def has_command_memory(present: tuple[str, ...] | None) -> bool:
+    """Whether some of these fields (None: all) lie on the way of a command."""
+    return present is None or any(name in _ON_COMMANDS for name in present)
+
+
+def has_backlash(present: tuple[str, ...] | None) -> bool:
+    """Whether drives may have play."""
+    return present is None or "width" in present
+
+
+def has_body_drag(present: tuple[str, ...] | None) -> bool:
+    """Whether bodies may have drag."""
+    return present is None or "resistance" in present
+
+
+def has_contact_effects(present: Iterable[str] | None) -> bool:
+    """Whether contacts are changed in the step, where they are made."""
+    return present is None or any(name in IN_CONTACTS for name in present)
+
+
+def with_effects(
+    m: mjx.Model, e: Effects, present: tuple[str, ...] | None = None
+) -> mjx.Model:
+    """The model with all static effects; pure.
+
+    The model must have been put with force limits on where ``limit`` varies, and, for
+    RK4, contacts in direct form where ``softness`` does.
+
+    Args:
+        present: fields that may differ from none; None: any of them.
+    """
+
+    def on(*names: str) -> bool:
+        return present is None or any(name in present for name in names)
+
+    new: dict[str, Any] = {}
+    if on("mass", "spread"):
+        mass = m.body_mass
+        share = jnp.where(mass > 0, e.mass / jnp.where(mass > 0, mass, 1.0), 0.0)
+        new["body_mass"] = mass + e.mass
+        new["body_inertia"] = m.body_inertia * (1.0 + e.spread * share)[:, None]
+    if on("com"):
+        new["body_ipos"] = m.body_ipos + e.com
+    if on("armature", "width"):
+        new["dof_armature"] = m.dof_armature + e.armature - _apart(e)
+    if on("limit"):
+        low, high = m.actuator_forcerange[:, 0], m.actuator_forcerange[:, 1]
+        edge = jnp.maximum(low, -e.limit), jnp.minimum(high, e.limit)
+        new["actuator_forcerange"] = jnp.stack(edge, 1)
+    if on("gain"):
+        # Not on the command itself, which MuJoCo clips to its range.
+        scaled = m.actuator_gainprm.at[:, :3].multiply(e.gain[:, None])
+        new["actuator_gainprm"] = scaled
+    if on("tilt"):
+        new["opt.gravity"] = tilted(m.opt.gravity, e.tilt)
+    if on("friction"):
+        new["geom_friction"] = m.geom_friction.at[:, 0].multiply(e.friction)
+        if m.npair:
+            new["pair_friction"] = m.pair_friction.at[:, :2].multiply(e.friction)
+    if on("softness") and m.opt.integrator == IntegratorType.RK4:
+        new["geom_solref"] = _softened(m.geom_solref, e.softness)
+        if m.npair:
+            new["pair_solref"] = _softened(m.pair_solref, e.softness)
+    m = m.tree_replace(new)
+    return set_const(m) if on("mass", "com", "armature", "width") else m
+
+
+def _apart(e: Effects) -> jax.Array:
+    """Inertia of drives with play, ``(nv,)``."""
+    return jnp.where(e.width > 0, e.rotor, 0.0)
+
+
+def _softened(solref: jax.Array, factors: jax.Array) -> jax.Array:
+    # Only the direct form (-stiffness, -damping) scales like this.
+    return jnp.where(solref < 0, solref * factors, solref)
+
+
+def _direct(m: mjx.Model, solref: jax.Array) -> jax.Array:
+    """Solver references ``(n, 2)`` in direct form; as `quantities.direct_solref`."""
+    time, ratio = solref.T
+    standard = time > 0
+    if not m.opt.disableflags & DisableBit.REFSAFE:
+        time = jnp.maximum(time, 2 * m.opt.timestep)
+    time, ratio = (jnp.where(standard, x, 1.0) for x in (time, ratio))
+    direct = -jnp.stack([1 / (time * ratio) ** 2, 2 / time], 1)
+    return jnp.where(standard[:, None], direct, solref)
+
+
+def tilted(gravity: jax.Array, tilt: jax.Array) -> jax.Array:
+    """Gravity in the frame of a base that is rolled, then pitched."""
+    (cr, cp), (sr, sp) = jnp.cos(tilt), jnp.sin(tilt)
+    x, y, z = gravity
+    # transpose of Ry(pitch) Rx(roll)
+    x, z = cp * x - sp * z, sp * x + cp * z
+    y, z = cr * y + sr * z, -sr * y + cr * z
+    return jnp.stack([x, y, z])
+
+
+def in_step(
+    m: mjx.Model,
+    d: mjx.Data,
+    e: Effects,
+    rotor: Any,
+) -> tuple[mjx.Model, mjx.Data, Any]:
+    """Model, data and drives with play of one physics step.
+
+    Args:
+        d: before `forward`.
+        rotor: drives before the step (`backlash.Rotor`); empty where none has play.
+    """
+    at, dof = scalar_places(m).T
+    v = d.qvel
+    fall = jnp.exp(-jnp.square(v / e.stribeck))
+    m = m.replace(
+        dof_frictionloss=m.dof_frictionloss + e.coulomb + e.static * fall,
+        # As damping it is treated implicitly, and stays stable.
+        dof_damping=m.dof_damping + e.damping + e.drag * jnp.abs(v),
+    )
+    q = jnp.zeros(m.nv, d.qpos.dtype).at[dof].set(d.qpos[at])
+    torque = e.constant + e.spring - e.stiffness * q
+    torque += e.ripple * jnp.sin(e.cycles * q + e.phase)
+    force = jnp.concatenate([e.force, jnp.zeros_like(e.force)], 1)
+    drives = backlash.geared(m)
+    if drives and isinstance(rotor, MotorState):
+        load = jnp.maximum(
+            e.effective_inertia + e.armature - e.rotor, 0.05 * e.effective_inertia
+        )
+        u = backlash.sent(m, d.ctrl, d.act)
+        rotor = backlash.pushes(
+            *(m, drives, rotor, e.width, e.rotor, load, (q, v), u, m.opt.timestep)
+        )
+        m, torque = _driven(m, e, drives), torque + rotor.push
+    d = d.replace(
+        qfrc_applied=d.qfrc_applied + torque, xfrc_applied=d.xfrc_applied + force
+    )
+    return m, d, rotor
+
+
+def _driven(m: mjx.Model, e: Effects, drives: dict[int, list[int]]) -> mjx.Model:
+    """The model without the actuators that push on rotors."""
+    left = jnp.ones(m.nu)
+    for dof, has_step_effects in drives.items():
+        left = left.at[np.array(has_step_effects)].set(
+            jnp.where(e.width[dof] > 0, 0.0, 1.0)
+        )
+    return m.replace(
+        actuator_gainprm=m.actuator_gainprm * left[:, None],
+        actuator_biasprm=m.actuator_biasprm * left[:, None],
+    )
+
+
+def body_resistance(m: mjx.Model, d: mjx.Data, e: Effects) -> mjx.Data:
+    """Data with the quadratic drag of bodies, after `fwd_velocity`."""
+    arm = d.xipos - d.subtree_com[np.asarray(m.body_rootid)]
+    v = d.cvel[:, 3:] + jnp.cross(d.cvel[:, :3], arm)
+    speed = jnp.sqrt(jnp.sum(v * v, 1) + 1e-12)
+    force = -(e.resistance * speed)[:, None] * v
+    return d.replace(xfrc_applied=d.xfrc_applied.at[:, :3].add(force))
+
+
+def pair_contacts(m: mjx.Model, d: mjx.Data, e: Effects) -> mjx.Data:
+    """Data whose contacts have the softness of all and what their pair of geoms has,
+    after `collision`."""
+    if not d._impl.ncon:
+        return d
+    number = np.zeros((m.ngeom, m.ngeom), np.int32)
+    for k, (a, b) in enumerate(pair_ids(m)):
+        number[a, b] = number[b, a] = k
+    contact = d._impl.contact
+    pair = jnp.asarray(number)[contact.geom1, contact.geom2]
+    friction = contact.friction.at[:, :2].multiply(e.slip[pair][:, None])
+    factors = e.softness * e.give[pair]
+    solref = _softened(_direct(m, contact.solref), factors)
+    contact = contact.replace(friction=friction, solref=solref)
+    return d.tree_replace({"_impl.contact": contact})
+
+
+def first_memory(steps: int, nu: int) -> CommandMemory:
+    """Before any command; delays of up to ``steps`` control steps fit."""
+    return CommandMemory(jnp.zeros((steps + 1, nu)), jnp.zeros(nu), jnp.zeros((), bool))
+
+
+def commands(
+    e: Effects, memory: CommandMemory, ctrl: jax.Array, dt: float, substeps: int
+) -> tuple[jax.Array, CommandMemory]:
+    """What arrives at the actuators during a control step.
+
+    Delay, deadband and lag, in this order. Commands are held; of a physics step
+    in which a late command changes the mean counts, and so it does of the lag's
+    response. Before the first command the first one is taken to have been sent for
+    ever.
+
+    Args:
+        ctrl: sent at the start of the step, ``(nu,)``.
+        dt: control step [s].
+
+    Returns:
+        Commands in each physics step ``(substeps, nu)``, and the memory after.
+    """
+    n, nu = memory.past.shape
+    past = jnp.where(memory.known, memory.past, ctrl)
+    line = jnp.concatenate([past, ctrl[None]])  # row n is now
+    whole, old = _late(e, n, dt, substeps)
+    column = jnp.arange(nu)
+    u = old * line[whole + n, column]
+    u += (1 - old) * line[jnp.minimum(whole + 1 + n, n), column]
+    u = _beyond_deadband(e, u)
+    response = jnp.where(memory.known, memory.response, u[0])
+    out = []
+    for i in range(substeps):
+        arrived, response = _lagging(e, response, u[i], dt / substeps)
+        out.append(arrived)
+    return jnp.stack(out), CommandMemory(line[1:], response, jnp.ones((), bool))
+
+
+def command_sequence(
+    e: Effects, ctrl: jax.Array, steps: int, dt: float, substeps: int
+) -> jax.Array:
+    """What arrives in each physics step of many control steps, ``(T, substeps, nu)``.
+
+    As `commands` step by step, with all commands known.
+
+    Args:
+        ctrl: sent at the start of each step, ``(T, nu)``.
+        steps: control steps that a command can be late.
+    """
+    t, nu = ctrl.shape
+    whole, old = _late(e, steps, dt, substeps)
+    row = jnp.arange(t)[:, None, None] + whole
+    column = jnp.arange(nu)
+    before = ctrl[jnp.maximum(row, 0), column]
+    after = ctrl[jnp.clip(row + 1, 0, jnp.arange(t)[:, None, None]), column]
+    u = _beyond_deadband(e, old * before + (1 - old) * after)
+    flat = u.reshape(t * substeps, nu)
+
+    def step(response: jax.Array, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+        arrived, response = _lagging(e, response, u, dt / substeps)
+        return response, arrived
+
+    return jax.lax.scan(step, flat[0], flat)[1].reshape(u.shape)
+
+
+def _late(
+    e: Effects, steps: int, dt: float, substeps: int
+) -> tuple[jax.Array, jax.Array]:
+    """Which command a physics step gets, relative to the present one, and the share of
+    the step in which it does; the rest has the one after, ``(substeps, nu)`` both."""
+    start = np.arange(substeps)[:, None] / substeps - e.delay / dt
+    start = jnp.clip(start, -float(steps) + 1, 1.0)
+    whole = jnp.floor(start)
+    old = jnp.clip((whole + 1 - start) * substeps, 0.0, 1.0)
+    return whole.astype(jnp.int32), old
+
+
+def _beyond_deadband(e: Effects, u: jax.Array) -> jax.Array:
+    size = jnp.maximum(jnp.abs(u) - e.deadband, 0.0)
+    size = jnp.where(size > 0, size + e.jump * e.deadband, 0.0)
+    return jnp.where(e.deadband > 0, jnp.sign(u) * size, u)
+
+
+def _lagging(
+    e: Effects, response: jax.Array, u: jax.Array, h: float
+) -> tuple[jax.Array, jax.Array]:
+    """Mean response in a step to a held command, and the response at its end."""
+    tau = jnp.maximum(e.lag, _TINY)
+    left = jnp.exp(-h / tau)
+    mean = tau / h * (1 - left)
+    return u + (response - u) * mean, u + (response - u) * left
+
+
+def warmed(
+    e: Effects, memory: CommandMemory, past: jax.Array, dt: float, substeps: int
+) -> CommandMemory:
+    """The memory after commands ``past (D, nu)``, oldest first; see `commands`."""
+
+    def one(memory: CommandMemory, u: jax.Array) -> tuple[CommandMemory, None]:
+        return commands(e, memory, u, dt, substeps)[1], None
+
+    return jax.lax.scan(one, memory, past)[0]

@@ -1,0 +1,268 @@
+"""An MJX model whose physical parameters are an argument."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from easi_jax.devices.mesh import own_device
+from easi_jax.errors import UserError
+from easi_jax.model import effects as physical
+from easi_jax.model.addresses import Writer, open_gates, resolve
+from easi_jax.model.effects import Effects
+from easi_jax.model.quantities import length_of, long_axis, unit_inertia
+from easi_jax.model.set_const import set_const
+from easi_jax.model.torque_speed import TorqueSpeed
+
+Sense = Callable[[mjx.Model, mjx.Data], jax.Array]
+
+
+@flax.struct.dataclass
+class Model:
+    """What a simulation runs on; a pytree.
+
+    Attributes:
+        mjx: the MJX model.
+        speed_limit: largest joint speed, ``(nv,)`` [m/s, rad/s]; inf where none.
+        writers: which numbers follow which parameter (static).
+        long_axes: the axis of each geom that its length is measured along (static).
+        sense: ``sense(mjx_model, data) -> (sense_size,)``, read in every physics step
+            (static); None for nothing.
+        sense_size: how many numbers it reads (static).
+        torque_speed: what the actuators can give at which speed, within their force
+            limits; None for no such curve.
+        effects: what acts beyond the model; None for nothing.
+        present: fields of the effects that may differ from none; None: any (static).
+        delay_steps: control steps that a command can be late (static).
+    """
+
+    mjx: mjx.Model
+    speed_limit: jax.Array
+    writers: tuple[Writer, ...] = flax.struct.field(pytree_node=False, default=())
+    long_axes: tuple[int, ...] = flax.struct.field(pytree_node=False, default=())
+    sense: Sense | None = flax.struct.field(pytree_node=False, default=None)
+    sense_size: int = flax.struct.field(pytree_node=False, default=0)
+    torque_speed: TorqueSpeed | None = None
+    effects: Effects | None = None
+    present: tuple[str, ...] | None = flax.struct.field(pytree_node=False, default=None)
+    delay_steps: int = flax.struct.field(pytree_node=False, default=0)
+
+    if TYPE_CHECKING:  # made by flax
+
+        def replace(self, **changes: Any) -> "Model": ...
+
+
+def _unsupported(m: mujoco.MjModel) -> str | None:
+    """What MJX would ignore without a word."""
+    fluid = m.opt.density > 0 or m.opt.viscosity > 0
+    actuator_extra = (m.actuator_damping, m.actuator_armature, m.actuator_dampingpoly)
+    poly = (m.jnt_stiffnesspoly, m.dof_dampingpoly)
+    poly += (m.tendon_stiffnesspoly, m.tendon_dampingpoly)
+    checks = (
+        (m.nhistory > 0, "actuator or sensor delay (delay, nsample)"),
+        (m.nplugin > 0, "plugins"),
+        (any(np.any(x) for x in actuator_extra), "actuator damping or armature"),
+        (any(np.any(x) for x in poly), "polynomial stiffness or damping"),
+        (np.any(m.actuator_actearly), 'actearly="true"'),
+        (m.opt.noslip_iterations > 0, "noslip_iterations"),
+        (bool(m.flg_surfacevel), "surface velocity"),
+        (fluid and np.any(m.geom_fluid[:, 0] > 0), 'fluidshape="ellipsoid"'),
+        (np.any(m.geom_gap) or np.any(m.pair_gap), "contact gap"),
+    )
+    return next((what for found, what in checks if found), None)
+
+
+def put_model(
+    mj_model: mujoco.MjModel,
+    addresses_per_parameter: Iterable[Iterable[str]] = (),
+    fixed: Mapping[str, float] | None = None,
+) -> Model:
+    """Puts a MuJoCo model on the device, ready to have parameters written into it.
+
+    Args:
+        mj_model: nominal model; it is not changed.
+        addresses_per_parameter: for each parameter its addresses.
+        fixed: values by address that stay, effects among them.
+
+    Raises:
+        UserError: an address that does not fit the model; or the model uses what MJX
+            cannot simulate or would ignore, by name.
+    """
+    per_parameter = tuple(tuple(a) for a in addresses_per_parameter)
+    ignored = _unsupported(mj_model)
+    if ignored is None and np.any(
+        mj_model.actuator_dyntype == mujoco.mjtDyn.mjDYN_DCMOTOR
+    ):
+        ignored = "dcmotor actuators"
+    if ignored is not None:
+        raise UserError(f"the model uses {ignored}, which MJX does not simulate")
+    fixed = dict(fixed or {})
+    every = (*per_parameter, *((a,) for a in fixed))
+    writers = resolve(mj_model, every)
+    opened = open_gates(mj_model, [a for p in every for a in p])
+    try:
+        put = mjx.put_model(opened, own_device(), impl="jax")
+    except NotImplementedError as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"MJX cannot simulate this model: {reason}") from error
+    if any(w.quantity in MOVES_CENTERS for w in writers):
+        put = full_structure(put)
+    n = len(per_parameter)
+    lasting = [replace(w, parameter=w.parameter - n) for w in writers]
+    lasting = tuple(w for w in lasting if w.parameter >= 0)
+    present = {w.quantity.split(".")[0] for w in writers if w.kind == "effect"}
+    model = Model(
+        mjx=put,
+        speed_limit=jnp.full(mj_model.nv, jnp.inf),
+        writers=lasting,
+        long_axes=tuple(long_axis(mj_model, g) for g in range(mj_model.ngeom)),
+        effects=physical.none(mj_model) if present else None,
+        present=tuple(sorted(present)) if present else None,
+    )
+    values = jnp.array(list(fixed.values()), jnp.result_type(float))
+    return _written(model, values).replace(
+        writers=tuple(w for w in writers if w.parameter < n)
+    )
+
+
+MOVES_CENTERS = ("com_x", "com_y", "com_z", "length", "com.0", "com.1", "com.2")
+
+
+def full_structure(m: mjx.Model) -> mjx.Model:
+    """Lets every degree of freedom couple with all its ancestors.
+
+    MuJoCo drops the off-diagonals of a body whose center of mass is at its joints;
+    once the center moves they are no longer zero, but MJX keeps the mask.
+    """
+    rows = []
+    for i in range(m.nv):
+        chain = [i]
+        while m.dof_parentid[chain[-1]] >= 0:
+            chain.append(int(m.dof_parentid[chain[-1]]))
+        rows.append(chain[::-1])
+    count = np.array([len(r) for r in rows], m.M_rownnz.dtype)
+    columns = np.array([j for r in rows for j in r], m.M_colind.dtype)
+    start = (np.cumsum(count) - count).astype(m.M_rowadr.dtype)
+    return m.replace(M_rownnz=count, M_rowadr=start, M_colind=columns, nC=len(columns))
+
+
+def with_parameters(model: Model, theta: jax.Array) -> Model:
+    """The model at parameters ``theta`` ``(n,)``, SI units, in `put_model`'s order.
+
+    Pure; works under jit, vmap and forward derivatives. Leaves that no parameter
+    touches are passed through, so that under vmap only the others get a batch axis.
+    A body's inertia scales with its mass; derived constants are computed again where
+    some address asks for it. The result does not depend on the order of writing.
+    Static effects are in its ``mjx``; ``effects`` holds all, or None where no other
+    is present.
+    """
+    model = _written(model, theta)
+    e = model.effects
+    if e is None:
+        return model
+    return model.replace(
+        mjx=physical.with_effects(model.mjx, e, model.present),
+        effects=e if physical.has_step_effects(model.present) else None,
+    )
+
+
+def _written(model: Model, theta: jax.Array) -> Model:
+    if not model.writers:
+        return model
+    old = model.mjx
+    m, speed, acting = old, model.speed_limit, model.effects
+    numbers: dict[str, list[tuple[tuple[int, ...], int, int]]] = {}
+    for w in model.writers:
+        if w.quantity not in ("gravity", "length") or w.kind == "effect":
+            for e in w.entries:
+                numbers.setdefault(e.field, []).append((e.index, w.parameter, e.sign))
+    for field, items in numbers.items():
+        if field == "speed_limit":
+            speed = _write(speed, items, theta)
+        elif field.startswith("effects."):
+            name = field.partition(".")[2]
+            assert acting is not None
+            value = _write(getattr(acting, name), items, theta)
+            acting = acting.replace(**{name: value})
+        else:
+            m = m.tree_replace({field: _write(_leaf(m, field), items, theta)})
+    m = _scale_inertia(model.writers, old, m)
+    for w in model.writers:
+        if w.quantity == "length":
+            m = _write_length(m, w, model.long_axes[w.id], theta)
+        elif w.quantity == "gravity":
+            g = m.opt.gravity
+            value = theta[w.parameter].astype(g.dtype)
+            m = m.tree_replace({"opt.gravity": g / jnp.linalg.norm(g) * value})
+    if any(w.row.derived for w in model.writers):
+        m = set_const(m)
+    return model.replace(mjx=m, speed_limit=speed, effects=acting)
+
+
+def _leaf(m: mjx.Model, field: str) -> jax.Array:
+    target: Any = m
+    for part in field.split("."):
+        target = getattr(target, part)
+    return target
+
+
+def _write(leaf: jax.Array, items: list[Any], theta: jax.Array) -> jax.Array:
+    index = tuple(np.array(k) for k in zip(*(i for i, _, _ in items), strict=True))
+    sign = np.array([s for _, _, s in items], leaf.dtype)
+    values = theta[np.array([p for _, p, _ in items])].astype(leaf.dtype) * sign
+    if not index:  # a scalar
+        return values[0]
+    return leaf.at[index].set(values)
+
+
+def _scale_inertia(writers: Iterable[Writer], old: mjx.Model, m: Any) -> Any:
+    heavy = {w.id for w in writers if (w.kind, w.quantity) == ("body", "mass")}
+    bodies = np.array(sorted(heavy), int)
+    if not bodies.size:
+        return m
+    ratio = m.body_mass[bodies] / old.body_mass[bodies]
+    inertia = m.body_inertia[bodies] * ratio[:, None]
+    return m.replace(body_inertia=m.body_inertia.at[bodies].set(inertia))
+
+
+def _write_length(m: Any, w: Writer, axis: int, theta: jax.Array) -> Any:
+    """A uniform solid of another length and the same mass, from the body's frame."""
+    g, b, kind = w.id, m.geom_bodyid[w.id], int(m.geom_type[w.id])
+    size, pos = m.geom_size[g], m.geom_pos[g]
+    length = theta[w.parameter].astype(size.dtype)
+    old = length_of(kind, axis, size)
+    # The stored half length; a capsule's does not include its ends.
+    changed = size.at[w.entries[0].index[1]].add((length - old) / 2)
+    along = _axis_of(m.geom_quat[g], axis)
+    pos = pos + (length / old - 1) * jnp.dot(pos, along) * along
+    inertia = m.body_mass[b] * unit_inertia(kind, changed, jnp)
+    return m.replace(
+        geom_size=m.geom_size.at[g].set(changed),
+        geom_pos=m.geom_pos.at[g].set(pos),
+        geom_rbound=m.geom_rbound.at[g].set(_bound(kind, changed)),
+        geom_aabb=m.geom_aabb.at[g, 3 + axis].set(length / 2),
+        body_ipos=m.body_ipos.at[b].set(pos),
+        body_inertia=m.body_inertia.at[b].set(inertia),
+    )
+
+
+def _axis_of(quat: jax.Array, axis: int) -> jax.Array:
+    """Column ``axis`` of the rotation matrix of a unit quaternion ``(4,)``."""
+    w, v = quat[0], quat[1:]
+    e = jnp.zeros(3, quat.dtype).at[axis].set(1.0)
+    return e + 2 * jnp.cross(v, jnp.cross(v, e) + w * e)
+
+
+def _bound(kind: int, size: jax.Array) -> jax.Array:
+    """Radius of the ball about the geom's center that holds it."""
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        return jnp.linalg.norm(size)
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        return size[0] + size[1]
+    return jnp.hypot(size[0], size[1])

@@ -1,0 +1,1 @@
+"""One step, a rollout, a replay of commands."""

@@ -1,0 +1,1 @@
+"""What makes MJX fast on a CPU."""

@@ -1,0 +1,99 @@
+"""Simulating measured segments under a model: logged commands, logged starts."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from easi_jax.data.segments import Segments
+from easi_jax.simulation.simulator import Simulator
+
+
+def predict(
+    simulator: Simulator,
+    model: Any,
+    segments: Segments,
+    steps: int | jax.Array | None = None,
+) -> tuple[jax.Array, jax.Array]:
+    """Open-loop prediction: ``qpos (M, H, nq)``, ``qvel (M, H, nv)``.
+
+    Commands on their way at the start are those that the segments know of; before
+    them, the first one counts as sent for ever. ``steps``: how many control steps are
+    simulated, all H by default; the others hold the start.
+    """
+    model = simulator.without_sense(model)  # only controllers read it
+
+    def one(qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array, past: Any) -> Any:
+        def step(state: Any, u: jax.Array) -> Any:
+            state = simulator.step(model, state, u)
+            return state, (state.qpos, state.qvel)
+
+        first = dataclasses.replace(simulator.start(qpos, qvel), sensed=())
+        if not isinstance(past, tuple):
+            first = simulator.after(model, first, past)
+        if steps is None:
+            return jax.lax.scan(step, first, ctrl)[1]
+        begun = jax.tree.map(
+            lambda x: jnp.broadcast_to(x, (ctrl.shape[0], *x.shape)),
+            (first.qpos, first.qvel),
+        )
+
+        def at(i: jax.Array, carry: Any) -> Any:
+            state, seen = step(carry[0], ctrl[i])
+            put = jax.tree.map(lambda row, x: row.at[i].set(x), carry[1], seen)
+            return state, put
+
+        return jax.lax.fori_loop(0, steps, at, (first, begun))[1]
+
+    return jax.vmap(one)(segments.qpos, segments.qvel, segments.ctrl, segments.past)
+
+
+def prediction_residuals(
+    simulator: Simulator,
+    reference: tuple[jax.Array, jax.Array],
+    states: tuple[jax.Array, jax.Array],
+) -> jax.Array:
+    """States minus the reference prediction, ``(M, H, 2 nv)``."""
+    difference = jax.vmap(jax.vmap(simulator.difference))
+    return difference(reference[0], reference[1], states[0], states[1])
+
+
+def errors(simulator: Simulator, model: Any, segments: Segments) -> jax.Array:
+    """Measured minus predicted, ``(M, H, 2 nv)``."""
+    return errors_from(simulator, model, segments, segments)
+
+
+def errors_from(
+    simulator: Simulator,
+    model: Any,
+    starts: Segments,
+    measured: Segments,
+    steps: int | jax.Array | None = None,
+) -> jax.Array:
+    """Measured minus what is predicted from other starts, ``(M, H, 2 nv)``; ``steps``
+    as in `predict`."""
+    target = (measured.next_qpos, measured.next_qvel)
+    return prediction_residuals(
+        simulator, predict(simulator, model, starts, steps), target
+    )
+
+
+def motion(simulator: Simulator, segments: Segments) -> jax.Array:
+    """Measured change since the segment's start, ``(M, H, 2 nv)``."""
+
+    def one(s: Segments) -> jax.Array:
+        diff = jax.vmap(simulator.difference, in_axes=(None, None, 0, 0))
+        return diff(s.qpos, s.qvel, s.next_qpos, s.next_qvel)
+
+    return jax.vmap(one)(segments)
+
+
+def features(simulator: Simulator, segments: Segments) -> jax.Array:
+    """Start state and commands of each segment, past ones where they matter, flat,
+    ``(M, nq + nv + (H + D) nu)``."""
+    m = segments.qpos.shape[0]
+    commands = [
+        x.reshape(m, -1) for x in jax.tree.leaves((segments.ctrl, segments.past))
+    ]
+    return jnp.concatenate([segments.qpos, segments.qvel, *commands], axis=1)

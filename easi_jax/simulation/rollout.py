@@ -1,0 +1,113 @@
+"""Trajectories of a controller in an environment, as segments of one step."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from easi_jax.data.segments import Segments
+from easi_jax.simulation.env import Env
+
+Act = Callable[[jax.Array, jax.Array], jax.Array]
+
+
+def policy_rollout(
+    env: Any,
+    model: Any,
+    act: Act,
+    key: jax.Array,
+    steps: int,
+    auto_reset: bool = False,
+    past: int = 0,
+) -> Segments:
+    """One trajectory of ``act(obs, key) -> action`` from a reset.
+
+    ``past``: how many commands before each step the segments hold; those before an
+    episode's first are that one.
+
+    Returns:
+        Segments with horizon 1, ``(steps, 1, ...)``, weight 1 where the transition
+        counts. Without ``auto_reset`` the trajectory ends at termination and later
+        weights are 0. With it, as in EASI's reference, the
+        state after a termination is that of the next episode, and the transition
+        across is kept.
+    """
+    k_reset, k_run = jax.random.split(key)
+
+    def step(carry: Any, k: jax.Array) -> Any:
+        state, alive, (sent, begun) = carry
+        k_act, k_again = jax.random.split(k)
+        action = act(state.obs, k_act)
+        ctrl = env.control(state, action)
+        sent = jnp.where(begun, sent, ctrl)
+        new = env.step(model, state, action)
+        done = new.terminated > 0
+        after = new
+        if auto_reset:
+            fresh = env.reset(model, k_again)
+            after = jax.tree.map(lambda a, b: jnp.where(done, a, b), fresh, new)
+        seg = Segments(
+            qpos=state.physics.qpos,
+            qvel=state.physics.qvel,
+            ctrl=ctrl[None],
+            next_qpos=after.physics.qpos[None],
+            next_qvel=after.physics.qvel[None],
+            weight=alive,
+            past=sent if past else (),
+        )
+        sent = jnp.concatenate([sent, ctrl[None]])[1:]
+        if auto_reset:
+            return (after, alive, (sent, ~done)), seg
+        # A finished episode stands still instead of running on into nonsense.
+        held = jax.tree.map(lambda a, b: jnp.where(alive > 0, a, b), after, state)
+        return (held, alive * (1.0 - done), (sent, jnp.ones((), bool))), seg
+
+    first = env.reset(model, k_reset)
+    ctrl = jax.eval_shape(lambda s: env.control(s, act(s.obs, k_run)), first)
+    sent = jnp.zeros((past, *ctrl.shape))
+    init = (first, jnp.ones(()), (sent, jnp.zeros((), bool)))
+    _, out = jax.lax.scan(step, init, jax.random.split(k_run, steps))
+    return out
+
+
+def collect(
+    env: Env,
+    model: Any,
+    act: Act,
+    key: jax.Array,
+    trajectories: int,
+    steps: int,
+    past: int = 0,
+) -> Segments:
+    """``trajectories`` rollouts of one model: leaves ``(B, steps, ...)``; ``past`` as
+    for `policy_rollout`."""
+    keys = jax.random.split(key, trajectories)
+    return jax.vmap(lambda k: policy_rollout(env, model, act, k, steps, past=past))(
+        keys
+    )
+
+
+def measured(trajectories: Segments, noise: jax.Array, key: jax.Array) -> Segments:
+    """What sensors would have recorded of trajectories ``(B, T, 1, ...)``.
+
+    Noise ``(2 nv,)`` [standard deviations of positions and velocities] is drawn once
+    per row: the end of a step and the start of the next are one measurement.
+    Positions of free and ball joints stay as they are.
+    """
+    t = trajectories
+    b, steps = t.weight.shape
+    nv = t.qvel.shape[-1]
+    z = noise * jax.random.normal(key, (b, steps + 1, 2 * nv))
+    pos, vel = z[..., :nv], z[..., nv:]
+    start, end = slice(0, steps), slice(1, steps + 1)
+    moved = t.qpos.shape[-1] == nv
+    return Segments(
+        qpos=t.qpos + pos[:, start] if moved else t.qpos,
+        qvel=t.qvel + vel[:, start],
+        ctrl=t.ctrl,
+        next_qpos=t.next_qpos + pos[:, end, None] if moved else t.next_qpos,
+        next_qvel=t.next_qvel + vel[:, end, None],
+        weight=t.weight,
+        past=t.past,
+    )

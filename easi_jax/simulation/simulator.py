@@ -1,0 +1,244 @@
+"""A robot as it is simulated: MuJoCo model, what may vary, control step."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco.mjx._src import math
+
+from easi_jax.data.recording import physics_steps
+from easi_jax.devices.runtime import on_cpu
+from easi_jax.errors import UserError
+from easi_jax.model import effects
+from easi_jax.model.addresses import describe
+from easi_jax.model.mjx_model import Model, Sense, put_model, with_parameters
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.model.quantities import is_scalar, joint_name
+from easi_jax.model.torque_speed import TorqueSpeed
+from easi_jax.simulation.step import WRITTEN_OUT, Physics, at_rest, control_step
+
+# Small enough for XLA to run a simulation as one piece (see `runtime`).
+_BATCH = 128  # benchmarks/speed.py
+_WIDE_BATCH = 32  # benchmarks/physics.py
+_ACCELERATOR_BATCH = 16_384  # benchmarks/scaling.py
+_FORWARD_MODE = 3  # degrees of freedom: of six, written out, it compiles for minutes
+_SETTLED = 4.0  # time constants after which a lag has forgotten
+
+
+class Simulator:
+    """A MuJoCo model, its parameters and its control step.
+
+    Attributes:
+        mj_model: the model as given, nominal values in it.
+        space: the parameters that may vary.
+        base: the model on the device, nominal values in it, gates opened.
+        dt: control step [s].
+        substeps: physics steps in a control step. The physics step is ``dt``
+            divided by the smallest whole number that brings it to the model's own
+            timestep or below.
+        wide: whether it is too large to be written out entry by entry.
+        by_differences: whether slopes of a fit are central differences, not
+            forward-mode derivatives.
+        fixed: values by address that are not those of ``mj_model``, effects among them.
+        past_steps: commands before a measured start that its simulation has use for;
+            0 where no effect lies on the way of a command.
+
+    Raises:
+        UserError: what MJX cannot simulate, or an address that the model lacks.
+    """
+
+    def __init__(
+        self,
+        mj_model: mujoco.MjModel,
+        space: ParameterSpace,
+        dt: float | None = None,
+        sense: Sense | None = None,
+        sense_size: int = 0,
+        torque_speed: TorqueSpeed | None = None,
+        fixed: Mapping[str, float] | None = None,
+    ) -> None:
+        step = float(mj_model.opt.timestep)
+        self.dt = float(dt) if dt is not None else step
+        if not 0 < self.dt < 10:
+            raise UserError(f"control step {self.dt} s: give one above 0 and below 10")
+        self.substeps = physics_steps(self.dt, step)
+        self.mj_model = mj_model
+        self.space = space
+        self.fixed = dict(fixed or {})
+        self.wide = mj_model.nv > WRITTEN_OUT
+        self.by_differences = mj_model.nv > _FORWARD_MODE
+        self.base = self._put().replace(
+            sense=sense,
+            sense_size=sense_size,
+            torque_speed=torque_speed,
+            delay_steps=_steps(self._longest("effect.delay.") / self.dt),
+        )
+        self.past_steps = 0
+        if self.base.effects is not None and effects.has_command_memory(
+            self.base.present
+        ):
+            settled = _SETTLED * self._longest("effect.lag.") / self.dt
+            self.past_steps = self.base.delay_steps + 1 + _steps(settled)
+
+    @cached_property
+    def batch(self) -> int:
+        """Simulations at once on a device. More would leave a CPU core's cache; an
+        accelerator hides behind thousands what each step waits for."""
+        if not on_cpu():
+            return _ACCELERATOR_BATCH
+        return _WIDE_BATCH if self.wide else _BATCH
+
+    def _longest(self, kind: str) -> float:
+        """The largest value that effects of a kind may have [s]; 0 without any."""
+        fixed = [v for a, v in self.fixed.items() if a.startswith(kind)]
+        free = [
+            min(p.bounds[1], describe(self.mj_model, p.addresses)[1][1])
+            for p in self.space.parameters
+            if p.addresses[0].startswith(kind)
+        ]
+        return max([0.0, *fixed, *free])
+
+    def _put(self) -> Model:
+        # Eagerly, also where a machine is made while something is traced.
+        with jax.ensure_compile_time_eval():
+            model = put_model(self.mj_model, self.space.addresses, self.fixed)
+            step = jnp.asarray(self.dt / self.substeps, model.mjx.opt.timestep.dtype)
+            return model.replace(mjx=model.mjx.tree_replace({"opt.timestep": step}))
+
+    def rebuilt(
+        self,
+        mj_model: mujoco.MjModel | None = None,
+        space: ParameterSpace | None = None,
+        fixed: Mapping[str, float] | None = None,
+    ) -> "Simulator":
+        """The same machine, what it senses and its drives included, of another model
+        or with other parameters or fixed values."""
+        base = self.base
+        return Simulator(
+            self.mj_model if mj_model is None else mj_model,
+            self.space if space is None else space,
+            self.dt,
+            base.sense,
+            base.sense_size,
+            base.torque_speed,
+            self.fixed if fixed is None else fixed,
+        )
+
+    def model(self, theta: jax.Array) -> Model:
+        """The model at parameters ``theta`` ``(n,)`` in SI units."""
+        return with_parameters(self.base, theta)
+
+    def start(
+        self, qpos: jax.Array, qvel: jax.Array, model: Model | None = None
+    ) -> Physics:
+        """A measured state, nothing known of what came before it.
+
+        ``model`` is given where it has effects, which remember.
+        """
+        return at_rest(self.base if model is None else model, qpos, qvel)
+
+    def after(self, model: Model, state: Physics, past: jax.Array) -> Physics:
+        """A state with commands ``past (D, nu)`` sent before it, oldest first."""
+        e = model.effects
+        if e is None or not self.past_steps:
+            return state
+        memory = effects.warmed(e, state.memory, past, self.dt, self.substeps)
+        return replace(state, memory=memory)
+
+    def without_sense(self, model: Model) -> Model:
+        """The model with nothing read but the state."""
+        return model.replace(sense=None) if self.base.sense else model
+
+    def step(self, model: Model, state: Physics, ctrl: jax.Array) -> Physics:
+        """One control step with ``ctrl`` ``(nu,)`` held."""
+        return control_step(model, state, ctrl, self.substeps)
+
+    @cached_property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the ``2 nv`` entries of `difference`: positions, velocities."""
+        m = self.mj_model
+        pos, vel = [], []
+        for j in range(m.njnt):
+            name = joint_name(m, j)
+            n = {0: 6, 1: 3}.get(int(m.jnt_type[j]), 1)
+            ends = [""] if n == 1 else [f".{i}" for i in range(n)]
+            pos += [f"qpos.{name}{e}" for e in ends]
+            vel += [f"qvel.{name}{e}" for e in ends]
+        return (*pos, *vel)
+
+    @cached_property
+    def _hinge_only(self) -> bool:
+        return all(is_scalar(self.mj_model, j) for j in range(self.mj_model.njnt))
+
+    def difference(
+        self,
+        qpos_a: jax.Array,
+        qvel_a: jax.Array,
+        qpos_b: jax.Array,
+        qvel_b: jax.Array,
+    ) -> jax.Array:
+        """State b minus state a, ``(2 nv,)``: positions in the tangent space
+        (rotation vectors for free and ball joints), then velocities.
+
+        Hinges are subtracted as they are: simulated angles do not wrap.
+        """
+        dq = qpos_b - qpos_a if self._hinge_only else self._tangent(qpos_a, qpos_b)
+        return jnp.concatenate([dq, qvel_b - qvel_a])
+
+    def move(self, qpos: jax.Array, tangent: jax.Array) -> jax.Array:
+        """Positions ``(nq,)`` moved by a tangent vector ``(nv,)``."""
+        if self._hinge_only:
+            return qpos + tangent
+        m, out = self.mj_model, []
+        for j in range(m.njnt):
+            a, v, kind = int(m.jnt_qposadr[j]), int(m.jnt_dofadr[j]), int(m.jnt_type[j])
+            if kind == 0:
+                out += [qpos[a : a + 3] + tangent[v : v + 3]]
+                a, v = a + 3, v + 3
+            if kind <= 1:
+                out += [_turned(qpos[a : a + 4], tangent[v : v + 3])]
+            else:
+                out += [qpos[a : a + 1] + tangent[v : v + 1]]
+        return jnp.concatenate(out)
+
+    def _tangent(self, qa: jax.Array, qb: jax.Array) -> jax.Array:
+        m, out = self.mj_model, []
+        for j in range(m.njnt):
+            a, kind = int(m.jnt_qposadr[j]), int(m.jnt_type[j])
+            if kind == 0:
+                out += [qb[a : a + 3] - qa[a : a + 3]]
+                a += 3
+            if kind <= 1:
+                out += [_rotation_between(qa[a : a + 4], qb[a : a + 4])]
+            else:
+                out += [qb[a : a + 1] - qa[a : a + 1]]
+        return jnp.concatenate(out)
+
+
+def _steps(x: float) -> int:
+    """Whole steps that cover ``x`` of them, up to rounding."""
+    return int(np.ceil(x - 1e-6))
+
+
+def _turned(quat: jax.Array, vector: jax.Array) -> jax.Array:
+    # Exponential map with its slope at zero, which `math.quat_integrate` lacks.
+    n2 = vector @ vector
+    n = jnp.sqrt(jnp.where(n2 > 1e-16, n2, 1.0))
+    scale = jnp.where(n2 > 1e-16, jnp.sin(n / 2) / n, 0.5)
+    real = jnp.where(n2 > 1e-16, jnp.cos(n / 2), 1.0)
+    return math.quat_mul(quat, jnp.concatenate([real[None], scale * vector]))
+
+
+def _rotation_between(qa: jax.Array, qb: jax.Array) -> jax.Array:
+    """Rotation vector from unit quaternion a to b (w x y z), in a's frame [rad]."""
+    wa, va, wb, vb = qa[0], qa[1:], qb[0], qb[1:]
+    w = wa * wb + va @ vb
+    v = wa * vb - wb * va - jnp.cross(va, vb)
+    v = jnp.where(w < 0, -v, v)
+    n2 = v @ v
+    n = jnp.sqrt(jnp.where(n2 > 1e-16, n2, 1.0))
+    return v * jnp.where(n2 > 1e-16, 2 * jnp.arctan2(n, jnp.abs(w)) / n, 2.0)

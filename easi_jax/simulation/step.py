@@ -1,0 +1,242 @@
+"""One control step of physics: the state, the substeps, and nothing else."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from mujoco import mjx
+from mujoco.mjx._src import forward as mjx_forward
+from mujoco.mjx._src import sensor as mjx_sensor
+from mujoco.mjx._src import smooth as mjx_smooth
+from mujoco.mjx._src import solver as mjx_solver
+from mujoco.mjx._src.collision_driver import collision
+from mujoco.mjx._src.constraint import make_constraint
+from mujoco.mjx._src.types import IntegratorType
+
+from easi_jax.devices.mesh import own_device
+from easi_jax.model import effects
+from easi_jax.model.backlash import first_rotor
+from easi_jax.model.effects import Effects
+from easi_jax.model.quantities import scalar_places
+from easi_jax.simulation import constraint_solver
+from easi_jax.simulation.cpu.small_linalg import unroll_small
+from easi_jax.simulation.cpu.unroll import scalarized
+from easi_jax.simulation.mjx_patches import with_velocity_products
+
+WRITTEN_OUT = 8  # degrees of freedom up to which small matrices are written out
+
+
+@flax.struct.dataclass
+class Physics:
+    """What the simulation carries from step to step; small, and can be saved.
+
+    Attributes:
+        qpos: joint positions, ``(nq,)`` [m, rad].
+        qvel: joint velocities, ``(nv,)`` [m/s, rad/s].
+        act: actuator activations, ``(na,)``.
+        warmstart: last acceleration, where the solver starts, ``(nv,)``.
+        sensed: what ``model.sense`` read in the last physics step; zeros before.
+        memory: what the way of a command remembers, where effects lie on it.
+        rotor: drives with play, where there are any.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    act: jax.Array
+    warmstart: jax.Array
+    sensed: Any = ()
+    memory: Any = ()
+    rotor: Any = ()
+
+    if TYPE_CHECKING:  # made by flax
+
+        def replace(self, **changes: Any) -> "Physics": ...
+
+
+def at_rest(model: Any, qpos: jax.Array, qvel: jax.Array) -> Physics:
+    """A state with nothing known of what came before it."""
+    m = model.mjx
+    act, warm = jnp.zeros(m.na), jnp.zeros(m.nv)
+    sensed = jnp.zeros(model.sense_size) if model.sense else ()
+    memory, rotor, e = (), (), model.effects
+    if e is not None and effects.has_backlash(model.present):
+        rotor = first_rotor(scalar_places(m), qpos, qvel)
+    if e is not None and effects.has_command_memory(model.present):
+        memory = effects.first_memory(model.delay_steps, m.nu)
+    return Physics(qpos, qvel, act, warm, sensed, memory, rotor)
+
+
+def data_at(model: Any, state: Physics, ctrl: jax.Array) -> mjx.Data:
+    """The `mjx.Data` of a state, before `forward`."""
+    return mjx.make_data(model.mjx, own_device()).replace(
+        qpos=state.qpos,
+        qvel=state.qvel,
+        act=state.act,
+        qacc_warmstart=state.warmstart,
+        ctrl=ctrl,
+    )
+
+
+@dataclass(frozen=True)
+class Within:
+    """Effects that act between the parts of a physics step.
+
+    Attributes:
+        effects: their strengths.
+        resists: whether bodies may have drag, which needs their velocities.
+        touches: whether contacts are changed where they are made.
+    """
+
+    effects: Effects
+    has_body_drag: bool
+    has_contact_effects: bool
+
+
+def _within(model: Any) -> Within | None:
+    has_body_drag = effects.has_body_drag(model.present)
+    has_contact_effects = effects.has_contact_effects(model.present)
+    if model.effects is None or not (has_body_drag or has_contact_effects):
+        return None
+    return Within(model.effects, has_body_drag, has_contact_effects)
+
+
+def _position(m: mjx.Model, d: mjx.Data, e: Effects) -> mjx.Data:
+    """`fwd_position`, contacts changed where their constraints are made."""
+    for part in (
+        *(mjx_smooth.kinematics, mjx_smooth.com_pos, mjx_smooth.camlight),
+        *(mjx_smooth.tendon, mjx_smooth.crb, mjx_smooth.tendon_armature),
+        *(mjx_smooth.factor_m, collision),
+    ):
+        d = part(m, d)
+    d = effects.pair_contacts(m, d, e)
+    return mjx_smooth.transmission(m, make_constraint(m, d))
+
+
+def forward(
+    m: mjx.Model, d: mjx.Data, wide: bool = False, within: Within | None = None
+) -> mjx.Data:
+    """`mjx.forward` with this package's constraint solver where it applies.
+
+    ``wide`` is the solver for batches of larger robots
+    (`easi_jax.simulation.cpu.batched_newton`).
+    """
+    own = constraint_solver.supported(m)
+    if not own and within is None:
+        return mjx.forward(m, d)
+    if within is not None and within.has_contact_effects:
+        d = _position(m, d, within.effects)
+    else:
+        d = mjx_forward.fwd_position(m, d)
+    d = mjx_sensor.sensor_pos(m, d)
+    d = mjx_forward.fwd_velocity(m, d)
+    if own:
+        d = with_velocity_products(m, d)
+    d = mjx_sensor.sensor_vel(m, d)
+    if within is not None and within.has_body_drag:
+        d = effects.body_resistance(m, d, within.effects)
+    d = mjx_forward.fwd_actuation(m, d)
+    d = mjx_forward.fwd_acceleration(m, d)
+    if d._impl.efc_J.size == 0:
+        d = d.replace(qacc=d.qacc_smooth)
+    elif own:
+        d = constraint_solver.solve(m, d, int(m.opt.iterations), wide)
+    else:
+        d = mjx_solver.solve(m, d)
+    return mjx_sensor.sensor_acc(m, d)
+
+
+def mjx_step(
+    m: mjx.Model, d: mjx.Data, wide: bool = False, within: Within | None = None
+) -> mjx.Data:
+    """`mjx.step`, its constraint solve and small matrices batched well; see `forward`.
+
+    RK4 leaves effects within a step out.
+    """
+    if m.opt.integrator == IntegratorType.RK4:
+        return mjx.step(m, d)  # RK4 solves inside its stages
+    d = forward(m, d, wide, within)
+    if m.opt.integrator == IntegratorType.EULER:
+        return mjx_forward.euler(m, d)
+    return mjx_forward.implicit(_without_clamped(m, d), d)
+
+
+def _without_clamped(m: mjx.Model, d: mjx.Data) -> mjx.Model:
+    """The model as `implicit` must see it: no velocity feedback where it is cut off.
+
+    MuJoCo C (4.0) leaves an actuator at its force limit out of the derivative; MJX
+    3.17 does not, and a saturated servo then brakes too softly.
+    """
+    limited = m.actuator_forcelimited.astype(bool)
+    if not limited.any():
+        return m
+    force, edge = d.actuator_force, m.actuator_forcerange
+    clamped = limited & ((force <= edge[:, 0]) | (force >= edge[:, 1]))
+    free = jnp.where(clamped, 0.0, 1.0)
+    return m.replace(
+        actuator_gainprm=m.actuator_gainprm.at[:, 2].set(
+            m.actuator_gainprm[:, 2] * free
+        ),
+        actuator_biasprm=m.actuator_biasprm.at[:, 2].set(
+            m.actuator_biasprm[:, 2] * free
+        ),
+    )
+
+
+def _with_torque_speed(m: mjx.Model, limits: jax.Array) -> mjx.Model:
+    own = m.actuator_forcerange
+    low = jnp.maximum(own[:, 0], limits[:, 0])
+    high = jnp.minimum(own[:, 1], limits[:, 1])
+    return m.replace(actuator_forcerange=jnp.stack([low, high], axis=1))
+
+
+def substep(model: Any, state: Physics, ctrl: jax.Array, wide: bool = False) -> Physics:
+    """One physics step; the joint speed limit, which MuJoCo lacks, clips after it."""
+    m = model.mjx
+    if model.torque_speed is not None:
+        m = _with_torque_speed(m, model.torque_speed.limits(state.qvel))
+    d = data_at(model, state, ctrl)
+    e, rotor = model.effects, state.rotor
+    if e is not None:
+        m, d, rotor = effects.in_step(m, d, e, rotor)
+    d = mjx_step(m, d, wide, _within(model))
+    qvel = jnp.clip(d.qvel, -model.speed_limit, model.speed_limit)
+    sensed = model.sense(model.mjx, d) if model.sense else ()
+    return Physics(d.qpos, qvel, d.act, d.qacc_warmstart, sensed, (), rotor)
+
+
+def _otherwise(model: Any, state: Physics, ctrl: jax.Array) -> Physics:
+    """Beyond what is written out entry by entry (benchmarks/physics.py)."""
+    if model.mjx.nv <= WRITTEN_OUT:
+        return _unrolled(model, state, ctrl)
+    return substep(model, state, ctrl, wide=True)
+
+
+_unrolled = unroll_small(substep)
+_batched_substep = scalarized(substep, otherwise=_otherwise)
+
+
+def control_step(model: Any, state: Physics, ctrl: jax.Array, substeps: int) -> Physics:
+    """Holds ``ctrl`` ``(nu,)`` for ``substeps`` physics steps."""
+    if model.effects is None or not effects.has_command_memory(model.present):
+
+        def step(s: Physics, _: None) -> tuple[Physics, None]:
+            return _batched_substep(model, s, ctrl), None
+
+        return jax.lax.scan(step, state, None, length=substeps)[0]
+
+    dt = model.mjx.opt.timestep * substeps
+    arrived, memory = effects.commands(model.effects, state.memory, ctrl, dt, substeps)
+
+    bare = state.replace(memory=())
+    return arrived_step(model, bare, arrived).replace(memory=memory)
+
+
+def arrived_step(model: Any, state: Physics, arrived: jax.Array) -> Physics:
+    """One control step in which ``arrived (substeps, nu)`` reaches the actuators."""
+
+    def step(s: Physics, u: jax.Array) -> tuple[Physics, None]:
+        return _batched_substep(model, s, u), None
+
+    return jax.lax.scan(step, state, arrived)[0]

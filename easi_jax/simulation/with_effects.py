@@ -1,0 +1,48 @@
+"""A simulator, or an environment, with found effects in its model."""
+
+import copy
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from easi_jax.errors import UserError
+from easi_jax.model.found_effects import FoundEffects, joined
+from easi_jax.simulation.simulator import Simulator
+
+
+def simulator_with(simulator: Simulator, found: FoundEffects) -> Simulator:
+    """The machine with effects in its physics and in its space.
+
+    Raises:
+        UserError: as `joined`.
+    """
+    space, fixed = joined(simulator.mj_model, simulator.space, found)
+    return simulator.rebuilt(space=space, fixed={**simulator.fixed, **fixed})
+
+
+def env_with(env: Any, found: FoundEffects) -> Any:
+    """An environment with effects; the given one stays as it is.
+
+    Raises:
+        UserError: as `joined`; or the environment simulates with something else than
+            its ``simulator``.
+    """
+    if not (found.physical or found.own):
+        return env
+    if not isinstance(getattr(env, "simulator", None), Simulator):
+        raise UserError(
+            f"{env.name}: effects need an environment whose `simulator` is an "
+            "easi_jax.simulation.simulator.Simulator"
+        )
+    out = copy.copy(env)
+    out.simulator = simulator_with(env.simulator, found)
+    out.space = out.simulator.space
+    theta = jnp.asarray(out.space.nominal, jnp.float32)
+    model = jax.eval_shape(out.model, theta)
+    if getattr(model, "present", None) != out.simulator.base.present:
+        raise UserError(
+            f"{env.name}: effects need an environment whose model() is that of its "
+            "`simulator` (self.simulator.model(theta))"
+        )
+    return out

@@ -1,0 +1,891 @@
+"""Reading and writing of logs, and every way in which a log can be wrong."""
+
+import io
+import os
+import zipfile
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+import pytest
+
+from easi_jax.data.recording import Run
+from easi_jax.errors import UserError
+from easi_jax.io.logs import tables as log_tables
+from easi_jax.io.logs.reader import read_logs, write_log
+from easi_jax.model.joint_space import Configuration
+
+SHARED = Path(__file__).parents[3] / "shared" / "data"
+
+CART = """
+<mujoco><compiler angle="radian"/><option timestep="0.01"/><worldbody>
+  <body name="cart"><joint name="slider" type="slide" range="-1 1" limited="true"/>
+    <geom size=".1"/><site name="site"/>
+    <body><joint name="pole" type="hinge" range="-2 2" limited="true"/>
+      <geom size=".1"/></body></body>
+</worldbody>
+<actuator><motor name="drive" joint="slider" ctrlrange="-5 5" ctrllimited="true"/>
+</actuator>
+<sensor><jointpos name="encoder" joint="pole"/><accelerometer name="imu" site="site"/>
+</sensor></mujoco>
+"""
+
+FLYER = """
+<mujoco><compiler angle="radian"/><option timestep="0.01"/><worldbody>
+  <body><freejoint name="base"/><geom size=".1"/>
+    <body><joint name="wrist" type="ball"/><geom size=".1"/>
+      <body><joint name="wheel" type="hinge"/><geom size=".1"/></body></body></body>
+</worldbody></mujoco>
+"""
+
+ROWS = 40
+
+
+@pytest.fixture(scope="module")
+def cart() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(CART)
+
+
+@pytest.fixture(scope="module")
+def flyer() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(FLYER)
+
+
+def cart_columns(rows: int = ROWS, dt: float = 0.01) -> dict[str, np.ndarray]:
+    time = dt * np.arange(rows)
+    return {
+        "time": time,
+        "qpos.slider": 0.3 * np.sin(3 * time),
+        "qpos.pole": 0.5 * np.cos(2 * time),
+        "ctrl.drive": np.arange(rows) / 10.0,
+    }
+
+
+def save(path: Path, columns: dict[str, np.ndarray]) -> Path:
+    """Written by other code than the project's own."""
+    if path.suffix == ".npz":
+        np.savez(path, **columns)
+    elif path.suffix == ".parquet":
+        pyarrow.parquet.write_table(pyarrow.table(columns), path)
+    else:
+        lines = [",".join(columns)]
+        for row in zip(*columns.values(), strict=True):
+            lines.append(",".join("" if x is None else str(x) for x in row))
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def failure(*args, **kwargs) -> str:
+    with pytest.raises(UserError) as caught:
+        read_logs(*args, **kwargs)
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+def said(log, words: str) -> str:
+    found = [note for note in log.notes if words in note.partition(": ")[2]]
+    assert len(found) == 1, log.notes
+    return found[0]
+
+
+EXTENSIONS = ["csv", "npz", "parquet"]
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_reads_every_file_type(tmp_path, cart, extension):
+    columns = cart_columns()
+    shuffled = dict(reversed(columns.items()))
+    log = read_logs(save(tmp_path / f"a.{extension}", shuffled), cart)
+    (run,) = log.runs
+    assert (run.name, run.dt, len(run)) == ("a", 0.01, ROWS)
+    assert run.source.endswith(f"a.{extension}")
+    np.testing.assert_array_equal(run.time, columns["time"])
+    np.testing.assert_array_equal(run.qpos[:, 0], columns["qpos.slider"])
+    np.testing.assert_array_equal(run.qpos[:, 1], columns["qpos.pole"])
+    np.testing.assert_array_equal(run.ctrl[:, 0], columns["ctrl.drive"])
+    assert not run.qvel_measured
+    assert run.qvel.dtype == run.qpos.dtype == np.float64
+    np.testing.assert_allclose(run.qvel[5:-5, 0], 0.9 * np.cos(3 * run.time)[5:-5],
+                               atol=5e-3)  # fmt: skip
+    assert "qvel.slider, qvel.pole" in said(log, "estimated")
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_written_logs_read_back_bit_equal(tmp_path, cart, extension):
+    rng = np.random.default_rng(0)
+    runs = [
+        Run(
+            name=name,
+            source="",
+            dt=0.01,
+            time=0.01 * np.arange(20),
+            qpos=rng.normal(size=(20, 2)) * 0.3,
+            qvel=rng.normal(size=(20, 2)),
+            qvel_measured=True,
+            ctrl=rng.normal(size=(20, 1)),
+            configuration=Configuration.of(cart),
+            sensors={"imu": rng.normal(size=(20, 3))},
+        )
+        for name in ("first", "second")
+    ]
+    path = tmp_path / f"out.{extension}"
+    write_log(path, cart, runs)
+    log = read_logs(path, cart)
+    assert log.notes == ()
+    assert [run.name for run in log.runs] == ["out/first", "out/second"]
+    for old, new in zip(runs, log.runs, strict=True):
+        assert new.qvel_measured
+        for name in ("time", "qpos", "qvel", "ctrl"):
+            np.testing.assert_array_equal(getattr(new, name), getattr(old, name))
+        np.testing.assert_array_equal(new.sensors["imu"], old.sensors["imu"])
+
+    write_log(path, cart, runs[0], velocities=False)
+    (run,) = read_logs(path, cart).runs
+    assert run.name == "out"
+    assert not run.qvel_measured
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_writing_refuses_what_it_cannot_do(tmp_path, cart):
+    save(tmp_path / "a.csv", cart_columns())
+    (run,) = read_logs(tmp_path / "a.csv", cart).runs
+    with pytest.raises(UserError, match="ends in"):
+        write_log(tmp_path / "a.xlsx", cart, run)
+    with pytest.raises(UserError, match="no run"):
+        write_log(tmp_path / "a.csv", cart, [])
+    with pytest.raises(ValueError, match="one name"):
+        write_log(tmp_path / "a.csv", cart, [run, run])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot write"):
+        write_log(tmp_path / "file" / "a.csv", cart, run)
+
+
+# Columns
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_missing_column_is_named_with_the_nearest(tmp_path, cart, extension):
+    columns = cart_columns()
+    columns["qpos.pol"] = columns.pop("qpos.pole")
+    text = failure(save(tmp_path / f"a.{extension}", columns), cart)
+    assert f"a.{extension}" in text
+    assert '"qpos.pole"' in text
+    assert 'did you mean "qpos.pol"?' in text
+
+
+def test_all_missing_columns_are_named(tmp_path, cart):
+    text = failure(save(tmp_path / "a.csv", {"time": np.arange(3)}), cart)
+    for name in ("qpos.slider", "qpos.pole", "ctrl.drive"):
+        assert f'"{name}"' in text
+    columns = cart_columns()
+    del columns["time"]
+    assert '"time"' in failure(save(tmp_path / "b.csv", columns), cart)
+
+
+@pytest.mark.parametrize(
+    ("extra", "near"),
+    [
+        ("qpos.pole2", "qpos.pole"),
+        ("qvel.slidr", "qvel.slider"),
+        ("ctrl.driver", "ctrl.drive"),
+        ("qpos.pole.0", "qpos.pole"),
+    ],
+)
+def test_unknown_position_velocity_or_command_is_an_error(tmp_path, cart, extra, near):
+    columns = cart_columns() | {extra: np.zeros(ROWS)}
+    text = failure(save(tmp_path / "a.csv", columns), cart)
+    assert f'"{extra}"' in text
+    assert f'did you mean "{near}"?' in text
+
+
+def test_other_unknown_columns_are_listed_and_ignored(tmp_path, cart):
+    columns = cart_columns() | {
+        "temperature": np.zeros(ROWS),
+        "sensor.gyro": np.zeros(ROWS),
+    }
+    note = said(read_logs(save(tmp_path / "a.csv", columns), cart), "ignored")
+    assert "temperature, sensor.gyro" in note
+
+
+def test_ignored_columns_may_hold_anything(tmp_path, cart):
+    columns = cart_columns() | {"remark": np.array(["x"] * ROWS)}
+    for extension in EXTENSIONS:
+        log = read_logs(save(tmp_path / f"a.{extension}", columns), cart)
+        assert "remark" in said(log, "ignored")
+    np.savez(tmp_path / "b.npz", **cart_columns(), image=np.zeros((2, 3, 4)))
+    assert "image" in said(read_logs(tmp_path / "b.npz", cart), "ignored")
+
+
+def test_duplicate_columns(tmp_path, cart):
+    path = save(tmp_path / "a.csv", cart_columns())
+    lines = path.read_text().splitlines()
+    lines[0] += ",time"
+    path.write_text("\n".join([lines[0], *(f"{x},0" for x in lines[1:])]))
+    assert '"time" is there more than once' in failure(path, cart)
+
+    table = pyarrow.table(cart_columns())
+    table = table.append_column("qpos.pole", table["qpos.pole"])
+    pyarrow.parquet.write_table(table, tmp_path / "a.parquet")
+    assert '"qpos.pole" is there more' in failure(tmp_path / "a.parquet", cart)
+
+    save(tmp_path / "a.npz", cart_columns())
+    with zipfile.ZipFile(tmp_path / "a.npz", "a") as archive:
+        raw = archive.read("time.npy")
+        with pytest.warns(UserWarning, match="Duplicate"):
+            archive.writestr("time.npy", raw)
+    assert '"time" is there more' in failure(tmp_path / "a.npz", cart)
+
+
+def test_velocities_of_some_joints(tmp_path, cart, flyer):
+    columns = cart_columns() | {"qvel.pole": np.full(ROWS, 7.0)}
+    log = read_logs(save(tmp_path / "a.csv", columns), cart)
+    (run,) = log.runs
+    np.testing.assert_array_equal(run.qvel[:, 1], 7.0)
+    assert abs(run.qvel[3, 0]) < 1.0
+    assert not run.qvel_measured
+    note = said(log, "estimated")
+    assert "qvel.slider" in note
+    assert "qvel.pole" not in note
+
+    columns = flyer_columns() | {"qvel.base.0": np.zeros(ROWS)}
+    text = failure(save(tmp_path / "b.csv", columns), flyer)
+    assert '"qvel.base.0" needs "qvel.base.1"' in text
+
+
+def test_missing_velocity_cells_are_estimated_and_counted(tmp_path, cart):
+    columns = cart_columns()
+    columns |= {"qvel.slider": np.full(ROWS, 7.0), "qvel.pole": np.full(ROWS, 8.0)}
+    columns["qvel.pole"][[3, 9]] = np.nan
+    log = read_logs(save(tmp_path / "a.csv", columns), cart)
+    (run,) = log.runs
+    assert len(run) == ROWS
+    assert "2 rows are estimated" in said(log, "velocities missing")
+    assert not run.qvel_measured
+    assert abs(run.qvel[3, 1]) < 1.0
+    assert run.qvel[4, 1] == 8.0
+
+
+def test_sensors_are_optional_and_may_have_gaps(tmp_path, cart):
+    slow = np.where(np.arange(ROWS) % 5 == 0, 1.0, np.nan)
+    columns = cart_columns() | {"sensor.encoder": slow}
+    columns |= {f"sensor.imu.{i}": np.full(ROWS, float(i)) for i in range(3)}
+    log = read_logs(save(tmp_path / "a.csv", columns), cart)
+    (run,) = log.runs
+    assert len(run) == ROWS
+    np.testing.assert_array_equal(run.sensors["encoder"][:, 0], slow)
+    np.testing.assert_array_equal(run.sensors["imu"][4], [0, 1, 2])
+    del columns["sensor.imu.2"]
+    log = read_logs(save(tmp_path / "b.csv", columns), cart)
+    assert "imu" not in log.runs[0].sensors
+    assert "it has 3 columns" in said(log, "sensor imu")
+
+
+def test_models_whose_parts_have_no_name():
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body name="b"><joint/><geom size=".1"/></body>'
+        "</worldbody></mujoco>"
+    )
+    assert 'joint 0 (in body "b") has no name' in failure("a.csv", model)
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body>'
+        '</worldbody><actuator><motor joint="j"/></actuator></mujoco>'
+    )
+    assert "actuator 0 has no name" in failure("a.csv", model)
+
+
+# Time and runs
+
+
+def test_runs_by_column(tmp_path, cart):
+    columns = cart_columns()
+    label = np.repeat([7, 3], ROWS // 2)
+    columns["time"] = np.tile(columns["time"][: ROWS // 2], 2)
+    for extension in EXTENSIONS:
+        path = save(tmp_path / f"a.{extension}", {**columns, "run": label})
+        assert [r.name for r in read_logs(path, cart).runs] == ["a/7", "a/3"]
+    for extension in EXTENSIONS:
+        names = np.where(label == 7, "up", "down")
+        path = save(tmp_path / f"b.{extension}", {**columns, "run": names})
+        assert [r.name for r in read_logs(path, cart).runs] == ["b/up", "b/down"]
+    text = failure(save(tmp_path / "c.csv", columns), cart)
+    assert '"run" column' in text
+    label = np.array(["x", *[""] * (ROWS - 1)])
+    text = failure(save(tmp_path / "d.csv", {**columns, "run": label}), cart)
+    assert "row 2 has no value" in text
+
+
+def test_runs_of_different_rates_together(tmp_path, cart):
+    slow = save(tmp_path / "slow.csv", cart_columns(dt=0.02))
+    fast = save(tmp_path / "fast.npz", cart_columns(dt=0.005))
+    assert [r.dt for r in read_logs([slow, fast], cart).runs] == [0.02, 0.005]
+
+
+def test_names_stay_apart(tmp_path, cart):
+    (tmp_path / "mon").mkdir()
+    (tmp_path / "tue").mkdir()
+    a = save(tmp_path / "mon" / "run.csv", cart_columns())
+    b = save(tmp_path / "tue" / "run.csv", cart_columns())
+    names = [run.name for run in read_logs([a, b], cart).runs]
+    assert len(set(names)) == 2
+    assert "more than once" in failure([a, a], cart)
+    assert "no log" in failure([], cart)
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+@pytest.mark.parametrize("step", [0.0, -0.005])
+def test_time_going_back(tmp_path, cart, extension, step):
+    columns = cart_columns()
+    columns["time"][11] = columns["time"][10] + step
+    text = failure(save(tmp_path / f"a.{extension}", columns), cart)
+    assert "row 11" in text
+    assert "row 12" in text
+    assert "goes back or stands still" in text
+
+
+@pytest.mark.parametrize("column", ["time", "qpos.pole", "ctrl.drive"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_non_finite_rows_split_the_run(tmp_path, cart, column, value, extension):
+    columns = cart_columns()
+    columns[column][[10, 25]] = value
+    log = read_logs(save(tmp_path / f"a.{extension}", columns), cart)
+    assert [run.name for run in log.runs] == ["a#1", "a#2", "a#3"]
+    assert [len(run) for run in log.runs] == [10, 14, 14]
+    assert log.runs[1].ctrl[0, 0] == pytest.approx(1.1)
+    note = said(log, "dropped")
+    assert "2 of 40 rows" in note
+    assert "row 11" in note
+    assert "3 runs" in said(log, "split")
+
+
+def test_empty_cells_are_non_finite(tmp_path, cart):
+    path = save(tmp_path / "a.csv", cart_columns())
+    lines = path.read_text().splitlines()
+    cells = lines[6].split(",")
+    lines[6] = ",".join([*cells[:2], "", cells[3]])
+    path.write_text("\n".join(lines))
+    log = read_logs(path, cart)
+    assert [len(run) for run in log.runs] == [5, 34]
+    table = pyarrow.table({k: list(v) for k, v in cart_columns().items()})
+    nulls = table.set_column(1, "qpos.slider", [[None, *[0.0] * (ROWS - 1)]])
+    pyarrow.parquet.write_table(nulls, tmp_path / "a.parquet")
+    assert [len(r) for r in read_logs(tmp_path / "a.parquet", cart).runs] == [ROWS - 1]
+
+
+def test_holes(tmp_path, cart):
+    columns = cart_columns()
+    keep = np.ones(ROWS, bool)
+    keep[[10, 11]] = False  # three steps: bridged
+    keep[[20, 21, 22]] = False  # four: a hole
+    log = read_logs(
+        save(tmp_path / "a.csv", {k: v[keep] for k, v in columns.items()}), cart
+    )
+    first, second = log.runs
+    assert len(first) == 20
+    assert len(second) == 17
+    np.testing.assert_allclose(first.time, columns["time"][:20], atol=1e-12)
+    bridge = np.interp(0.10, [0.09, 0.12], columns["qpos.slider"][[9, 12]])
+    assert first.qpos[10, 0] == pytest.approx(bridge)
+    np.testing.assert_allclose(first.ctrl[9:13, 0], [0.9, 0.9, 0.9, 1.2])
+    assert said(log, "holes longer than 3 steps: 1")
+    assert "200 % (a#1)" in said(log, "in 1 of 2 runs")
+
+
+def test_irregular_times(tmp_path, cart):
+    """Linear motion comes out exact; commands are held from the row before."""
+    rng = np.random.default_rng(2)
+    time = 0.01 * np.arange(ROWS)
+    time[1:-1] += rng.uniform(-0.003, 0.003, ROWS - 2)
+    columns = cart_columns() | {
+        "time": time,
+        "qpos.slider": 0.5 * time,
+        "qvel.slider": 2.0 * time,
+        "qvel.pole": -1.0 * time,
+        "sensor.encoder": 3.0 * time,
+    }
+    (run,) = read_logs(save(tmp_path / "a.npz", columns), cart).runs
+    assert run.dt == pytest.approx(np.median(np.diff(time)))
+    np.testing.assert_allclose(np.diff(run.time), run.dt)
+    np.testing.assert_allclose(run.qpos[:, 0], 0.5 * run.time, atol=1e-12)
+    np.testing.assert_allclose(run.qvel[:, 0], 2.0 * run.time, atol=1e-12)
+    np.testing.assert_allclose(run.sensors["encoder"][:, 0], 3 * run.time, atol=1e-12)
+    before = [np.flatnonzero(time <= t + 1e-4)[-1] for t in run.time]
+    np.testing.assert_array_equal(run.ctrl[:, 0], columns["ctrl.drive"][before])
+    assert run.qvel_measured
+
+
+def test_rounded_time_stamps_are_not_interpolated(tmp_path, cart):
+    columns = cart_columns()
+    columns["time"] += np.random.default_rng(0).uniform(-2e-5, 2e-5, ROWS)
+    log = read_logs(save(tmp_path / "a.csv", columns), cart)
+    np.testing.assert_array_equal(log.runs[0].qpos[:, 0], columns["qpos.slider"])
+    columns["time"] += 1.7e9  # seconds since 1970
+    (run,) = read_logs(save(tmp_path / "b.csv", columns), cart).runs
+    assert len(run) == ROWS
+
+
+@pytest.mark.parametrize(
+    ("factor", "ratio"), [(1000.0, "1e+03 times"), (1e-3, "0.001 times")]
+)
+def test_wrong_rate(tmp_path, cart, factor, ratio):
+    columns = cart_columns()
+    columns["time"] = columns["time"] * factor
+    text = failure(save(tmp_path / "a.csv", columns), cart)
+    assert "wrong rate" in text
+    assert ratio in text
+    assert "scale" in text
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"), [(100.0, "100 physics steps"), (0.1, "is the control step")]
+)
+def test_odd_rate_is_said(tmp_path, cart, factor, words):
+    columns = cart_columns()
+    columns["time"] = columns["time"] * factor
+    log = read_logs(save(tmp_path / "a.csv", columns), cart)
+    assert words in said(log, "a control step of")
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_single_rows(tmp_path, cart, extension):
+    one = save(tmp_path / f"a.{extension}", cart_columns(rows=1))
+    assert "single row" in failure(one, cart)
+    none = save(tmp_path / f"b.{extension}", cart_columns(rows=0))
+    assert "no rows" in failure(none, cart)
+
+
+def test_rows_that_stand_alone(tmp_path, cart):
+    columns = cart_columns()
+    columns["qpos.pole"][1::2] = np.nan
+    assert "no two successive rows" in failure(save(tmp_path / "a.csv", columns), cart)
+    columns = cart_columns()
+    columns["qpos.pole"][1] = np.nan
+    log = read_logs(save(tmp_path / "b.csv", columns), cart)
+    assert [(run.name, len(run)) for run in log.runs] == [("b", ROWS - 2)]
+    assert said(log, "alone between holes: 1")
+    columns = cart_columns() | {"run": np.array([1] * (ROWS - 1) + [2])}
+    log = read_logs(save(tmp_path / "c.csv", columns), cart)
+    assert [run.name for run in log.runs] == ["c/1"]
+    assert said(log, "c/2 left out")
+
+
+# Values
+
+
+def test_degrees_are_noticed(tmp_path, cart, flyer):
+    columns = cart_columns()
+    columns["qpos.pole"] = np.degrees(columns["qpos.pole"])
+    log = read_logs(save(tmp_path / "a.csv", columns), cart)
+    assert "degrees" in said(log, "joint pole")
+    columns = cart_columns()
+    columns["qpos.slider"] = 1000 * columns["qpos.slider"]
+    log = read_logs(save(tmp_path / "b.csv", columns), cart)
+    assert "mm" in said(log, "joint slider")
+    columns = flyer_columns() | {"qpos.wheel": np.linspace(0, 90, ROWS)}
+    log = read_logs(save(tmp_path / "c.csv", columns), flyer)
+    assert "degrees" in said(log, "joint wheel")
+
+
+def test_commands_beyond_their_range_are_noticed(tmp_path, cart):
+    columns = cart_columns()
+    columns["ctrl.drive"][:4] = 6.0
+    log = read_logs(save(tmp_path / "a.csv", columns), cart)
+    assert "4 commands" in said(log, "actuator drive")
+    assert log.runs[0].ctrl[0, 0] == 6.0
+
+
+@pytest.mark.parametrize("column", ["qpos.pole", "ctrl.drive"])
+def test_huge_numbers(tmp_path, cart, column):
+    columns = cart_columns()
+    columns[column][4] = 1e300
+    text = failure(save(tmp_path / "a.csv", columns), cart)
+    assert "row 5" in text
+    assert column in text
+    assert "1e+300" in text
+
+
+def flyer_columns() -> dict[str, np.ndarray]:
+    """A free base and a ball joint that turn steadily, quaternions of any length."""
+    time = 0.01 * np.arange(ROWS)
+    angle = 2.0 * time
+    columns = {"time": time, "qpos.wheel": 3.0 * time}
+    for i, value in enumerate((0.1 * time, 0 * time, 1 + 0 * time)):
+        columns[f"qpos.base.{i}"] = value
+    zero = 0 * time
+    for i, value in enumerate((np.cos(angle / 2), zero, zero, np.sin(angle / 2))):
+        columns[f"qpos.base.{i + 3}"] = 2.0 * value
+    for i, value in enumerate((np.cos(angle), np.sin(angle), zero, zero)):
+        columns[f"qpos.wrist.{i}"] = -value
+    return columns
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_free_and_ball_joints(tmp_path, flyer, extension):
+    columns = flyer_columns()
+    for i in range(4):  # the sign of a quaternion means nothing
+        columns[f"qpos.wrist.{i}"][17:] *= -1
+    log = read_logs(save(tmp_path / f"a.{extension}", columns), flyer)
+    (run,) = log.runs
+    assert "base" in said(log, "off unit length")
+    for first in (3, 7):
+        quaternion = run.qpos[:, first : first + 4]
+        np.testing.assert_allclose(np.linalg.norm(quaternion, axis=1), 1.0)
+        assert np.all(np.sum(quaternion[1:] * quaternion[:-1], axis=1) > 0.9)
+    expected = [0.1, 0, 0, 0, 0, 2.0, 4.0, 0, 0, 3.0]
+    np.testing.assert_allclose(run.qvel, np.tile(expected, (ROWS, 1)), atol=1e-9)
+    assert run.ctrl.shape == (ROWS, 0)
+
+
+def test_quaternions_between_rows(tmp_path, flyer):
+    columns = flyer_columns()
+    keep = np.arange(ROWS) != 12
+    log = read_logs(
+        save(tmp_path / "a.npz", {k: v[keep] for k, v in columns.items()}), flyer
+    )
+    (run,) = log.runs
+    assert len(run) == ROWS
+    expected = [np.cos(0.12), 0, 0, np.sin(0.12)]
+    np.testing.assert_allclose(run.qpos[12, 3:7], expected, atol=1e-12)
+
+
+def test_zero_quaternion(tmp_path, flyer):
+    columns = flyer_columns()
+    for i in range(4):
+        columns[f"qpos.wrist.{i}"][6] = 0.0
+    text = failure(save(tmp_path / "a.csv", columns), flyer)
+    assert "row 7" in text
+    assert "wrist" in text
+
+
+def test_wrapped_hinge_is_unrolled_per_recording(tmp_path, flyer, cart):
+    columns = flyer_columns()
+    true = np.linspace(0, 8, ROWS)
+    columns["qpos.wheel"] = (true + np.pi) % (2 * np.pi) - np.pi
+    log = read_logs(save(tmp_path / "a.csv", columns), flyer)
+    np.testing.assert_allclose(log.runs[0].qpos[:, 11], true, atol=1e-9)
+    assert "wheel" in said(log, "whole turn")
+    # another recording may start anywhere: its jump is no wrap
+    values = np.where(np.arange(ROWS) < 20, 0.0, 6.0)
+    columns |= {"qpos.wheel": values, "run": np.repeat([1, 2], 20)}
+    log = read_logs(save(tmp_path / "b.csv", columns), flyer)
+    np.testing.assert_array_equal(log.runs[1].qpos[:, 11], 6.0)
+    # a joint with limits cannot wrap
+    columns = cart_columns()
+    columns["qpos.pole"][20:] += 2 * np.pi
+    (run,) = read_logs(save(tmp_path / "c.csv", columns), cart).runs
+    np.testing.assert_array_equal(run.qpos[:, 1], columns["qpos.pole"])
+
+
+# Files
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_missing_empty_and_unreadable_files(tmp_path, cart, extension):
+    path = tmp_path / f"a.{extension}"
+    assert "no such file" in failure(path, cart)
+    path.write_bytes(b"")
+    assert "is empty" in failure(path, cart)
+    path.write_bytes(b"\x93garbage \xff\xfe" * 50)
+    assert f"a.{extension}" in failure(path, cart)
+    path.unlink()
+    path.mkdir()
+    assert "folder" in failure(path, cart)
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_files_cut_short_anywhere(tmp_path, cart, extension):
+    whole = save(tmp_path / f"whole.{extension}", cart_columns()).read_bytes()
+    path = tmp_path / f"a.{extension}"
+    for share in np.linspace(0.02, 0.98, 25):
+        path.write_bytes(whole[: int(share * len(whole))])
+        try:
+            log = read_logs(path, cart)
+        except UserError as error:
+            assert "\n" not in str(error)
+            assert f"a.{extension}" in str(error)
+        else:  # a CSV that ends inside its last number or after it
+            assert extension == "csv"
+            assert len(log.runs[0]) < ROWS
+            if not path.read_bytes().endswith(b"\n"):
+                assert said(log, "no line end")
+
+
+@pytest.mark.parametrize("extension", ["npz", "parquet"])
+def test_damaged_files(tmp_path, cart, extension):
+    """Wherever bytes are wrong: an error of one line, or nothing of use was hit."""
+    whole = save(tmp_path / f"whole.{extension}", cart_columns()).read_bytes()
+    path = tmp_path / f"a.{extension}"
+    rng = np.random.default_rng(0)
+    errors = 0
+    for _ in range(60):
+        raw = bytearray(whole)
+        for at in rng.integers(0, len(raw), 4):
+            raw[at] = rng.integers(256)
+        path.write_bytes(raw)
+        try:
+            read_logs(path, cart)
+        except UserError as error:
+            errors += 1
+            assert "\n" not in str(error)
+    assert errors > 10
+
+
+def test_csv_row_of_another_length(tmp_path, cart):
+    path = save(tmp_path / "a.csv", cart_columns())
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:-1], "0.39,1.0"]))
+    text = failure(path, cart)
+    assert "row 40 has 2 cells where the header has 4" in text
+    assert "cut short" in text
+    path.write_text("\n".join([*lines[:5], "0.39,1.0", *lines[6:]]))
+    text = failure(path, cart)
+    assert "row 5 " in text
+    assert "cut short" not in text
+
+
+def test_damaged_npz_entry(tmp_path, cart):
+    path = save(tmp_path / "a.npz", cart_columns())
+    raw = bytearray(path.read_bytes())
+    at = raw.index(b"NUMPY") + 150
+    raw[at : at + 20] = bytes(20)
+    path.write_bytes(raw)
+    assert "damaged" in failure(path, cart)
+
+
+def test_one_type_under_the_name_of_another(tmp_path, cart):
+    for kind in EXTENSIONS:
+        raw = save(tmp_path / f"true.{kind}", cart_columns()).read_bytes()
+        for name in EXTENSIONS:
+            if name != kind:
+                path = tmp_path / f"false.{name}"
+                path.write_bytes(raw)
+                assert f"false.{name}" in failure(path, cart)
+    path = tmp_path / "log.txt"
+    path.write_text("time\n")
+    assert ".csv, .npz, .parquet" in failure(path, cart)
+
+
+@pytest.mark.fault("pickles and damaged archives")
+def test_npy_and_pickles_are_refused(tmp_path, cart):
+    buffer = io.BytesIO()
+    np.save(buffer, np.zeros(3))
+    (tmp_path / "a.npz").write_bytes(buffer.getvalue())
+    assert "not an NPZ" in failure(tmp_path / "a.npz", cart)
+    columns = cart_columns()
+    columns["qpos.pole"] = columns["qpos.pole"].astype(object)
+    np.savez(tmp_path / "b.npz", **columns)
+    text = failure(tmp_path / "b.npz", cart)
+    assert "qpos.pole" in text
+    assert "pickled" in text
+
+
+def test_npz_arrays_of_other_shapes(tmp_path, cart):
+    columns = cart_columns()
+    np.savez(tmp_path / "a.npz", **{**columns, "qpos.pole": np.zeros((ROWS, 2))})
+    assert "2-dimensional" in failure(tmp_path / "a.npz", cart)
+    np.savez(tmp_path / "b.npz", **{**columns, "qpos.pole": np.zeros(ROWS - 1)})
+    assert "39 rows where time has 40" in failure(tmp_path / "b.npz", cart)
+    np.savez(tmp_path / "c.npz", **{**columns, "qpos.pole": np.zeros(ROWS) * 1j})
+    assert "complex128" in failure(tmp_path / "c.npz", cart)
+
+
+def test_text_and_encodings(tmp_path, cart):
+    path = save(tmp_path / "a.csv", cart_columns())
+    text = path.read_text()
+    path.write_text(text, encoding="utf-16")
+    assert "UTF-8" in failure(path, cart)
+    path.write_text(text, encoding="utf-8-sig")
+    assert len(read_logs(path, cart).runs) == 1
+    path.write_text(text.replace("\n", "\r\n") + "\r\n")
+    assert len(read_logs(path, cart).runs[0]) == ROWS
+    path.write_text(text.replace(",", ";"))
+    assert len(read_logs(path, cart).runs[0]) == ROWS
+    path.write_text(text.replace(",", ";").replace("0.01;", "0,01;"))
+    assert "decimal point" in failure(path, cart)
+    path.write_text(text.replace("0.03,", "start,"))
+    assert 'row 4, column "time" holds "start"' in failure(path, cart)
+    path.write_text(text.replace("0.03,", '"two\nlines",'))
+    assert 'holds "two lines"' in failure(path, cart)
+    path.write_text(text.split("\n", 1)[1])
+    assert "name the columns" in failure(path, cart)
+    path.write_text("\n\n")
+    assert "is empty" in failure(path, cart)
+
+
+def test_parquet_types(tmp_path, cart):
+    columns = {k: pyarrow.array(v) for k, v in cart_columns().items()}
+    columns["ctrl.drive"] = pyarrow.array(np.arange(ROWS) % 3, pyarrow.int8())
+    columns["qpos.pole"] = columns["qpos.pole"].cast(pyarrow.float32())
+    columns["run"] = pyarrow.array(["a"] * ROWS).dictionary_encode()
+    pyarrow.parquet.write_table(pyarrow.table(columns), tmp_path / "a.parquet")
+    (run,) = read_logs(tmp_path / "a.parquet", cart).runs
+    assert run.ctrl[4, 0] == 1.0
+    columns["time"] = pyarrow.array(np.arange(ROWS), pyarrow.timestamp("ms"))
+    pyarrow.parquet.write_table(pyarrow.table(columns), tmp_path / "b.parquet")
+    assert "timestamp" in failure(tmp_path / "b.parquet", cart)
+
+
+# Mapping
+
+
+def foreign(tmp_path: Path) -> Path:
+    ours = cart_columns()
+    return save(
+        tmp_path / "foreign.csv",
+        {
+            "t_ms": 1000 * ours["time"],
+            "x": ours["qpos.slider"],
+            "theta_deg": np.degrees(ours["qpos.pole"]) + 90,
+            "ctrl.drive": ours["ctrl.drive"],
+        },
+    )
+
+
+MAPPING = """
+columns:
+  t_ms: time
+  x: qpos.slider
+  theta_deg: qpos.pole
+scale:
+  t_ms: 1e-3          # by their name; YAML takes this one for text
+  qpos.pole: 0.017453292519943295
+offset:
+  qpos.pole: -1.5707963267948966
+"""
+
+
+def test_mapping(tmp_path, cart):
+    path = tmp_path / "map.yaml"
+    path.write_text(MAPPING)
+    (run,) = read_logs(foreign(tmp_path), cart, mapping=path).runs
+    ours = cart_columns()
+    np.testing.assert_allclose(run.time, ours["time"], atol=1e-12)
+    np.testing.assert_allclose(run.qpos[:, 1], ours["qpos.pole"], atol=1e-12)
+    np.testing.assert_array_equal(run.qpos[:, 0], ours["qpos.slider"])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("columns:", "colums:", 'unknown key "colums"; did you mean "columns"?'),
+        ("t_ms: time", "t_s: time", '"t_s" is not in'),
+        ("t_ms: time", "t_ms: tim", 'no column "time"'),
+        ("x: qpos.slider", "x: ctrl.drive", "two columns become"),
+        ("qpos.pole: 0.01745", "qpos.pol: 0.01745", 'did you mean "qpos.pole"?'),
+        ("1e-3 ", "fast ", "'fast', not a number"),
+        ("1e-3 ", ".nan ", "not a number"),
+        ("1e-3 ", "0 ", "is zero"),
+        ("scale:", "scale: 2\nothers:", '"others"'),
+        ("  t_ms: 1e-3 ", "  time: 2\n  t_ms: 1e-3 ", 'scale of "time" is given twice'),
+        ("offset:", "scale:", 'in line 9 (key "scale" is there twice)'),
+        ("x: qpos.slider", "x: [", "not valid YAML in line"),
+        ("columns:", "!!python/object:os.system columns:", "not valid YAML"),
+    ],
+)
+def test_bad_mappings(tmp_path, cart, old, new, words):
+    path = tmp_path / "map.yaml"
+    assert old in MAPPING
+    path.write_text(MAPPING.replace(old, new, 1))
+    assert words in failure(foreign(tmp_path), cart, mapping=path)
+
+
+def test_mapping_files_that_are_none(tmp_path, cart):
+    path = tmp_path / "map.yaml"
+    assert "cannot be read" in failure(foreign(tmp_path), cart, mapping=path)
+    path.write_text("- 1\n")
+    assert '"columns:"' in failure(foreign(tmp_path), cart, mapping=path)
+    path.write_bytes(b"\xff\xfe")
+    assert "UTF-8" in failure(foreign(tmp_path), cart, mapping=path)
+    path.write_text("columns: 3\n")
+    assert '"columns:" must hold' in failure(foreign(tmp_path), cart, mapping=path)
+
+
+# Real machines
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared/data is not here")
+@pytest.mark.parametrize(
+    ("folder", "rates", "runs"),
+    [
+        ("dfki_pendulum", {200.0, 500.0}, 4),
+        ("emps", {1000.0}, 2),
+        ("quanser_cartpole", {250.0}, 16),
+    ],
+)
+def test_real_logs(folder, rates, runs):
+    model = mujoco.MjModel.from_xml_path(str(SHARED / folder / "model.xml"))
+    log = read_logs(sorted((SHARED / folder).glob("*.csv")), model)
+    assert len(log.runs) == runs
+    assert {round(1 / run.dt) for run in log.runs} == rates
+    for run in log.runs:
+        assert len(run) > 500
+        for values in (run.qpos, run.qvel, run.ctrl):
+            assert np.isfinite(values).all()
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_a_pipe_or_a_device_is_not_waited_for(tmp_path, cart, extension):
+    path = tmp_path / f"log.{extension}"
+    os.mkfifo(path)
+    assert "a pipe or a device" in failure(path, cart)
+    path.unlink()
+    path.symlink_to("/dev/zero")
+    assert "a pipe or a device" in failure(path, cart)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (999999999999,)}",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999999999999999,)}",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (-1,)}",
+        "{'descr': ((((",
+        "[[[[[[[[",
+        "{{}: 1}",
+        "'a' 'b",
+    ],
+)
+def test_npz_headers_that_numpy_trips_over(tmp_path, cart, header):
+    path = save(tmp_path / "a.npz", cart_columns())
+    text = header.encode().ljust(117) + b"\n"
+    with zipfile.ZipFile(path, "a") as archive:
+        raw = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
+        archive.writestr("other.npy", raw)
+    assert "not an NPZ file, damaged or cut short" in failure(path, cart)
+
+
+@pytest.mark.parametrize("extension", ["npz", "parquet"])
+def test_files_that_unpack_to_more_than_a_log(tmp_path, cart, extension, monkeypatch):
+    path = save(tmp_path / f"a.{extension}", cart_columns())
+    monkeypatch.setattr(log_tables, "_LARGEST", 1000)
+    assert "when unpacked, more than a log has" in failure(path, cart)
+
+
+@pytest.mark.parametrize("column", ["time", "run"])
+def test_parquet_text_that_is_no_utf8(tmp_path, cart, column):
+    columns = {k: pyarrow.array(v) for k, v in cart_columns(3).items()}
+    columns[column] = pyarrow.array([b"\xff", b"1", b"2"]).view(pyarrow.string())
+    path = tmp_path / "a.parquet"
+    pyarrow.parquet.write_table(pyarrow.table(columns), path)
+    assert "not a Parquet file, damaged or cut short" in failure(path, cart)
+
+
+@pytest.mark.timeout(120)
+def test_a_run_column_that_counts_rows_is_refused_soon(tmp_path, flyer):
+    """Time went with the square of the number of recordings."""
+    rows = 30_000
+    names = [f"qpos.base.{i}" for i in range(7)] + [f"qpos.wrist.{i}" for i in range(4)]
+    columns = {name: np.full(rows, 0.5) for name in [*names, "qpos.wheel"]}
+    columns |= {"time": 0.01 * np.arange(rows), "run": np.arange(rows)}
+    path = save(tmp_path / "a.npz", columns)
+    assert "no two successive rows" in failure(path, flyer)
+
+
+def test_mapping_numbers_beyond_float(tmp_path, cart):
+    path = save(tmp_path / "a.csv", cart_columns())
+    mapping = tmp_path / "m.yaml"
+    mapping.write_text("scale: {time: 0x" + "f" * 400 + "}")
+    assert "not a number" in failure(path, cart, mapping=mapping)

@@ -1,0 +1,103 @@
+"""Trajectories end where their episode ends; noise is measured once per row."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from easi_jax.data.segments import Segments
+from easi_jax.simulation import rollout
+from easi_jax.simulation.env import EnvState
+from easi_jax.simulation.step import Physics
+
+
+class Walker:
+    """Moves by the action; ends beyond 1. The model is the length of a step."""
+
+    def reset(self, model: Any, key: jax.Array) -> EnvState:
+        x = jax.random.uniform(key, (1,), maxval=0.2)
+        return self._state(x, jnp.zeros((), jnp.int32))
+
+    def _state(self, x: jax.Array, count: jax.Array) -> EnvState:
+        zero = jnp.zeros(())
+        physics = Physics(x, x * 0, jnp.zeros(0), jnp.zeros(1))
+        done = (x[0] > 1.0).astype(jnp.float32)
+        return EnvState(physics, x, zero, done, zero, count)
+
+    def control(self, state: Any, action: jax.Array) -> jax.Array:
+        return 2 * action
+
+    def step(self, model: Any, state: EnvState, action: jax.Array) -> EnvState:
+        return self._state(state.physics.qpos + model * action, state.count + 1)
+
+
+def forward(obs: jax.Array, key: jax.Array) -> jax.Array:
+    return jax.random.uniform(key, (1,), minval=0.5, maxval=1.0)
+
+
+STEPS = 30
+
+
+@pytest.fixture(scope="module")
+def ended() -> Segments:
+    return rollout.collect(
+        Walker(), jnp.asarray(0.2), forward, jax.random.key(0), 20, STEPS
+    )
+
+
+def test_shapes(ended: Segments) -> None:
+    assert ended.qpos.shape == (20, STEPS, 1)
+    assert ended.ctrl.shape == ended.next_qpos.shape == (20, STEPS, 1, 1)
+    assert ended.weight.shape == (20, STEPS)
+
+
+def test_no_transition_that_counts_crosses_a_reset(ended: Segments) -> None:
+    counts = np.asarray(ended.weight) > 0
+    x, after = np.asarray(ended.qpos[..., 0]), np.asarray(ended.next_qpos[..., 0, 0])
+    u = np.asarray(ended.ctrl[..., 0, 0])
+    np.testing.assert_allclose((after - x)[counts], 0.1 * u[counts], atol=1e-6)
+    # Every trajectory ends within the steps and nothing counts afterwards.
+    length = counts.sum(1)
+    assert (length < STEPS).all() and (length >= 4).all()
+    assert all(c[:n].all() for c, n in zip(counts, length, strict=True))
+    assert (x[counts] <= 1.0).all()
+
+
+def test_the_terminal_state_is_kept(ended: Segments) -> None:
+    last = np.asarray(ended.weight.sum(1), int) - 1
+    after = np.asarray(ended.next_qpos)[np.arange(20), last, 0, 0]
+    assert (after > 1.0).all()
+
+
+def test_auto_reset_keeps_the_transition_across() -> None:
+    seg = rollout.policy_rollout(
+        Walker(), jnp.asarray(0.2), forward, jax.random.key(0), STEPS, auto_reset=True
+    )
+    assert (seg.weight == 1).all()
+    jump = np.asarray(seg.next_qpos[:, 0, 0] - seg.qpos[:, 0])
+    crossing = jump < -0.5
+    assert crossing.sum() >= 2
+    np.testing.assert_array_equal(seg.qpos[1:, 0], seg.next_qpos[:-1, 0, 0])
+    assert (seg.next_qpos[crossing, 0, 0] <= 0.2).all()
+
+
+def test_trajectories_are_independent(ended: Segments) -> None:
+    assert len(np.unique(ended.qpos[:, 0])) == 20
+    assert len(np.unique(ended.ctrl[:, 0])) == 20
+
+
+def test_noise_is_drawn_once_per_row(ended: Segments) -> None:
+    noise = jnp.array([0.5, 2.0])
+    seen = rollout.measured(ended, noise, jax.random.key(3))
+    dq = np.asarray(seen.qpos - ended.qpos)[..., 0]
+    dv = np.asarray(seen.qvel - ended.qvel)[..., 0]
+    dq_next = np.asarray(seen.next_qpos - ended.next_qpos)[..., 0, 0]
+    dv_next = np.asarray(seen.next_qvel - ended.next_qvel)[..., 0, 0]
+    np.testing.assert_allclose(dq[:, 1:], dq_next[:, :-1], atol=1e-5)
+    np.testing.assert_allclose(dv[:, 1:], dv_next[:, :-1], atol=1e-5)
+    assert dq.std() == pytest.approx(0.5, rel=0.15)
+    assert dv.std() == pytest.approx(2.0, rel=0.15)
+    assert abs(np.corrcoef(dq[:, :-1].ravel(), dq_next[:, :-1].ravel())[0, 1]) < 0.2
+    np.testing.assert_array_equal(seen.ctrl, ended.ctrl)
