@@ -2,8 +2,9 @@
 
 from easi_jax import _moved
 from easi_jax.devices import runtime
+from easi_jax.version import __version__
 
 _moved.install()
 runtime.prepare()
 
-__version__ = "0.1.0"
+__all__ = ["__version__"]

@@ -9,9 +9,9 @@ ROOT = Path(__file__).parents[1]
 
 # What each package may import besides itself: those to its left.
 LEVELS = (
-    *("errors", "progress", "devices", "model", "data", "simulation", "io"),
+    *("errors", "progress", "version", "devices", "model", "data", "simulation", "io"),
     *("rl", "search", "estimation", "gap", "excite", "export", "baselines"),
-    *("pipeline", "easi_jax", "envs", "train", "scripts", "benchmarks"),
+    *("pipeline", "easi_jax", "envs", "train", "benchmarks", "scripts"),
 )
 
 # Files outside `io` that touch the disk or start a process, and why.
@@ -61,7 +61,7 @@ def _imports(tree: ast.Module) -> Iterator[str]:
 
 
 def _ours() -> dict[str, tuple[Path, ast.Module]]:
-    tops = ("easi_jax", "envs", "train", "scripts", "benchmarks")
+    tops = ("easi_jax", "envs", "train", "benchmarks", "scripts")
     return {_name(p): (p, t) for top in tops for p, t in _modules(top)}
 
 

@@ -7,9 +7,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from easi_jax import __version__
 from easi_jax.devices import runtime
 from easi_jax.io.files import to_plain
+from easi_jax.version import __version__
 
 _PACKAGES = (
     "jax",
