@@ -2,21 +2,19 @@
 
 import dataclasses
 import html
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import jinja2
-import numpy as np
 
 from easi_jax.io.files import atomic_write, to_plain
 from easi_jax.io.report.figure_style import BLUE, FAINT, GREEN, GRID, INK, VERMILION
+from easi_jax.io.report.numbers import cell, quantity
 
 Flag = Literal["determined", "not determined", "at bound"]
 
-_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 # Colors that need another shade on a dark page.
 _THEMED = {
     INK: "--ink",
@@ -167,35 +165,6 @@ def render(report: Report) -> str:
     )
 
 
-def quantity(mean: float, std: float) -> str:
-    """``0.2996 ± 0.0012``: two digits of the deviation, the mean to the same place."""
-    if not (math.isfinite(mean) and math.isfinite(std)):
-        return f"{cell(mean)} ± {cell(std)}"
-    if std <= 0:
-        return f"{cell(mean)} ± 0"
-    largest = max(abs(mean), std)
-    power = math.floor(math.log10(largest))
-    shift = power if power < -3 or power > 5 else 0
-    place = 1 - math.floor(math.log10(std)) + shift
-    digits = max(0, place)
-    scale = 10.0**shift
-    text = f"{mean / scale:.{digits}f} ± {std / scale:.{digits}f}"
-    return f"({text})·{_power(shift)}" if shift else text
-
-
-def cell(value: Any) -> str:
-    """A table cell: four digits for numbers, words for what is not finite."""
-    if value is None:
-        return "-"
-    if isinstance(value, bool | np.bool_):
-        return "yes" if value else "no"
-    if isinstance(value, int | np.integer):
-        return str(value)
-    if not isinstance(value, str) and hasattr(value, "__float__"):
-        return _four_digits(float(value))
-    return str(value)
-
-
 def inline_svg(picture: Picture, index: int) -> str:
     """The picture's SVG for use inside a page.
 
@@ -252,23 +221,3 @@ def _parameter_cells(row: ParameterRow) -> dict[str, Any]:
 
 def _numeric(text: str) -> bool:
     return re.match(r"\(?[-+]?\d|-$|not a number$|-?infinite$", text) is not None
-
-
-def _four_digits(value: float) -> str:
-    if math.isnan(value):
-        return "not a number"
-    if math.isinf(value):
-        return "infinite" if value > 0 else "-infinite"
-    if value == 0:
-        return "0"
-    # The power of the rounded number: 9999.6 has that of 10000.
-    power = int(f"{value:.3e}".split("e")[1])
-    if 3 <= power < 6:
-        return f"{value:.0f}"
-    if -4 < power < 3:
-        return f"{value:.{3 - power}f}".rstrip("0").rstrip(".")
-    return f"{value / 10.0**power:.4g}·{_power(power)}"
-
-
-def _power(exponent: int) -> str:
-    return f"10{str(exponent).translate(_SUPERSCRIPT)}"

@@ -1,5 +1,4 @@
 import html.parser
-import math
 import re
 
 import pytest
@@ -13,8 +12,6 @@ from easi_jax.io.report.html import (
     Picture,
     Report,
     Table,
-    cell,
-    quantity,
     render,
     write_report,
 )
@@ -189,42 +186,6 @@ def test_truth_columns_only_where_a_truth_is_known():
     with_truth = Page(render(Report("T", [], parameters=[_row(truth=0.0)])))
     assert "truth" in with_truth.words
     assert "truth" not in Page(render(Report("T", [], parameters=[_row()]))).words
-
-
-@pytest.mark.parametrize(
-    ("mean", "std", "text"),
-    [
-        (0.29963, 0.00121, "0.2996 ± 0.0012"),
-        (19.33, 0.44, "19.33 ± 0.44"),
-        (1234.5, 67.0, "1234 ± 67"),
-        (3.02e-4, 5e-6, "(3.020 ± 0.050)·10⁻⁴"),
-        (-2e7, 3e5, "(-2.000 ± 0.030)·10⁷"),
-        (0.0, 0.5, "0.00 ± 0.50"),
-        (5.0, 0.0, "5 ± 0"),
-        (math.nan, 1.0, "not a number ± 1"),
-    ],
-)
-def test_quantity(mean, std, text):
-    assert quantity(mean, std) == text
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (0.1 + 0.2, "0.3"),
-        (12345.6, "12346"),
-        (99999999.0, "1·10⁸"),
-        (3.14159e-7, "3.142·10⁻⁷"),
-        (0.0, "0"),
-        (-math.inf, "-infinite"),
-        (7, "7"),
-        (True, "yes"),
-        (None, "-"),
-        ("0.10", "0.10"),
-    ],
-)
-def test_cell(value, text):
-    assert cell(value) == text
 
 
 @pytest.mark.fault("disk full, folder read-only")

@@ -1,0 +1,67 @@
+"""Numbers as people write them, the same in every table, sentence and note."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+_DIGITS = 4  # that a reader compares; a deviation seldom leaves more
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def number(value: float, digits: int = _DIGITS) -> str:
+    """``value`` with so many digits: ``0.2``, ``1234``, ``1.5·10⁻⁵``.
+
+    Zeros at the end of a fraction are left out. Words for what is not finite.
+    """
+    if math.isnan(value):
+        return "not a number"
+    if math.isinf(value):
+        return "infinite" if value > 0 else "-infinite"
+    if value == 0:
+        return "0"
+    # The power of the rounded number: 9999.6 has that of 10000.
+    power = int(f"{value:.{digits - 1}e}".split("e")[1])
+    if -4 < power < 6:
+        text = f"{value:.{max(0, digits - 1 - power)}f}"
+        return text.rstrip("0").rstrip(".") if "." in text else text
+    return f"{value / 10.0**power:.{digits}g}·{_power(power)}"
+
+
+def measured(value: float, unit: str, digits: int = _DIGITS) -> str:
+    """A number with its unit: ``0.2 s``; ``1`` and ``""`` stand for no unit."""
+    text = number(value, digits)
+    return text if unit in ("", "1") else f"{text} {unit}"
+
+
+def quantity(mean: float, std: float) -> str:
+    """``0.2996 ± 0.0012``: two digits of the deviation, the mean to the same place."""
+    if not (math.isfinite(mean) and math.isfinite(std)):
+        return f"{number(mean)} ± {number(std)}"
+    if std <= 0:
+        return f"{number(mean)} ± 0"
+    largest = max(abs(mean), std)
+    power = math.floor(math.log10(largest))
+    shift = power if power < -3 or power > 5 else 0
+    place = 1 - math.floor(math.log10(std)) + shift
+    digits = max(0, place)
+    scale = 10.0**shift
+    text = f"{mean / scale:.{digits}f} ± {std / scale:.{digits}f}"
+    return f"({text})·{_power(shift)}" if shift else text
+
+
+def cell(value: Any) -> str:
+    """A table cell: four digits for numbers, words for what is not finite."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, int | np.integer):
+        return str(value)
+    if not isinstance(value, str) and hasattr(value, "__float__"):
+        return number(float(value))
+    return str(value)
+
+
+def _power(exponent: int) -> str:
+    return f"10{str(exponent).translate(_SUPERSCRIPT)}"
