@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from train._log_problem import Problem
+from easi_jax.estimation.problem import Problem
 from train._results import distribution_json, history_figure, seed_result
 
 _TITLE = "Held-out prediction error"
@@ -133,36 +133,6 @@ def write(
         shown,
         (table.title, table.columns, table.rows),
     )
-
-
-def ready_errors(problem: Problem, space: Any) -> Callable[[Any], Any]:
-    """Compiles what takes SI parameters to
-    `easi_jax.data.cleaning.errors_and_floor`."""
-    import jax
-    import jax.numpy as jnp
-
-    from easi_jax.data.segments import to_device
-    from easi_jax.devices.runtime import quick_compile
-    from easi_jax.estimation.pieces import segments_from_runs
-    from easi_jax.estimation.prediction_error import errors_and_floor
-    from train._stages import placed
-
-    simulator, every = problem.simulator, max(1, problem.steps // 2)
-    held, fit = (
-        to_device(
-            segments_from_runs(simulator, runs, problem.steps, every, fitted=True)
-        )
-        for runs in (problem.held, problem.fit)
-    )
-    noise = jnp.asarray(problem.noise, jnp.result_type(float))
-
-    def errors(theta: Any) -> Any:
-        model = simulator.model(theta)
-        return errors_and_floor(simulator, model, held, fit, noise, jax.random.key(0))
-
-    like = placed(jnp.zeros(space.size))
-    compiled = jax.jit(errors).lower(like).compile(quick_compile())
-    return lambda theta: jax.device_get(compiled(placed(theta)))
 
 
 def _errors(

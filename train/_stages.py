@@ -44,6 +44,7 @@ def run_stage(
     import jax
 
     from easi_jax.devices import distributed
+    from easi_jax.devices.mesh import placed
     from easi_jax.io.runs import checkpoints
 
     folder = run.checkpoints / name
@@ -78,30 +79,6 @@ def run_stage(
             shown = {k: v for k, v in last.items() if "/" not in k}
             meter.advance(n, **shown)
     return distributed.local(state)
-
-
-def placed(tree: Any) -> Any:
-    """Arrays on every device, of types of their own, wherever they came from.
-
-    A compiled program is found again only where both are the same, so without this the
-    second call of a loop that feeds on its results compiles anew.
-    """
-    import jax
-    import jax.numpy as jnp
-    from jax.sharding import NamedSharding, PartitionSpec
-
-    from easi_jax.devices import distributed
-    from easi_jax.devices.mesh import make_mesh
-
-    def strong(x: Any) -> Any:
-        x = jnp.asarray(x)
-        return x.astype(x.dtype) if jnp.issubdtype(x.dtype, jnp.number) else x
-
-    everywhere = NamedSharding(make_mesh(), PartitionSpec())
-    tree = jax.tree.map(strong, tree)
-    if distributed.count() > 1:
-        return distributed.everywhere(tree, everywhere)
-    return jax.device_put(tree, everywhere)
 
 
 def as_read_back(tree: Any) -> Any:

@@ -75,3 +75,21 @@ def replicated(tree: Any, mesh: Mesh) -> Any:
     if mesh.size == 1:
         return tree
     return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))
+
+
+def placed(tree: Any) -> Any:
+    """Arrays on every device, of types of their own, wherever they came from.
+
+    A compiled program is found again only where both are the same, so without this the
+    second call of a loop that feeds on its results compiles anew.
+    """
+
+    def strong(x: Any) -> Any:
+        x = jnp.asarray(x)
+        return x.astype(x.dtype) if jnp.issubdtype(x.dtype, jnp.number) else x
+
+    everywhere = NamedSharding(make_mesh(), PartitionSpec())
+    tree = jax.tree.map(strong, tree)
+    if distributed.count() > 1:
+        return distributed.everywhere(tree, everywhere)
+    return jax.device_put(tree, everywhere)

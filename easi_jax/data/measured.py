@@ -1,0 +1,74 @@
+"""From logs as they were read to runs that are fitted and runs that are held out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from easi_jax.data.cleaning import split_at_resets, to_common_step, without_odd_ends
+from easi_jax.data.holdout import split_held_out
+from easi_jax.data.noise import pooled_noise
+from easi_jax.data.recording import Log, Run
+
+_FEW_ROWS = 30  # of a run say little of its noise
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredRuns:
+    """Recordings of a machine at one control step.
+
+    Attributes:
+        recorded: those to fit, as they were recorded.
+        noise: standard deviations of positions and velocities [m, rad, m/s, rad/s],
+            ``(2 nv,)``.
+        fit, held: runs, cleaned.
+        held_name: which data are held out.
+        notes: what a user should know of the data, one line each.
+    """
+
+    recorded: tuple[Run, ...]
+    noise: np.ndarray
+    fit: list[Run]
+    held: list[Run]
+    held_name: str
+    notes: list[str]
+
+
+def measured_runs(
+    mj_model: mujoco.MjModel, log: Log, held_out: Log | None, horizon: float
+) -> MeasuredRuns:
+    """Cleans runs and splits them.
+
+    Args:
+        mj_model: of the machine.
+        log: to fit.
+        held_out: kept out of every fit; None: a quarter of ``log``
+            (`easi_jax.data.holdout.split_held_out`).
+        horizon: of predictions [s]; so much is left out between what is fitted and
+            what is held out of one run.
+
+    Raises:
+        UserError: too few rows to hold some out.
+    """
+    notes = [*log.notes, *(held_out.notes if held_out else ())]
+    # Before interpolation, which would smooth the noise.
+    noise = pooled_noise(log.runs)
+    parts: list[Sequence[Run]] = []
+    for given in (log.runs, held_out.runs if held_out else ()):
+        cut, leaps = split_at_resets(given, noise)
+        notes += leaps
+        parts.append(cut)
+    if parts[0] != list(log.runs):
+        # Bad readings have no part in the noise, where there are rows enough.
+        noise = pooled_noise([r for r in parts[0] if len(r) > _FEW_ROWS] or log.runs)
+    runs, changed = to_common_step([*parts[0], *parts[1]])
+    notes += changed
+    runs, odd = without_odd_ends(runs, noise)
+    notes += odd
+    fit, held = runs[: len(parts[0])], runs[len(parts[0]) :]
+    if held_out is None:
+        fit, held, name = split_held_out(mj_model, fit, horizon)
+    else:
+        name = ", ".join(run.name for run in held)
+    return MeasuredRuns(log.runs, noise, fit, held, name, notes)

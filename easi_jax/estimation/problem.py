@@ -1,0 +1,155 @@
+"""What an estimate from measured logs is asked: simulator, runs, noise."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from easi_jax.data.cleaning import true_readings, trusted_velocity
+from easi_jax.data.measured import MeasuredRuns
+from easi_jax.data.recording import Run
+from easi_jax.errors import UserError
+from easi_jax.estimation.pieces import visible_steps
+from easi_jax.model.found_effects import FoundEffects, joined
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation.simulator import Simulator
+
+HORIZON = 0.2  # s, of the error that is reported; pieces are no longer
+_ABOVE_NOISE = 30.0  # RMS motion over a piece in units of its noise
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A machine and its measured motion.
+
+    Attributes:
+        name: of the model.
+        simulator: with the parameters, at the logs' control step.
+        fit, held: runs.
+        held_name: which data are held out.
+        noise: standard deviations of positions and velocities, ``(2 nv,)``.
+        measured: velocities that were measured and can be trusted, ``(nv,)`` bool.
+        piece: control steps of a piece in the search.
+        steps: control steps of the open-loop error that is reported.
+        horizon: the same in seconds.
+        notes: what the user should know of the data.
+    """
+
+    name: str
+    simulator: Simulator
+    fit: list[Run]
+    held: list[Run]
+    held_name: str
+    noise: np.ndarray
+    measured: np.ndarray
+    piece: int
+    steps: int
+    horizon: float
+    notes: list[str]
+
+
+def checked_horizon(horizon: float | None) -> float:
+    """Seconds of a prediction; `HORIZON` where None.
+
+    Raises:
+        UserError: not a number above 0.
+    """
+    horizon = HORIZON if horizon is None else horizon
+    if not (math.isfinite(horizon) and horizon > 0):
+        raise UserError(f"--horizon is {horizon:g}: give seconds above 0")
+    return horizon
+
+
+def problem_of(
+    name: str,
+    mj_model: mujoco.MjModel,
+    space: ParameterSpace,
+    runs: MeasuredRuns,
+    *,
+    found: FoundEffects | None = None,
+    start: tuple[float, float] | None = None,
+    noise: Sequence[float] = (),
+    horizon: float | None = None,
+) -> Problem:
+    """The problem of fitting ``space`` to ``runs``.
+
+    Args:
+        name: of the model.
+        mj_model: the model as given.
+        space: what may vary in it.
+        runs: of `easi_jax.data.measured.measured_runs`.
+        found: effects that the model gets; their parameters join ``space``.
+        start: where the search starts, as factors on the nominal values.
+        noise: standard deviations of positions, then velocities, ``(2 nv,)``; empty:
+            those of ``runs``.
+        horizon: of predictions [s]; None: `HORIZON`, and pieces of the search as short
+            as the noise lets them be.
+
+    Raises:
+        UserError: what MJX cannot simulate, noise of another size, runs too short.
+    """
+    found = found or FoundEffects()
+    space, fixed = joined(mj_model, space, found)
+    if start is not None:
+        space = space.scaled(*start)
+    seconds = checked_horizon(horizon)
+    notes = list(runs.notes)
+    fit, held = (
+        true_readings(mj_model, r, found.entries) for r in (runs.fit, runs.held)
+    )
+    notes += [
+        f"{e.effect}@{e.at}: taken out of the logs' readings"
+        for e in found.entries
+        if e.of_readings
+    ]
+    nv = mj_model.nv
+    scatter = np.asarray(noise, float) if len(noise) else runs.noise
+    if scatter.shape != (2 * nv,) or not np.all(np.isfinite(scatter) & (scatter >= 0)):
+        raise UserError(
+            f"--noise is {list(noise)}: {name} needs {2 * nv} numbers, 0 or "
+            "more: positions, then velocities"
+        )
+    simulator = Simulator(mj_model, space, fit[0].dt, fixed=fixed)
+    measured = np.array([run.qvel_measured for run in fit]).all() & np.all(
+        [(trusted_velocity(run) == run.qvel).all(0) for run in fit], axis=0
+    )
+    if any(run.qvel_measured for run in fit) and not measured.all():
+        joints = [n for n, m in zip(simulator.state_names[nv:], measured, strict=True)]
+        doubted = [n for n, m in zip(joints, measured, strict=True) if not m]
+        notes.append(
+            f"{', '.join(doubted)}: not the derivative of the positions (filtered or "
+            "late?), so velocities are taken from the positions"
+        )
+    steps = max(1, round(seconds / simulator.dt))
+    _check_lengths(fit, held, steps, simulator.dt)
+    piece = steps
+    if horizon is None:
+        piece = visible_steps(fit, scatter, steps, _ABOVE_NOISE)
+    return Problem(
+        name,
+        simulator,
+        fit,
+        held,
+        runs.held_name,
+        scatter,
+        measured,
+        piece,
+        steps,
+        steps * simulator.dt,
+        notes,
+    )
+
+
+def _check_lengths(
+    fit: Sequence[Run], held: Sequence[Run], steps: int, dt: float
+) -> None:
+    for runs, what in ((fit, "to fit"), (held, "held out")):
+        longest = max(runs, key=len)
+        if len(longest) <= steps:
+            raise UserError(
+                f"the longest run {what} ({longest.name}) has {len(longest)} rows, too "
+                f"few for a horizon of {steps} steps ({steps * dt:g} s): record more, "
+                "or shorten --horizon"
+            )
