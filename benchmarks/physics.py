@@ -147,7 +147,6 @@ def _variants() -> dict[str, tuple[Callable[..., Any] | None, bool, bool]]:
     from mujoco import mjx
 
     from easi_jax.simulation import step as physics
-    from easi_jax.simulation.cpu.small_linalg import unroll_small
 
     def plain_mjx(model: Any, state: Any, ctrl: Any) -> Any:
         d = mjx.step(model.mjx, physics.data_at(model, state, ctrl))
@@ -160,7 +159,6 @@ def _variants() -> dict[str, tuple[Callable[..., Any] | None, bool, bool]]:
         "older loop emitters": (None, False, False),
         "solver on plain arrays": (physics.substep, True, False),
         "solver on plain arrays, older loop emitters": (physics.substep, False, False),
-        "all small matrices written out": (unroll_small(physics.substep), True, False),
         "mjx.step": (plain_mjx, False, False),
     }
 

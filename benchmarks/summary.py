@@ -2,8 +2,9 @@
 
     python -m benchmarks.summary
 
-Reads ``benchmarks/results/*.json`` and nothing else; writes ``README.md`` beside them.
-A result that was not run is named as not run.
+Reads ``benchmarks/results/*.json`` and ``SUMMARY.md``, which is written by hand and
+begins the page, and nothing else; writes ``README.md`` beside them. A result that was
+not run is named as not run.
 """
 
 import dataclasses
@@ -44,6 +45,9 @@ def run(config: Config) -> None:
     from easi_jax.io.files import atomic_write
 
     parts = ["# Results", "Made by `python -m benchmarks.summary` from the files here."]
+    by_hand = config.results / "SUMMARY.md"
+    if by_hand.is_file():
+        parts.append(by_hand.read_text().strip())
     for section in (
         *(
             _speed,

@@ -1,6 +1,7 @@
 """One control step of physics: the state, the substeps, and nothing else."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import flax.struct
@@ -21,11 +22,10 @@ from easi_jax.model.backlash import first_rotor
 from easi_jax.model.effects import Effects
 from easi_jax.model.quantities import scalar_places
 from easi_jax.simulation import constraint_solver
-from easi_jax.simulation.cpu.small_linalg import unroll_small
 from easi_jax.simulation.cpu.unroll import scalarized
 from easi_jax.simulation.mjx_patches import with_velocity_products
 
-WRITTEN_OUT = 8  # degrees of freedom up to which small matrices are written out
+WRITTEN_OUT = 8  # degrees of freedom up to which a step is written out by entries
 
 
 @flax.struct.dataclass
@@ -206,15 +206,8 @@ def substep(model: Any, state: Physics, ctrl: jax.Array, wide: bool = False) -> 
     return Physics(d.qpos, qvel, d.act, d.qacc_warmstart, sensed, (), rotor)
 
 
-def _otherwise(model: Any, state: Physics, ctrl: jax.Array) -> Physics:
-    """Beyond what is written out entry by entry (benchmarks/physics.py)."""
-    if model.mjx.nv <= WRITTEN_OUT:
-        return _unrolled(model, state, ctrl)
-    return substep(model, state, ctrl, wide=True)
-
-
-_unrolled = unroll_small(substep)
-_batched_substep = scalarized(substep, otherwise=_otherwise)
+# What is too large to be written out (benchmarks/physics.py) takes the wide solver.
+_batched_substep = scalarized(substep, otherwise=partial(substep, wide=True))
 
 
 def control_step(model: Any, state: Physics, ctrl: jax.Array, substeps: int) -> Physics:

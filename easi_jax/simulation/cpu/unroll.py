@@ -21,8 +21,6 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend import core as jex_core
 
-from easi_jax.simulation.cpu.small_linalg import scan_sizes
-
 MAX_ENTRIES = 60_000  # computed by all operations together: beyond, code gets too long
 _REMEMBERED = 32  # programs
 _UNROLLED = 8  # steps of an inner scan that are written out
@@ -116,6 +114,14 @@ def _inner(eqn: Any) -> Any:
     if name in ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call"):
         return eqn.params.get("jaxpr") or eqn.params["call_jaxpr"]
     return None
+
+
+def scan_sizes(p: dict[str, Any]) -> tuple[int, int]:
+    """Numbers of constants and of carried values of a ``scan``."""
+    if "ft_in" in p:  # from jax 0.11 on
+        consts, carry, _ = p["ft_in"].unpack()
+        return len(consts), len(carry)
+    return p["num_consts"], p["num_carry"]
 
 
 def _known(x: Any) -> bool:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from easi_jax.simulation import step as physics
-from easi_jax.simulation.cpu.small_linalg import unroll_small
 from easi_jax.simulation.cpu.unroll import _Replay, entries, scalarized
 from envs.cartpole import Cartpole
 
@@ -154,6 +153,6 @@ def test_one_step_of_cartpole_is_all_scalar(
 
     found = batch(scalarized(physics.substep))
     assert left == []
-    expected = batch(unroll_small(physics.substep))
+    expected = batch(physics.substep)
     np.testing.assert_allclose(found.qpos, expected.qpos, atol=1e-6)
     np.testing.assert_allclose(found.qvel, expected.qvel, atol=2e-5)
