@@ -25,6 +25,11 @@ def test_frames_show_the_motion(frames: np.ndarray) -> None:
     assert np.abs(frames[0].astype(int) - frames[-1]).mean() > 1
 
 
+def test_the_ground_is_light(frames: np.ndarray) -> None:
+    corners = frames[:, [0, 0, -1, -1], [0, -1, 0, -1]]
+    assert corners.min() > 230 and frames.min() < 150
+
+
 def test_gif_holds_all_frames(frames: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / "new" / "run.gif"
     write_video(path, frames, 20)
