@@ -121,7 +121,8 @@ def _products(
     scale: np.ndarray,
 ) -> np.ndarray:
     """Products of all signatures in some windows, in units of noise, ``(P, P)``."""
-    rms = np.sqrt(np.mean(errors[0].astype(float) ** 2, (0, 1)))
+    first, _ = measure.finite(errors[0], design.predictor.largest)
+    rms = np.sqrt(np.mean(first.astype(float) ** 2, (0, 1)))
     residuals = make_residuals(windows, runs, slope, noise, slack, _FLOOR * rms, scale)
     # Differences first: they are small beside what single precision carries.
     a, b = (np.array(x) for x in zip(*design.pairs, strict=True))

@@ -51,6 +51,11 @@ class Proposal:
     def text(self) -> str:
         """A sentence for a report."""
         pair = f"{self.effect} from {self.rival}"
+        if not self.names:
+            return (
+                "The model has no actuator that a test could be played on: to tell "
+                f"{pair}, record it from other starts, in larger and smaller motion."
+            )
         if self.test is None:
             return f"No test inside the joints' ranges was found to tell {pair}."
         if self.twins:
@@ -200,6 +205,8 @@ def quick_tests(
     And whether they are ``open-loop`` or ``feed-forward``. They take the longest of a
     proposal, and serve all effects.
     """
+    if not m.nu:
+        return [], "open-loop"
     dt = runs[0].dt
     travel = np.full(m.nv, _TRAVEL)
     for q, d in drives.scalar_dofs(m).values():

@@ -190,6 +190,12 @@ class Analysis:
         )
         slope = slope[:, : chosen.count]
         errors = chosen.errors(x[None])[0]
+        if not np.isfinite(errors).all():
+            raise UserError(
+                "most predictions of the fitting data are not finite: the model blows "
+                "up from the measured states; check its timestep, masses and contacts, "
+                "or shorten --horizon"
+            )
         rms = np.sqrt(np.mean(errors.astype(float) ** 2, (0, 1)))
         chosen.residuals = make_residuals(
             self.fit_windows,
@@ -262,7 +268,7 @@ class Analysis:
         """Held-out gap at a vector; ``judged``: without the own steps' share."""
         chosen = self.selector
         share, x = x[len(self.predictor.neutral) :], chosen.plain(x)
-        errors = self.predictor.errors(x[None], self.held_blocks)[0][: len(self.held)]
+        (errors,), (lost,) = self._held_errors(x[None])
         if judged and len(share):
             errors -= share[0] * self.held_steps
         square = measure.squares(errors)
@@ -275,7 +281,13 @@ class Analysis:
             square,
             errors,
             Conditions(self.m, self.held, self.runs, rows),
+            int(lost.sum()),
         )
+
+    def _held_errors(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of vectors ``(B, n)`` on the held-out windows, as `gap_metric.finite`."""
+        errors = self.predictor.errors(x, self.held_blocks)[:, : len(self.held)]
+        return measure.finite(errors, self.predictor.largest)
 
     def floor(self, x: np.ndarray) -> np.ndarray:
         """Mean squares of a perfect model on the held-out windows, ``(nv,)``.
@@ -291,8 +303,11 @@ class Analysis:
             np.repeat(x[None], _DRAWS, 0), self.held_blocks, offsets
         )
         count = len(self.held)
-        error = moved[:, :count] - still[:, :count] - targets
-        return np.mean(error.astype(float) ** 2, (0, 1, 2))
+        error = (moved[:, :count] - still[:, :count]).astype(float) - targets
+        known = np.isfinite(error).all((2, 3))
+        # Of a model that predicts nothing the noise of the targets alone is known.
+        kept = error[known] if known.any() else targets.reshape(-1, *targets.shape[2:])
+        return np.mean(kept**2, (0, 1))
 
     def disagreeing(
         self, x: np.ndarray, kept: Figures, floor: float
@@ -303,6 +318,7 @@ class Analysis:
         """
         count, x = len(self.fit_windows), self.selector.plain(x)
         fitted = self.predictor.errors(x[None], self.fit_blocks)[0][:count]
+        fitted, _ = measure.finite(fitted, self.predictor.largest)
         square = np.concatenate([measure.squares(fitted), kept.square])
         run = np.concatenate([self.fit_windows.run, self.held.run])
         scale = self.channels.scale
@@ -415,8 +431,7 @@ class Analysis:
         if not vectors:
             return np.zeros((0, len(self.held), self.m.nv))
         x = self.selector.plain(np.stack(vectors))
-        errors = self.predictor.errors(x, self.held_blocks)[:, : len(self.held)]
-        return np.stack([measure.squares(e) for e in errors])
+        return np.stack([measure.squares(e) for e in self._held_errors(x)[0]])
 
     def _needless(self, model: Model) -> list[tuple[Place, str]]:
         """Effects that were found and say nothing of the machine, with the reason."""

@@ -92,8 +92,9 @@ class Conditions:
         length = np.array([len(self._runs[r]) for r in w.run])
         out = {
             "late in the recordings": w.row > length * (2 / 3),
-            "when the command jumps": _largest(self._jumps.max(1)),
         }
+        if self._m.nu:
+            out["when the command jumps"] = _largest(self._jumps.max(1))
         if self._touching:
             out["in contact"] = np.any([*self._touching.values()], axis=0)
         return out

@@ -20,6 +20,7 @@ from easi_jax.gap.batched_least_squares import (
     lockstep,
 )
 from easi_jax.gap.effect_set import Candidate, Model
+from easi_jax.gap.gap_metric import finite
 from easi_jax.gap.model_comparison import better, contains, rank
 from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.table import Place
@@ -32,7 +33,7 @@ _STARTS = 2  # of each
 _SCREENED = 2  # blocks of windows that a larger robot's effects are first tried on
 _TRIED = ("cost", "which", "end")
 _HOPELESS = 4.0  # times the best promise; beyond, only the first few are fitted
-
+_LOST = 0.5  # of the windows not finite: beyond, a vector predicts nothing
 _FELT = 1e-3  # of the most that a number of an effect changes
 
 
@@ -86,11 +87,17 @@ class Selector:
 
     def errors(self, x: np.ndarray, some: np.ndarray | None = None) -> np.ndarray:
         """Errors of the fitted windows under vectors ``(B, n)``, ``(B, W, H, nv)``;
-        ``some``: of those in some of the blocks, by their place among them."""
+        ``some``: of those in some of the blocks, by their place among them.
+
+        Single windows whose prediction is not finite count as the largest motion; of a
+        vector that loses most windows they stay as they are, and no fit takes it."""
         every = np.arange(len(self.blocks)) if some is None else some
         found = self.predictor.errors(self.plain(x), self.blocks[every])
         at = self.windows_of(every)
         found = found[:, : len(at)]
+        bounded, lost = finite(found, self.predictor.largest)
+        few = lost.mean(1) <= _LOST
+        found = np.where(few[:, None, None, None], bounded, found)
         if self.steps is not None:
             found -= x[:, -1, None, None, None] * self.steps[at]
         return found

@@ -102,6 +102,24 @@ def squares(errors: np.ndarray) -> np.ndarray:
     return np.mean(errors.astype(np.float64) ** 2, 1)
 
 
+def finite(errors: np.ndarray, largest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Errors in which a window whose prediction is not finite counts as the largest
+    motion, and which windows those are.
+
+    Args:
+        errors: ``(..., W, H, nv)``.
+        largest: motion seen in a window, ``(nv,)``.
+
+    Returns:
+        Errors of the same shape, and ``(..., W)`` bool.
+    """
+    lost = np.asarray(~np.isfinite(errors).all((-2, -1)))
+    if lost.any():
+        most = np.asarray(largest, errors.dtype)
+        errors = np.where(lost[..., None, None], most, errors)
+    return errors, lost
+
+
 def odd_runs(
     square: np.ndarray, scale: np.ndarray, run: np.ndarray
 ) -> dict[int, float]:

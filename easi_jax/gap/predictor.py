@@ -77,6 +77,7 @@ class Predictor:
         own: number of the model's own parameters; they come first in a vector.
         neutral: the vector of the model as given.
         wrapped: hinges without limits, whose errors are wrapped, ``(nv,)`` bool.
+        largest: motion that was measured in a window, ``(nv,)``.
     """
 
     def __init__(
@@ -103,6 +104,8 @@ class Predictor:
             hinge = m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
             if hinge and not m.jnt_limited[j]:
                 self.wrapped[m.jnt_dofadr[j]] = True
+        moved = np.abs(self._unwrapped(windows.read)).max((0, 1))
+        self.largest = np.where(self.wrapped, np.minimum(moved, np.pi), moved)
         self._scalar = scalar_places(m).T
         self._mesh = make_mesh()
         self._items = _ITEMS if on_cpu() else _ACCELERATOR_ITEMS
@@ -131,8 +134,7 @@ class Predictor:
         """The windows in blocks, on all devices; the last is repeated to fill them."""
         fill = np.minimum(np.arange(self._room * BLOCK), len(windows) - 1)
         padded = windows.take(fill)
-        read = padded.read
-        read = np.where(self.wrapped, np.unwrap(read, axis=1), read)
+        read = self._unwrapped(padded.read)
         whole = NamedSharding(self._mesh, PartitionSpec())
 
         def blocks(x: np.ndarray) -> jax.Array:
@@ -152,6 +154,10 @@ class Predictor:
                 padded.led,
             )
         )
+
+    def _unwrapped(self, read: np.ndarray) -> np.ndarray:
+        """``WindowSet.read`` with the turns of hinges without limits counted."""
+        return np.where(self.wrapped, np.unwrap(read, axis=1), read)
 
     @property
     def devices(self) -> int:

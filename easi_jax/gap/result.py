@@ -63,6 +63,8 @@ class Figures:
         square: mean squares of each window, ``(W, nv)``.
         errors: of every step, ``(W, H, nv)``.
         conditions: what was going on in the rows that the errors belong to.
+        not_finite: windows whose prediction is not, which count as errors of the
+            largest motion.
     """
 
     gap: float
@@ -71,6 +73,7 @@ class Figures:
     square: np.ndarray
     errors: np.ndarray
     conditions: Conditions
+    not_finite: int = 0
 
 
 @dataclass

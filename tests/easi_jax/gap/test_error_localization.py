@@ -13,15 +13,14 @@ from easi_jax.gap.window_set import Rows, WindowSet
 from easi_jax.model.joint_space import Configuration
 
 # A weight on a vertical slide that reaches the floor, and an arm beside it.
-MODEL = mujoco.MjModel.from_xml_string(
-    """<mujoco><compiler angle="radian"/><worldbody><geom type="plane" size="1 1 1"/>
+XML = """<mujoco><compiler angle="radian"/><worldbody><geom type="plane" size="1 1 1"/>
 <body name="weight" pos="0 0 0.3"><joint name="lift" type="slide" axis="0 0 1"/>
 <geom size="0.1" mass="1"/></body>
 <body name="arm" pos="3 0 2"><joint name="turn" axis="0 1 0" range="-0.6 0.6"
 limited="true"/><geom size="0.1" mass="1" pos="0 0 0.5"/></body></worldbody>
 <actuator><motor name="winch" joint="lift"/><motor name="motor" joint="turn"/>
 </actuator></mujoco>"""
-)
+MODEL = mujoco.MjModel.from_xml_string(XML)
 H = 4
 ROWS = 800
 TIME = 0.02 * np.arange(ROWS)
@@ -188,3 +187,19 @@ def test_a_machine_without_hinges_and_slides_has_no_map(
     errors = np.ones((len(windows), H, 3))
     joints, _, table = condition_errors(errors, found, ball, channels)
     assert joints == [] and table.shape[0] == 0
+
+
+def test_a_machine_without_actuators_has_no_commands_that_jump(
+    simulator: tuple[WindowSet, list[Run]],
+) -> None:
+    windows, runs = simulator
+    xml = mujoco.MjSpec.from_string(XML)
+    for actuator in list(xml.actuators):
+        xml.delete(actuator)
+    bare, none = xml.compile(), np.zeros((ROWS, 0))
+    still = [replace(run, ctrl=none) for run in runs]
+    found = Conditions(bare, windows, still, conditions(windows, runs).rows)
+    assert list(found.general) == ["late in the recordings", "in contact"]
+    told = where(errors(found.general["in contact"], 0), found, bare, channels())
+    assert told[0].at == "lift" and "in contact" in told[0].when
+    assert condition_errors(errors(np.zeros(len(windows)), 0), found, bare, channels())
