@@ -3,32 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-_WORDS = {
-    "coulomb_friction": 'joint "{at}" has about {torque} of dry friction',
-    "stribeck_friction": 'joint "{at}" has dry friction of {static} at rest that falls '
-    "to {kinetic} in motion",
-    "viscous_damping": 'joint "{at}" has {damping} of viscous damping',
-    "quadratic_drag": '{kind} "{at}" has a drag of {coefficient} on the squared speed',
-    "joint_stiffness": 'joint "{at}" is pulled by a spring of {stiffness}',
-    "constant_force": 'a constant force acts at {kind} "{at}"',
-    "torque_ripple": 'joint "{at}" has a torque ripple of {amplitude}, '
-    "{cycles_per_rev} cycles per revolution",
-    "armature": 'joint "{at}" carries {armature} of inertia',
-    "backlash": 'joint "{at}" has {width} of free play',
-    "actuator_gain": 'actuator "{at}" gives {gain} times what it is told',
-    "actuator_delay": 'commands arrive at actuator "{at}" {delay} late',
-    "actuator_lag": 'actuator "{at}" responds with a time constant of {time_constant}',
-    "actuator_saturation": 'actuator "{at}" gives no more than {limit}',
-    "actuator_deadband": 'actuator "{at}" ignores commands below {width}',
-    "payload_mass": 'body "{at}" carries {mass} more',
-    "com_offset": 'the mass of body "{at}" sits elsewhere',
-    "gravity_tilt": "the base is tilted (roll {roll}, pitch {pitch})",
-    "sensor_bias": 'the reading of joint "{at}" is off by {bias}',
-    "sensor_delay": 'the reading of "{at}" comes {delay} late',
-    "contact_friction": "contacts{pair} have a sliding friction of {friction}",
-    "contact_softness": "contacts{pair} have a stiffness of {stiffness}",
-}
-
 
 def sentence(found: Any) -> str:
     """What a roboticist would say of an effect."""
@@ -38,7 +12,7 @@ def sentence(found: Any) -> str:
     names = (f'"{name}"' for name in place.at.split("/"))
     pair = f" between {' and '.join(names)}" if place.kind == "geom" else ""
     said = {"at": place.at, "kind": place.kind, "pair": pair}
-    words = _WORDS[place.effect]
+    words = place.row.sentence
     if found.parts:
         words = words.replace('actuator "{at}"', "{at}")
         said["at"] = _actuators(found)
@@ -203,10 +177,10 @@ def write_results(
     for f in outcome.found:
         index = analysis.selector.columns(f.place, fitted=False)
         columns = {
-            column_name(c): float(outcome.x[i])
+            c.name: float(outcome.x[i])
             for c, i in zip(f.place.columns, index, strict=True)
         }
-        std = {column_name(f.place.columns[k]): s for k, s in f.deviations.items()}
+        std = {f.place.columns[k].name: s for k, s in f.deviations.items()}
         for place, _ in sites(f):
             at = place.effect, place.at, place.kind
             entries.append(EffectEntry(*at, columns, std))
@@ -266,15 +240,6 @@ def retrained_line(retrained: dict[str, Any]) -> str:
         f"with the effects returns {with_:.1f}, the one trained without them "
         f"{without:.1f} ({seeds})."
     )
-
-
-def column_name(column: Any) -> str:
-    """A column's name in an effects file: ``com.0`` for one entry of a vector."""
-    from easi_jax.model.effect_catalog import VECTORS
-
-    if column.field in VECTORS:
-        return f"{column.field}.{column.index[-1]}"
-    return column.field
 
 
 def _report(folder: Any, config: Any, problem: Any, o: Any, content: Any) -> Path:

@@ -11,9 +11,10 @@ from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.batched_least_squares import Bounds
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.predictor import Predictor
-from easi_jax.gap.table import Place, Scales
+from easi_jax.gap.table import Place
 from easi_jax.gap.whitening import make_residuals, start_sensitivity, velocity_slack
 from easi_jax.gap.window_set import WindowSet, join, window_set
+from easi_jax.model.effect_catalog import Scales
 from easi_jax.model.parameters import ParameterSpace
 
 _TOGETHER = 16  # vectors in one call, between two lines of progress

@@ -17,14 +17,10 @@ import numpy as np
 from easi_jax.gap.batched_least_squares import Bounds
 from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.table import Place
+from easi_jax.model.effect_catalog import CATALOG
 
 _PARALLEL = 0.04  # sine of an angle that counts as none; slopes are differences
 _SEEN = 1.0  # times the noise, below which an effect leaves no trace
-# What the second can do includes the first; of two such names the simpler is taken.
-_WIDER = {
-    "coulomb_friction": "stribeck_friction",
-    "constant_force": "joint_stiffness",
-}
 _FAINT = 1e-6  # squared size of a change that counts as none
 _RANK = 1e-9  # relative curvature that counts as none
 
@@ -225,11 +221,12 @@ def alike(found: Sequence[Separation]) -> Alike:
     ever = np.any(seen, axis=0)
     same = (sine < _PARALLEL) & ever[:, None]
     np.fill_diagonal(same, False)
-    for i, key in enumerate(found[0].keys):
+    # What an effect contains it can do too; of two such names the simpler is taken.
+    for j, key in enumerate(found[0].keys):
         effect, at = key.split("@", 1)
-        more = f"{_WIDER[effect]}@{at}" if effect in _WIDER else ""
-        if more in found[0].keys:
-            same[i, found[0].keys.index(more)] = True
+        less = f"{CATALOG[effect].contains}@{at}"
+        if less in found[0].keys:
+            same[found[0].keys.index(less), j] = True
     return Alike(~ever, same)
 
 

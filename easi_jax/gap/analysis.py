@@ -261,7 +261,7 @@ class Analysis:
             Candidate(p, s)
             for p in (*self.places, *self.ripples)
             if p.key not in keys and p.key not in self.dropped
-            for s in p.starts[: 1 if p.effect == "torque_ripple" else None]
+            for s in p.starts[: 1 if p.row.is_sine else None]
         ]
 
     def figures(self, x: np.ndarray, judged: bool = False) -> Figures:

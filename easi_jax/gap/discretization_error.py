@@ -18,7 +18,6 @@ from easi_jax.gap.window_set import WindowSet
 from easi_jax.model.joint_space import Configuration
 
 _FINER = 8
-_SHIFTS = ("actuator_delay", "actuator_lag", "sensor_delay")
 _OWN_SHIFT = 0.75  # of a physics step
 
 
@@ -67,4 +66,4 @@ def within_a_step(place: Place, value: float, step: float) -> bool:
         step: of the physics [s].
     """
     seconds = place.columns[0].of * value
-    return place.effect in _SHIFTS and seconds < _OWN_SHIFT * step
+    return place.row.is_shift and seconds < _OWN_SHIFT * step

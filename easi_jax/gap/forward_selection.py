@@ -241,7 +241,7 @@ class Selector:
         for c in candidates:
             y = self.started(x, c)
             cols = self.columns(c.place)
-            if c.place.effect == "torque_ripple":
+            if c.place.row.is_sine:
                 cols = cols[[0, 2]]  # amplitude and phase; cycles come from the grid
             moved, step = difference(y, cols, self.bounds)
             asks.append(np.concatenate([y[None], moved]))
@@ -263,7 +263,7 @@ class Selector:
             size = np.concatenate([self.bounds.size[base.fit.active], np.abs(step)])
             end = ask[0].copy()
             end[index] += move * size
-            if c.place.effect == "torque_ripple":
+            if c.place.row.is_sine:
                 end[cols] = as_sine(ask[0][cols], end[cols])
             # Not the others: a force limit that is off lies outside its bounds.
             end[index] = np.clip(

@@ -7,7 +7,6 @@ import numpy as np
 
 from easi_jax.gap.effect_set import Model
 from easi_jax.gap.table import Place
-from easi_jax.model.effect_catalog import RARE
 
 _SURE = 1.7  # standard errors by which an effect has to help
 _LIKELY = 1.0  # by either measure
@@ -59,7 +58,7 @@ def better(model: Model, base: Model, floor: float) -> bool:
     if base.gap.mean() < (GOAL * floor) ** 2:
         helps *= _CLOSER
     known = {p.key for p in base.places}
-    rare = any(p.effect in RARE for p in model.places if p.key not in known)
+    rare = any(p.row.is_rare for p in model.places if p.key not in known)
     both = ((model.loss, base.loss), (model.gap, base.gap))
     gain = [1 - a.mean() / max(b.mean(), 1e-300) for a, b in both]
     large = min(gain) > _LARGE
@@ -106,16 +105,9 @@ def size_of(model: Model) -> int:
     return model.felt.get(place.key, sum(place.fitted))
 
 
-# An effect that contains another as a special case.
-_CONTAINS = {
-    "stribeck_friction": "coulomb_friction",
-    "joint_stiffness": "constant_force",
-}
-
-
 def contains(a: Place, b: Place) -> bool:
     """Whether effect ``a`` is ``b`` and more, at the same place."""
-    return a.at == b.at and a.kind == b.kind and _CONTAINS.get(a.effect) == b.effect
+    return (a.at, a.kind, a.row.contains) == (b.at, b.kind, b.effect)
 
 
 def _within(a: Model, b: Model) -> bool:

@@ -27,7 +27,7 @@ from easi_jax.gap.window_set import Rows, WindowSet
 from easi_jax.model import backlash, effects
 from easi_jax.model.backlash import MotorState
 from easi_jax.model.contact_pairs import pair_ids
-from easi_jax.model.effect_catalog import EFFECT_TABLE
+from easi_jax.model.effect_numbers import EFFECT_TABLE, fields_that_act
 from easi_jax.model.effects import Effects
 from easi_jax.model.mjx_model import Model, full_structure
 from easi_jax.model.parameters import ParameterSpace
@@ -57,13 +57,14 @@ def opened(m: mujoco.MjModel) -> mujoco.MjModel:
     return out
 
 
-_PLAY = ("width", "rotor", "felt")
+_PLAY = fields_that_act("drive")
 
 
 def _fields(layout: Layout) -> tuple[str, ...]:
     """Of `Effects`, those that predictions reckon with."""
     varied = {c.field for c in layout.columns}
-    unused = () if effects.has_contact_effects(varied) else effects.IN_CONTACTS
+    contacts = effects.has_contact_effects(varied)
+    unused = () if contacts else fields_that_act("contacts")
     return tuple(f for f in Effects.__dataclass_fields__ if f not in unused)
 
 

@@ -1,6 +1,5 @@
 """What the gap workflow found, as values."""
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -108,26 +107,6 @@ class Outcome:
     horizon: float = 0.0
 
 
-def for_people(
-    place: Place, got: dict[str, tuple[float, float, str]]
-) -> dict[str, tuple[float, float, str]]:
-    """Parameters as the table states them, from those that are fitted."""
-    out = dict(got)
-    if place.effect == "joint_stiffness":
-        (k, dk, unit), (s, ds, _) = got["stiffness"], got["rest"]
-        rest = s / k if k > 0 else 0.0
-        relative = math.hypot(ds / s if s else 0.0, dk / k if k > 0 else 0.0)
-        length = "rad" if "rad" in unit else "m"
-        out["rest"] = (rest, abs(rest) * relative, length)
-    if place.effect == "stribeck_friction":
-        (kinetic, dk, unit), (extra, de, _) = got["kinetic"], got["static"]
-        out["static"] = (kinetic + extra, math.hypot(dk, de), unit)
-    if place.effect == "torque_ripple":
-        phase, dp, unit = got["phase"]
-        out["phase"] = (math.remainder(phase, 2 * math.pi), dp, unit)
-    return out
-
-
 class Numbers:
     """What a model was fitted to.
 
@@ -157,7 +136,7 @@ class Numbers:
             if c.parameter:
                 value = c.of * float(self.model.fit.x[i])
                 got[c.parameter] = (value, c.of * std.get(k, 0.0), c.unit)
-        return for_people(place, got)
+        return dict(place.row.told(got))
 
     def refitted(self, space: ParameterSpace) -> list[dict]:
         """The model's own parameters that the fit moved."""

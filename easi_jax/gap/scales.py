@@ -8,8 +8,8 @@ import numpy as np
 from easi_jax.data.drive_forces import drive_forces
 from easi_jax.data.recording import Run
 from easi_jax.data.windows import fitted_velocity
-from easi_jax.gap.table import Scales
 from easi_jax.model.contact_pairs import pair_ids, touching
+from easi_jax.model.effect_catalog import Scales
 
 _ROWS = 400
 _LONGEST = 0.1  # s

@@ -1,9 +1,8 @@
-"""The effects that the workflow knows: names, and what one at a place consists of.
+"""Effects of the catalog at places of one model.
 
 A `Place` is one effect at one joint, actuator, body or at the whole model. Its numbers
 are columns of a long vector that holds every place (`easi_jax.gap.effect_vector`); at
-their neutral values the model is as given. Names and units: the log format's table of
-effects.
+their neutral values the model is as given.
 """
 
 from dataclasses import dataclass, field
@@ -13,7 +12,8 @@ import numpy as np
 
 from easi_jax.errors import UserError
 from easi_jax.model import addresses as language
-from easi_jax.model.effect_catalog import _UNUSUAL, RARE, REFITTED, SHARED
+from easi_jax.model.effect_catalog import CATALOG, Effect
+from easi_jax.model.effect_numbers import VECTORS
 from easi_jax.model.parameters import ParameterSpace
 
 
@@ -42,6 +42,12 @@ class Column:
     size: float
     of: float = 1.0
 
+    @property
+    def name(self) -> str:
+        """In an effects file: ``com.0`` for one entry of a vector."""
+        entry = f".{self.index[-1]}" if self.field in VECTORS else ""
+        return self.field + entry
+
 
 @dataclass(frozen=True)
 class Place:
@@ -69,6 +75,11 @@ class Place:
             object.__setattr__(self, "fitted", (True,) * len(self.columns))
 
     @property
+    def row(self) -> Effect:
+        """What is known of its effect."""
+        return CATALOG[self.effect]
+
+    @property
     def key(self) -> str:
         """``effect@at``."""
         return f"{self.effect}@{self.at}"
@@ -76,46 +87,14 @@ class Place:
     @property
     def shared(self) -> bool:
         """Whether it is one of single actuators that all have alike."""
-        return not self.at and self.effect in SHARED
+        return not self.at and self.row.is_shared
 
     def unlikely(self, values: np.ndarray) -> int:
         """For how many reasons few machines have it with these values of its columns:
         a rare effect, an unusual size."""
-        low, high = _UNUSUAL.get(self.effect, (-np.inf, np.inf))
+        low, high = self.row.usual
         usual = np.all((values >= low) & (values <= high))
-        return (self.effect in RARE) + (not usual)
-
-
-@dataclass(frozen=True)
-class Scales:
-    """How large things are in the data; every effect is measured against it.
-
-    Attributes:
-        position, speed, acceleration: RMS per degree of freedom, ``(nv,)``.
-        torque: RMS of what moves it, ``(nv,)``.
-        inertia: about each degree of freedom, ``(nv,)``.
-        command: RMS, ``(nu,)``.
-        force: RMS of an actuator's force, ``(nu,)``.
-        peak: its largest, but for two rows in 1,000, ``(nu,)``.
-        span: range of positions, ``(nv,)``.
-        touching: share of rows in which pairs of geoms touch, ``(P,)``
-            (`easi_jax.model.contact_pairs`).
-        dt: control step [s].
-        longest: longest delay that is looked for [s].
-    """
-
-    position: np.ndarray
-    speed: np.ndarray
-    acceleration: np.ndarray
-    torque: np.ndarray
-    inertia: np.ndarray
-    command: np.ndarray
-    force: np.ndarray
-    peak: np.ndarray
-    span: np.ndarray
-    touching: np.ndarray
-    dt: float
-    longest: float
+        return self.row.is_rare + (not usual)
 
 
 def name_of(m: mujoco.MjModel, kind: str, i: int) -> str:
@@ -151,10 +130,8 @@ def covered(place: Place, space: ParameterSpace, m: mujoco.MjModel) -> bool:
 
 def does(place: Place, address: str, m: mujoco.MjModel) -> bool:
     """Whether an address of the model's own parameters is what an effect changes."""
-    kind, quantity = REFITTED.get(place.effect, ("", ""))
-    found = language.places(m, address)
     return any(
-        (kind, quantity) == (k, q)
+        place.row.refits == (kind, quantity)
         and (not place.at or object_id(m, kind, place.at) == i)
-        for k, q, i in found
+        for kind, quantity, i in language.places(m, address)
     )

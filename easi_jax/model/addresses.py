@@ -21,7 +21,7 @@ from mujoco.mjx._src.collision_driver import geom_pairs
 
 from easi_jax.errors import UserError, nearest
 from easi_jax.model.contact_pairs import pair_names
-from easi_jax.model.effect_catalog import EFFECT_TABLE, VECTORS
+from easi_jax.model.effect_numbers import EFFECT_TABLE, VECTORS
 from easi_jax.model.quantities import TABLE as MODEL_TABLE
 from easi_jax.model.quantities import Entry, Inert, Quantity, direct_solref, value_of
 

@@ -5,10 +5,10 @@ strength (`none`) it changes nothing. Static ones (masses, armature, gravity, fo
 limits, contacts of the whole model) are written into the model once by `with_effects`;
 the others act in each physics step (`in_step`, `body_resistance`, `pair_contacts`) and
 on the way of a command to its actuator (`commands`).
-Names and meanings: `easi_jax.gap.table`.
+Their names: `easi_jax.model.effect_catalog`.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import flax.struct
@@ -22,10 +22,17 @@ from mujoco.mjx._src.types import DisableBit, IntegratorType
 from easi_jax.model import backlash
 from easi_jax.model.backlash import MotorState
 from easi_jax.model.contact_pairs import pair_ids
+from easi_jax.model.effect_numbers import (
+    NO_FORCE_LIMIT,
+    NUMBERS,
+    VECTORS,
+    EffectNumber,
+    field_of,
+    fields_that_act,
+)
 from easi_jax.model.quantities import scalar_places
 from easi_jax.model.set_const import set_const
 
-_NO_LIMIT = 1e9
 _TINY = 1e-9
 
 
@@ -69,8 +76,8 @@ class Effects:
         late: how late a reading is, ``(nv,)`` [s].
         width: total play between a drive and its joint, ``(nv,)``.
         rotor: inertia of the drive's side, part of the joint's, ``(nv,)``.
-        felt: inertia that a torque at the joint alone meets, ``(nv,)``; no effect, but
-            what `backlash` goes by.
+        effective_inertia: that a torque at the joint alone meets, ``(nv,)``; no effect,
+            but what `backlash` goes by.
     """
 
     coulomb: jax.Array
@@ -129,48 +136,27 @@ class CommandMemory:
 
 def none(m: mujoco.MjModel) -> Effects:
     """No effect anywhere."""
-    dof, act, body = jnp.zeros(m.nv), jnp.zeros(m.nu), jnp.zeros(m.nbody)
-    ones, pairs = jnp.ones, len(pair_ids(m))
+    count = {"joint": m.nv, "actuator": m.nu, "body": m.nbody}
+    count["geom"] = len(pair_ids(m))
+    fields: dict[str, list[EffectNumber]] = {}
+    for column, number in NUMBERS.items():
+        fields.setdefault(field_of(column), []).append(number)
+
+    def leaf(field: str, numbers: Sequence[EffectNumber]) -> jax.Array:
+        places = [count[n.on] for n in numbers[:1] if n.on != "model"]
+        entries = [len(numbers)] if field in VECTORS else []
+        neutral = min(numbers[0].neutral, NO_FORCE_LIMIT)
+        return jnp.full((*places, *entries), neutral, jnp.float32)
+
     return Effects(
-        coulomb=dof,
-        static=dof,
-        stribeck=ones(m.nv),
-        damping=dof,
-        drag=dof,
-        stiffness=dof,
-        spring=dof,
-        constant=dof,
-        ripple=dof,
-        cycles=ones(m.nv),
-        phase=dof,
-        armature=dof,
-        gain=ones(m.nu),
-        delay=act,
-        lag=act,
-        limit=jnp.full(m.nu, _NO_LIMIT),
-        deadband=act,
-        jump=act,
-        mass=body,
-        spread=body,
-        com=jnp.zeros((m.nbody, 3)),
-        force=jnp.zeros((m.nbody, 3)),
-        resistance=body,
-        tilt=jnp.zeros(2),
-        friction=ones(()),
-        softness=ones(2),
-        slip=ones(pairs),
-        give=ones((pairs, 2)),
-        bias=dof,
-        late=dof,
-        width=dof,
-        rotor=dof,
         effective_inertia=jnp.asarray(backlash.felt_inertia(m), jnp.float32),
+        **{field: leaf(field, numbers) for field, numbers in fields.items()},
     )
 
 
-_STATIC = ("mass", "spread", "com", "armature", "limit", "gain", "tilt", "friction")
-IN_CONTACTS = ("softness", "slip", "give")
-_ON_COMMANDS = ("delay", "lag", "deadband", "jump")
+_STATIC = fields_that_act("model")
+_IN_CONTACTS = fields_that_act("contacts")
+_ON_COMMANDS = fields_that_act("command")
 
 
 def has_step_effects(present: tuple[str, ...] | None) -> bool:
@@ -195,7 +181,7 @@ def has_body_drag(present: tuple[str, ...] | None) -> bool:
 
 def has_contact_effects(present: Iterable[str] | None) -> bool:
     """Whether contacts are changed in the step, where they are made."""
-    return present is None or any(name in IN_CONTACTS for name in present)
+    return present is None or any(name in _IN_CONTACTS for name in present)
 
 
 def with_effects(
@@ -319,10 +305,8 @@ def in_step(
 def _driven(m: mjx.Model, e: Effects, drives: dict[int, list[int]]) -> mjx.Model:
     """The model without the actuators that push on rotors."""
     left = jnp.ones(m.nu)
-    for dof, has_step_effects in drives.items():
-        left = left.at[np.array(has_step_effects)].set(
-            jnp.where(e.width[dof] > 0, 0.0, 1.0)
-        )
+    for dof, actuators in drives.items():
+        left = left.at[np.array(actuators)].set(jnp.where(e.width[dof] > 0, 0.0, 1.0))
     return m.replace(
         actuator_gainprm=m.actuator_gainprm * left[:, None],
         actuator_biasprm=m.actuator_biasprm * left[:, None],

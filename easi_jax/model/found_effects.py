@@ -13,10 +13,11 @@ import numpy as np
 
 from easi_jax.errors import UserError
 from easi_jax.model import addresses as language
-from easi_jax.model.effect_catalog import EFFECT_TABLE, READINGS, SHARED
+from easi_jax.model.effect_catalog import SHARED
+from easi_jax.model.effect_numbers import EFFECT_TABLE, field_of, fields_that_act
 from easi_jax.model.parameters import Parameter, ParameterSpace
 
-_SHAPES = ("spread", "jump")  # say which kind, not how much
+_READINGS = fields_that_act("readings")
 _STDS = 3.0
 _SHARE = 0.1  # of a value, at least, that it is taken to be uncertain by
 _FARTHER = 2.0  # times the upper end of where a search starts, that a delay may reach
@@ -44,7 +45,7 @@ class EffectEntry:
     @property
     def of_readings(self) -> bool:
         """Whether it is in the readings of a sensor, not in the physics."""
-        return all(column.split(".")[0] in READINGS for column in self.columns)
+        return all(field_of(column) in _READINGS for column in self.columns)
 
     def address(self, column: str) -> str:
         """The address of one of its numbers."""
@@ -137,12 +138,12 @@ def _parameter(
     """None where nothing is uncertain."""
     entry = alike[0]
     half = max(_STDS * entry.std.get(column, 0.0), _SHARE * abs(value))
-    if column.split(".")[0] in _SHAPES or half == 0:
+    if EFFECT_TABLE[column].is_shape or half == 0:
         return None
     addresses = tuple(e.address(column) for e in alike)
     unit, (low, high) = language.describe(m, addresses)
     start = max(value - half, low), min(value + half, high)
-    if column in ("delay", "lag"):
+    if EFFECT_TABLE[column].is_shift:
         high = min(high, _FARTHER * start[1])
     at = "all" if len(alike) == m.nu > 1 else "+".join(e.at for e in alike)
     place = f"@{at}" if at else ""

@@ -83,7 +83,7 @@ def test_what_is_told_of_them(results: Path) -> None:
     assert told["score"] == scores[0] == max(scores) and min(scores) < 0.7 * scores[0]
     inertia = told["effects"]["armature@hinge"]
     (number,) = inertia["numbers"]
-    assert number["unit"] == "kg m2" and 0 < number["std_per_size"] < 1
+    assert number["unit"] == "kg m^2" and 0 < number["std_per_size"] < 1
     assert inertia["apart"] <= inertia["visible"] * (1 + 1e-9)
     assert told["worst_pairs"][0]["apart"] == min(
         p["apart"] for p in told["worst_pairs"]

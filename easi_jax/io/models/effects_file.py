@@ -12,7 +12,6 @@ refitted:
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +21,10 @@ from easi_jax.errors import UserError, nearest
 from easi_jax.io.files import atomic_write, to_plain
 from easi_jax.io.strict_yaml import read_yaml
 from easi_jax.model.effect_catalog import EFFECTS
-from easi_jax.model.effects import Effects
+from easi_jax.model.effect_numbers import NUMBERS, field_of
 from easi_jax.model.found_effects import EffectEntry, FoundEffects
 
 _KEYS = ("effect", "at", "kind", "columns", "parameters", "std")
-_SIZED = {"joint": "nv", "actuator": "nu", "body": "nbody"}
 
 
 def write_effects(
@@ -120,9 +118,9 @@ def _entry(path: str, i: int, item: Any) -> EffectEntry:
     columns = item.get("columns")
     if not isinstance(columns, dict) or not columns:
         raise UserError(f"{path}, {where} ({name}): columns: holds its numbers")
-    known = [f.name for f in fields(Effects)]
+    known = {field_of(name) for name in NUMBERS}
     for key in columns:
-        if str(key).split(".")[0] not in known:
+        if field_of(str(key)) not in known:
             raise UserError(
                 f'{path}, {where} ({name}): unknown column "{key}"'
                 f"{nearest(str(key), known)}"

@@ -4,7 +4,7 @@ import numpy as np
 
 from easi_jax.excite.choose import effects_wanted, less_named
 from easi_jax.gap.candidates import places
-from easi_jax.gap.table import Scales
+from easi_jax.model.effect_catalog import Scales
 from easi_jax.model.parameter_proposal import own_space
 from envs import make
 

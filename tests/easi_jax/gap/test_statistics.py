@@ -32,7 +32,6 @@ from easi_jax.gap.model_comparison import (
     simplest,
 )
 from easi_jax.gap.predictor import BLOCK, Predictor
-from easi_jax.gap.result import for_people
 from easi_jax.gap.scales import scales_of
 from easi_jax.gap.sensor_faults import velocity_lags
 from easi_jax.gap.table import Place
@@ -280,8 +279,8 @@ def test_stiffness_is_told_with_its_rest(
         for p in places(model, scales_of(model, runs))
         if p.effect == "joint_stiffness"
     )
-    told = for_people(
-        place, {"stiffness": (2.0, 0.1, "N m/rad"), "rest": (0.5, 0.0, "N m")}
+    told = place.row.told(
+        {"stiffness": (2.0, 0.1, "N m/rad"), "rest": (0.5, 0.0, "N m")}
     )
     assert told["rest"][0] == pytest.approx(0.25) and told["rest"][2] == "rad"
 

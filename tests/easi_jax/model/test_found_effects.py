@@ -20,8 +20,7 @@ from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.scales import scales_of
 from easi_jax.gap.window_set import window_set
-from easi_jax.model.effect_catalog import EFFECT_TABLE
-from easi_jax.model.effects import IN_CONTACTS
+from easi_jax.model.effect_numbers import EFFECT_TABLE, fields_that_act
 from easi_jax.model.found_effects import EffectEntry, FoundEffects, joined
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import Parameter, ParameterSpace
@@ -56,7 +55,7 @@ def arm() -> mujoco.MjModel:
 def simulator(arm: mujoco.MjModel) -> Simulator:
     """Every effect of the arm is a parameter."""
     # Shapes, and contacts, which the arm does not have.
-    left = ("spread", "jump", "friction", *IN_CONTACTS)
+    left = ("spread", "jump", "friction", *fields_that_act("contacts"))
     found = [entry(c, 0.1) for c in EFFECT_TABLE if c.split(".")[0] not in left]
     found.append(entry("lag", 0.02, at="m"))
     base = Simulator(arm, ParameterSpace(()), DT)
