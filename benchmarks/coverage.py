@@ -117,7 +117,7 @@ def _solver(config: Config) -> Any:
         runs = collect(
             *(real, model, controller, k_run, config.trajectories, env.episode_length)
         )
-        demos = measured(runs, noise, k_noise)
+        demos = measured(runs, noise, k_noise, env.simulator.configuration)
         data = SearchData(windows(demos, 8, 4), noise, ())
         state, info = search.run(search.init(k_search, data), data, config.generations)
         return demos, state.result_mean, state.result_cov, info.non_finite.sum()

@@ -153,7 +153,9 @@ def searched(config: Config) -> dict[str, Any]:
     @jax.jit
     def find(key: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
         demos = collect(env, env.model(), controller, key, 50, env.episode_length)
-        demos = measured(demos, noise, jax.random.fold_in(key, 1))
+        demos = measured(
+            demos, noise, jax.random.fold_in(key, 1), env.simulator.configuration
+        )
         data = SearchData(windows(demos, 8, 8), noise, ())
         state, _ = search.run(search.init(key, data), data, config.generations)
         mean, cov = state.result_mean, state.result_cov

@@ -267,7 +267,7 @@ def _recorded(robot: str, run_folder: Path, hidden: Path, folder: Path) -> list[
             EPISODES[robot],
             env.episode_length,
         )
-        return measured(trajectories, noise, sensors)
+        return measured(trajectories, noise, sensors, env.simulator.configuration)
 
     joints = [env.mj_model.joint(j) for j in range(env.mj_model.njnt)]
     columns = [

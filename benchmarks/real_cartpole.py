@@ -141,16 +141,20 @@ def evaluate(
     from easi_jax.data.cleaning import rows_of
     from easi_jax.data.segments import to_device
     from easi_jax.estimation.pieces import segments_from_runs
-    from easi_jax.estimation.prediction_error import open_loop_error
     from easi_jax.io.logs.reader import read_logs
+    from easi_jax.simulation import open_loop
     from easi_jax.simulation.simulator import Simulator
+
+    def position_errors(simulator: Simulator, model: Any, pieces: Any) -> Any:
+        error = open_loop.errors(simulator, model, pieces)[..., : mj_model.nv]
+        return jnp.sqrt(jnp.mean(error**2, axis=(0, 1)))
 
     logs = {name: read_logs(paths, mj_model).runs for name, paths in files.items()}
     simulator = Simulator(mj_model, space, logs["chirp_plus"][0].dt)
     steps, every = round(HORIZON / simulator.dt), round(EVERY / simulator.dt)
     error = jax.jit(
         jax.vmap(
-            lambda theta, s: open_loop_error(simulator, simulator.model(theta), s),
+            lambda theta, s: position_errors(simulator, simulator.model(theta), s),
             (0, None),
         )
     )

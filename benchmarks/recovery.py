@@ -83,7 +83,7 @@ def _case(
     from easi_jax.devices.runtime import fast_loops
     from easi_jax.estimation import posterior
     from easi_jax.estimation.identifiability import describe, identifiability
-    from easi_jax.pipeline.held_out import relative_errors
+    from easi_jax.pipeline.held_out import errors_by_step
     from easi_jax.search.config import preset as make_preset
     from easi_jax.search.easi import Search, SearchData
     from easi_jax.simulation.rollout import collect, measured
@@ -114,7 +114,12 @@ def _case(
     @jax.jit
     def demonstrate(key: jax.Array) -> Any:
         k_run, k_noise = jax.random.split(key)
-        return measured(trajectories(k_run, config.trajectories), deviation, k_noise)
+        return measured(
+            trajectories(k_run, config.trajectories),
+            deviation,
+            k_noise,
+            simulator.configuration,
+        )
 
     @functools.partial(jax.jit, compiler_options=fast_loops())
     def find(key: jax.Array, demos: Any) -> Any:
@@ -133,7 +138,7 @@ def _case(
         fresh = trajectories(key, 20)
         model, limit = simulator.model(search.space.to_si(mean)), nominal.speed_limit
         return tuple(
-            relative_errors(simulator, model, windows(fresh, h, h), limit)
+            errors_by_step(simulator, model, windows(fresh, h, h), limit)[-1]
             for h in (1, 10)
         )
 

@@ -154,7 +154,12 @@ class Rig:
                     STEPS,
                 )
 
-            return measured(jax.vmap(one)(keys), noise, jax.random.fold_in(keys[0], 1))
+            return measured(
+                jax.vmap(one)(keys),
+                noise,
+                jax.random.fold_in(keys[0], 1),
+                simulator.configuration,
+            )
 
         std = jnp.asarray(explore * _EXPLORED[self.name])
         return Task(

@@ -171,7 +171,7 @@ def recorded(
 
     def record(theta: Any, k_record: Any, k_noise: Any) -> Any:
         clean = rig.record(real, theta, k_record, cell.trajectories, explore)
-        return measured(clean, noise, k_noise)
+        return measured(clean, noise, k_noise, real.configuration)
 
     demos = jax.jit(record)(theta, *keys[:2])
     if cell.setting != "unpaired":

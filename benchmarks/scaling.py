@@ -104,8 +104,8 @@ def every_part(mj_model: Any) -> Any:
     joint, mass and center of every body, all that contacts take of named geoms, gravity
     and density of the air: 117 of a Go2."""
     from easi_jax.model.addresses import names, places
+    from easi_jax.model.joint_space import joint_name, scalar_dofs
     from easi_jax.model.parameters import ParameterSpace, declare
-    from easi_jax.model.quantities import joint_name, scalar_dofs
 
     m = mj_model
     touching = [m.geom(i).name for *_, i in places(m, "geom.*.friction")]

@@ -95,7 +95,7 @@ def ready(generations: int) -> Any:
         theta, play, sensors, begin = jax.random.split(key, 4)
         target = env.space.to_si(jax.random.uniform(theta, (env.space.size,)))
         demos = collect(env, env.model(target), wander(env), play, 4, 60)
-        demos = measured(demos, noise, sensors)
+        demos = measured(demos, noise, sensors, env.simulator.configuration)
         data = SearchData(windows(demos, 8, 8), noise, ())
         state, info = search.run(search.init(begin, data), data, generations)
         found = estimate(

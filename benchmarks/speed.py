@@ -74,6 +74,15 @@ def _whole(search: Any, config: Config) -> Any:
     )
 
 
+def _simulated(search: Any, config: Config, state: Any, data: Any, key: Any) -> Any:
+    """What one generation simulates and nothing else; the last positions."""
+    import jax
+
+    unit = jax.random.uniform(key, (config.population, search.space.size))
+    theta, center = search.space.to_si(unit), search.space.to_si(state.mean)
+    return search._replay(data, theta, center, key)[2].next_qpos[..., -1, :]
+
+
 def _compile(config: Config) -> dict[str, float]:
     import jax
 
@@ -107,7 +116,7 @@ def _generations(config: Config) -> dict[str, Any]:
         lambda s, d: jax.lax.scan(
             lambda k, _: (
                 jax.random.fold_in(k, 1),
-                search.simulated_states(s, d, k),
+                _simulated(search, config, s, d, k),
             ),
             jax.random.key(3),
             None,

@@ -50,10 +50,10 @@ def read_excite_problem(config: Any) -> ExciteProblem:
     from easi_jax.errors import UserError
     from easi_jax.excite.candidates import LEAD, make_bench
     from easi_jax.excite.choose import check_names
-    from easi_jax.excite.drives import limits_of, scalar_dofs
+    from easi_jax.excite.drives import limits_of
     from easi_jax.io.models.parameter_file import read_parameter_file
+    from easi_jax.model.joint_space import joint_name, scalar_dofs
     from easi_jax.model.parameter_proposal import own_space
-    from easi_jax.model.quantities import joint_name
     from train._gap_problem import read_model
 
     if not config.model:

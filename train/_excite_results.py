@@ -66,8 +66,7 @@ def _keys(choice: Any) -> tuple[str, ...]:
 
 
 def _named(problem: Any, kind: str, values: Any) -> dict[str, float]:
-    from easi_jax.excite.drives import scalar_dofs
-    from easi_jax.model.quantities import joint_name
+    from easi_jax.model.joint_space import joint_name, scalar_dofs
 
     m = problem.mj_model
     if kind == "actuator":
@@ -76,8 +75,7 @@ def _named(problem: Any, kind: str, values: Any) -> dict[str, float]:
 
 
 def _start(problem: Any) -> dict[str, float]:
-    from easi_jax.excite.drives import scalar_dofs
-    from easi_jax.model.quantities import joint_name
+    from easi_jax.model.joint_space import joint_name, scalar_dofs
 
     m, start = problem.mj_model, problem.bench.start
     return {joint_name(m, j): float(start[q]) for j, (q, _) in scalar_dofs(m).items()}
@@ -96,8 +94,7 @@ def _limits(config: Any, problem: Any, best: Any) -> dict[str, Any]:
     """What was allowed, and what the model and the wrong ones reach."""
     import numpy as np
 
-    from easi_jax.excite.drives import scalar_dofs
-    from easi_jax.model.quantities import joint_name
+    from easi_jax.model.joint_space import joint_name, scalar_dofs
 
     m, lim = problem.mj_model, problem.bench.limits
     q_all = np.concatenate([x.qpos for x in best.motions])
@@ -300,13 +297,12 @@ def write_results(
 
 def commands_csv(problem: Any, best: Any) -> str:
     """The commands, with the positions that the model predicts, as a log."""
+    from easi_jax.model.joint_space import position_names
+
     m, bench = problem.mj_model, problem.bench
     way = "ctrl" if bench.feedback is None else "feedforward"
     names = ["time", *(f"{way}.{m.actuator(a).name}" for a in range(m.nu))]
-    for j in range(m.njnt):
-        n = {0: 7, 1: 4}.get(int(m.jnt_type[j]), 1)
-        ends = [""] if n == 1 else [f".{i}" for i in range(n)]
-        names += [f"qpos.{m.joint(j).name}{e}" for e in ends]
+    names += [f"qpos.{name}" for name in position_names(m)]
     out = io.StringIO()
     write = csv.writer(out, lineterminator="\n").writerow
     write(names)

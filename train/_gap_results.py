@@ -391,7 +391,7 @@ def _residual_map(problem: Any, o: Any) -> list[Any]:
     from easi_jax.gap.error_localization import condition_errors
     from easi_jax.io.report.gap_figures import residual_maps
     from easi_jax.io.report.html import Picture
-    from easi_jax.model.quantities import scalar_dofs
+    from easi_jax.model.joint_space import scalar_dofs
 
     c, m = o.channels, problem.model.mj_model
     joints, names, before = condition_errors(o.before.errors, o.before.conditions, m, c)

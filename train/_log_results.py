@@ -142,6 +142,8 @@ def _errors(
     import jax.numpy as jnp
     import numpy as np
 
+    from easi_jax.model.joint_space import tangent_units
+
     before, scale, _ = errors_of(jnp.asarray(space.nominal, jnp.result_type(float)))
     scale = np.maximum(scale, 1e-12)
     seeds = []
@@ -159,15 +161,10 @@ def _errors(
     names = [n.removeprefix("qpos.") for n in coordinates]
     return {
         "channels": names,
-        "units": _units(simulator.mj_model),
+        "units": list(tangent_units(simulator.mj_model)),
         "before": before.tolist(),
         "seeds": seeds,
     }
-
-
-def _units(model: Any) -> list[str]:
-    kinds = {0: ["m"] * 3 + ["rad"] * 3, 1: ["rad"] * 3, 2: ["m"], 3: ["rad"]}
-    return [u for kind in model.jnt_type for u in kinds[int(kind)]]
 
 
 def _better(before: Sequence[float], after: Sequence[float]) -> str:

@@ -1,4 +1,4 @@
-"""Cuts runs into open-loop windows and into transitions; nothing crosses a run's end.
+"""Cuts runs into open-loop windows; nothing crosses a run's end.
 
 The start of a window is that of the log format: the position as measured, and as
 velocity the derivative of a quadratic fitted to the positions around it.
@@ -34,24 +34,6 @@ class Windows(NamedTuple):
     ctrl: np.ndarray
     target_qpos: np.ndarray
     dt: float
-
-
-class Transitions(NamedTuple):
-    """Pairs of successive rows of one run, N = T - 1.
-
-    Attributes:
-        qpos: ``(N, nq)``.
-        qvel: ``(N, nv)``.
-        ctrl: command sent in between, ``(N, nu)``.
-        next_qpos: ``(N, nq)``.
-        next_qvel: ``(N, nv)``.
-    """
-
-    qpos: np.ndarray
-    qvel: np.ndarray
-    ctrl: np.ndarray
-    next_qpos: np.ndarray
-    next_qvel: np.ndarray
 
 
 def fitted_velocity(
@@ -117,17 +99,6 @@ def make_windows(run: Run, horizon_s: float, every_s: float | None = None) -> Wi
         ctrl=run.ctrl[row],
         target_qpos=run.qpos[row + 1],
         dt=run.dt,
-    )
-
-
-def transitions(run: Run) -> Transitions:
-    """Every pair of successive rows of ``run``, with the command in between."""
-    return Transitions(
-        qpos=run.qpos[:-1],
-        qvel=run.qvel[:-1],
-        ctrl=run.ctrl[:-1],
-        next_qpos=run.qpos[1:],
-        next_qvel=run.qvel[1:],
     )
 
 

@@ -54,7 +54,7 @@ class Normal:
 def shift_start(simulator: Simulator, seg: Segments, delta: jax.Array) -> Segments:
     """Segments with starts moved by tangent vectors ``(M, 2 nv)``."""
     nv = simulator.mj_model.nv
-    move = jax.vmap(simulator.move)
+    move = simulator.move
     return replace(
         seg, qpos=move(seg.qpos, delta[:, :nv]), qvel=seg.qvel + delta[:, nv:]
     )

@@ -12,12 +12,6 @@ from easi_jax.simulation import open_loop
 from easi_jax.simulation.simulator import Simulator
 
 
-def open_loop_error(simulator: Simulator, model: Any, segments: Segments) -> jax.Array:
-    """RMS over all steps of all segments of the position error, ``(nv,)``."""
-    nv = simulator.mj_model.nv
-    return _rms_of_steps(open_loop.errors(simulator, model, segments)[..., :nv])
-
-
 def errors_and_floor(
     simulator: Simulator,
     model: Any,
@@ -26,8 +20,8 @@ def errors_and_floor(
     noise: jax.Array,
     key: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """`open_loop_error` on ``held``, on ``fit``, and what the first would be for a
-    perfect model, ``(nv,)`` each.
+    """RMS over all steps of the position error on ``held``, on ``fit``, and what the
+    first would be for a perfect model, ``(nv,)`` each.
 
     For the floor noise ``(2 nv,)`` is drawn for starts and targets and pushed through
     the model.
@@ -37,7 +31,7 @@ def errors_and_floor(
     z = noise * jax.random.normal(k_start, (held.count, 2 * nv))
     moved = replace(
         held,
-        qpos=jax.vmap(simulator.move)(held.qpos, z[:, :nv]),
+        qpos=simulator.move(held.qpos, z[:, :nv]),
         qvel=held.qvel + z[:, nv:],
     )
     # One simulation, since compiling it takes longer than running it.

@@ -199,7 +199,7 @@ class ProfileFit(PairedFit):
     def _measured(self, s: Segments, error: jax.Array) -> Segments:
         """One piece with what was measured moved by tangents ``error (H, 2 nv)``."""
         nv = self.simulator.mj_model.nv
-        move = jax.vmap(self.simulator.move)
+        move = self.simulator.move
         return replace(
             s,
             next_qpos=move(s.next_qpos, error[:, :nv]),

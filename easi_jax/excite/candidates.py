@@ -9,7 +9,7 @@ import numpy as np
 from easi_jax.data.recording import Run
 from easi_jax.errors import UserError
 from easi_jax.excite import drives, play, signals
-from easi_jax.model.joint_space import Configuration
+from easi_jax.model.joint_space import Configuration, scalar_dofs
 from easi_jax.model.quantities import is_position_servo
 
 LEAD = 1.0  # s of rest at either end
@@ -141,7 +141,7 @@ def holds(bench: play.Bench, rows: int) -> bool:
     """Whether the machine stays put without a controller, wrong models and a start
     that is a little off included."""
     m, limits, start = bench.models[0], bench.limits, bench.start.copy()
-    for q, d in drives.scalar_dofs(m).values():
+    for q, d in scalar_dofs(m).values():
         span = limits.high[d] - limits.low[d]
         start[q] += _NUDGE * span if np.isfinite(span) else 0.0
     for model in bench.models:

@@ -23,8 +23,8 @@ from easi_jax.gap.candidates import places, ripples
 from easi_jax.gap.scales import scales_of
 from easi_jax.gap.table import Place, covered, does
 from easi_jax.model.effect_catalog import EFFECTS, Scales
+from easi_jax.model.joint_space import scalar_dofs
 from easi_jax.model.parameters import ParameterSpace
-from easi_jax.model.quantities import scalar_dofs
 from easi_jax.simulation.step import WRITTEN_OUT
 
 _WORK = 4e6  # physics steps of all simulations together

@@ -6,13 +6,11 @@ import mujoco
 import numpy as np
 
 from easi_jax.errors import UserError
+from easi_jax.model.joint_space import is_scalar, joint_name, scalar_dofs
 from easi_jax.model.quantities import (
     actuator_name,
     is_position_servo,
-    is_scalar,
     is_velocity_servo,
-    joint_name,
-    scalar_dofs,
 )
 
 _ROOM = 0.15  # of a joint's range that a start needs on both sides

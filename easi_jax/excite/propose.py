@@ -17,6 +17,7 @@ from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.scales import scales_of
 from easi_jax.gap.table import Place
 from easi_jax.gap.window_set import WindowSet, join
+from easi_jax.model.joint_space import scalar_dofs
 
 _WINDOWS = 32  # of each run
 _MARGIN = 0.05
@@ -209,7 +210,7 @@ def quick_tests(
         return [], "open-loop"
     dt = runs[0].dt
     travel = np.full(m.nv, _TRAVEL)
-    for q, d in drives.scalar_dofs(m).values():
+    for q, d in scalar_dofs(m).values():
         seen = max(float(np.abs(r.qpos[:, q] - m.qpos0[q]).max()) for r in runs)
         travel[d] = max(_TRAVEL, seen)
     limits = drives.limits_of(m, _MARGIN, travel, np.full(m.nv, np.inf))

@@ -43,8 +43,8 @@ from easi_jax.gap.whitening import (
 )
 from easi_jax.gap.window_set import join, reach, spread, window_set
 from easi_jax.io.runs.step_cache import key_of
+from easi_jax.model.joint_space import scalar_dofs
 from easi_jax.model.parameters import ParameterSpace
-from easi_jax.model.quantities import scalar_dofs
 from easi_jax.progress import Progress, silent
 
 _FITTED = (32, 96)  # windows that fits see

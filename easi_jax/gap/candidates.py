@@ -10,7 +10,7 @@ from easi_jax.gap.table import Column, Place, name_of
 from easi_jax.model.contact_pairs import contact_pairs
 from easi_jax.model.effect_catalog import CATALOG, Effect, Part, Scales, Spot
 from easi_jax.model.effect_numbers import field_of
-from easi_jax.model.quantities import scalar_dofs
+from easi_jax.model.joint_space import scalar_dofs
 
 _SELDOM = 0.02  # of the rows: a pair of geoms that touches less says nothing
 _PAIRS = 12  # at most, that are looked at one by one

@@ -11,7 +11,8 @@ from easi_jax.data.recording import Run
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.gap.gap_metric import Channels
 from easi_jax.gap.window_set import Rows, WindowSet
-from easi_jax.model.quantities import actuator_name, body_name, scalar_dofs
+from easi_jax.model.joint_space import scalar_dofs
+from easi_jax.model.quantities import actuator_name, body_name
 
 _TELLING = 1.3  # times as much error as elsewhere
 _FEW = 8  # windows that a condition needs

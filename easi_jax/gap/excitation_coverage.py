@@ -7,7 +7,8 @@ import numpy as np
 
 from easi_jax.data.recording import Run
 from easi_jax.data.windows import fitted_velocity
-from easi_jax.model.quantities import actuator_name, joint_name, joint_unit, scalar_dofs
+from easi_jax.model.joint_space import joint_name, scalar_dofs
+from easi_jax.model.quantities import actuator_name, joint_unit
 
 _ONE_WAY = 0.02  # share of the travel that the way back has at least
 _FASTER = 1.5  # times what the fitting data reach

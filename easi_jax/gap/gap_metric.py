@@ -9,7 +9,7 @@ import numpy as np
 from easi_jax.data.recording import Run
 from easi_jax.gap.whitening import noise_rows
 from easi_jax.gap.window_set import WindowSet
-from easi_jax.model.quantities import joint_name
+from easi_jax.model.joint_space import dofs, is_hinge, joint_name, tangent_units, widths
 
 _VISIBLE = 5.0  # times the noise
 _ODD = 3.0  # times the error of other runs
@@ -49,7 +49,6 @@ def channels(
     (a free base's x and y, a hinge that turns on) the RMS of its change over ``steps``
     control steps.
     """
-    nv = m.nv
     parts, changes = [], []
     for run in runs:
         origin = np.broadcast_to(runs[0].qpos[0], run.qpos.shape)
@@ -61,23 +60,15 @@ def channels(
     everything = np.concatenate(parts)
     change = np.sqrt(np.mean(np.concatenate(changes) ** 2, 0))
     spread = everything.std(0)
-    joints, units, unbounded = [], [], np.zeros(nv, bool)
+    joints = [joint_name(m, j) for j in m.dof_jntid]
+    units = tangent_units(m)
+    unbounded = np.zeros(m.nv, bool)
     for j in range(m.njnt):
-        kind, d = int(m.jnt_type[j]), int(m.jnt_dofadr[j])
-        name = joint_name(m, j)
-        if kind == mujoco.mjtJoint.mjJNT_FREE:
-            joints += [name] * 6
-            units += ["m"] * 3 + ["rad"] * 3
-            unbounded[d : d + 2] = True
-        elif kind == mujoco.mjtJoint.mjJNT_BALL:
-            joints += [name] * 3
-            units += ["rad"] * 3
-        else:
-            hinge = kind == mujoco.mjtJoint.mjJNT_HINGE
-            joints.append(name)
-            units.append("rad" if hinge else "m")
-            turns = np.ptp(everything[:, d]) > 2 * np.pi
-            unbounded[d] = hinge and not m.jnt_limited[j] and turns
+        if is_hinge(m, j) and not m.jnt_limited[j]:
+            d = int(m.jnt_dofadr[j])
+            unbounded[d] = np.ptp(everything[:, d]) > 2 * np.pi
+        elif widths(m, j) == (7, 6):
+            unbounded[list(dofs(m, j)[:2])] = True
     scale = np.where(unbounded, change, spread)
     quiet = change < _VISIBLE * noise
     ignored = {

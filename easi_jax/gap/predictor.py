@@ -29,9 +29,9 @@ from easi_jax.model.backlash import MotorState
 from easi_jax.model.contact_pairs import pair_ids
 from easi_jax.model.effect_numbers import EFFECT_TABLE, fields_that_act
 from easi_jax.model.effects import Effects
+from easi_jax.model.joint_space import dofs, scalar_places, turns_fully
 from easi_jax.model.mjx_model import Model, full_structure
 from easi_jax.model.parameters import ParameterSpace
-from easi_jax.model.quantities import scalar_places
 from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.step import Physics, arrived_step
 
@@ -77,7 +77,8 @@ class Predictor:
         windows: what is predicted.
         own: number of the model's own parameters; they come first in a vector.
         neutral: the vector of the model as given.
-        wrapped: hinges without limits, whose errors are wrapped, ``(nv,)`` bool.
+        wrapped: hinges in whose range a full turn fits, whose errors are wrapped,
+            ``(nv,)`` bool.
         largest: motion that was measured in a window, ``(nv,)``.
     """
 
@@ -102,9 +103,7 @@ class Predictor:
         self.nv, self.steps = nv, windows.ctrl.shape[1]
         self.wrapped = np.zeros(nv, bool)
         for j in range(m.njnt):
-            hinge = m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
-            if hinge and not m.jnt_limited[j]:
-                self.wrapped[m.jnt_dofadr[j]] = True
+            self.wrapped[dofs(m, j)] = turns_fully(m, j)
         moved = np.abs(self._unwrapped(windows.read)).max((0, 1))
         self.largest = np.where(self.wrapped, np.minimum(moved, np.pi), moved)
         self._scalar = scalar_places(m).T

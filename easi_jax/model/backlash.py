@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from easi_jax.model.quantities import is_scalar
+from easi_jax.model.joint_space import is_scalar
 
 _PARTS = 6  # of a physics step
 _STIFF = 0.4  # phase of the teeth's own oscillation in a part [rad]

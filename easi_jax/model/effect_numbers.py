@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.model.backlash import geared
+from easi_jax.model.joint_space import is_scalar
 from easi_jax.model.quantities import (
     SEED,
     Entry,
@@ -21,7 +22,6 @@ from easi_jax.model.quantities import (
     Quantity,
     actuation,
     direct_solref,
-    is_scalar,
     joint_unit,
     linear_drive,
     open_force_limit,

@@ -30,7 +30,7 @@ from easi_jax.model.effect_numbers import (
     field_of,
     fields_that_act,
 )
-from easi_jax.model.quantities import scalar_places
+from easi_jax.model.joint_space import scalar_places
 from easi_jax.model.set_const import set_const
 
 _TINY = 1e-9

@@ -1,16 +1,115 @@
-"""Differences and steps on a model's configuration space, in numpy.
+"""Joint geometry: where joints lie in ``qpos`` and ``qvel``, and differences and steps
+between positions, in numpy or jax.
 
 A hinge or slide coordinate is a plain number; the orientation of a ball or free
 joint is a unit quaternion (w x y z), whose differences are rotation vectors in
 the joint's own frame, as MuJoCo's angular velocities are.
 """
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-_TINY = 1e-12
+_Joint = mujoco.mjtJoint
+# Widths of a joint's positions and velocities.
+_WIDTHS = {_Joint.mjJNT_FREE: (7, 6), _Joint.mjJNT_BALL: (4, 3)}
+_TANGENT_UNITS = {
+    _Joint.mjJNT_FREE: ("m", "m", "m", "rad", "rad", "rad"),
+    _Joint.mjJNT_BALL: ("rad", "rad", "rad"),
+    _Joint.mjJNT_SLIDE: ("m",),
+    _Joint.mjJNT_HINGE: ("rad",),
+}
+# Square of a rotation [rad^2] below which sines and angles are their first order,
+# which then is exact in float64 and has a slope.
+_TINY = 1e-16
+# Range of a hinge [rad] in which a full turn fits: limits are written with few digits.
+_FULL_TURN = 2 * math.pi - 1e-3
+
+
+def _kind(m: Any, j: int) -> mujoco.mjtJoint:
+    return _Joint(int(m.jnt_type[j]))
+
+
+def joint_name(m: Any, j: int) -> str:
+    """A joint's name, or its number."""
+    return m.joint(j).name or f"joint{j}"
+
+
+def widths(m: Any, j: int) -> tuple[int, int]:
+    """How many positions and how many velocities joint ``j`` has."""
+    return _WIDTHS.get(_kind(m, j), (1, 1))
+
+
+def dofs(m: Any, j: int) -> range:
+    """Degrees of freedom of joint ``j``."""
+    start = int(m.jnt_dofadr[j])
+    return range(start, start + widths(m, j)[1])
+
+
+def numbered(name: str, width: int) -> tuple[str, ...]:
+    """``name`` alone, or ``name.0``, ``name.1`` ... where a joint or sensor has more
+    than one number."""
+    return (name,) if width == 1 else tuple(f"{name}.{i}" for i in range(width))
+
+
+def tangent_names(m: Any) -> tuple[str, ...]:
+    """Names of the ``nv`` entries of a tangent vector or velocity."""
+    return tuple(
+        name
+        for j in range(m.njnt)
+        for name in numbered(joint_name(m, j), widths(m, j)[1])
+    )
+
+
+def position_names(m: Any) -> tuple[str, ...]:
+    """Names of the ``nq`` entries of ``qpos``."""
+    return tuple(
+        name
+        for j in range(m.njnt)
+        for name in numbered(joint_name(m, j), widths(m, j)[0])
+    )
+
+
+def tangent_units(m: Any) -> tuple[str, ...]:
+    """Units of the ``nv`` entries of a tangent vector: m or rad."""
+    return tuple(u for j in range(m.njnt) for u in _TANGENT_UNITS[_kind(m, j)])
+
+
+def is_scalar(m: Any, j: int) -> bool:
+    """Whether joint ``j`` is a hinge or a slide."""
+    return _kind(m, j) in (_Joint.mjJNT_HINGE, _Joint.mjJNT_SLIDE)
+
+
+def is_hinge(m: Any, j: int) -> bool:
+    """Whether joint ``j`` is a hinge."""
+    return _kind(m, j) == _Joint.mjJNT_HINGE
+
+
+def turns_fully(m: Any, j: int) -> bool:
+    """Whether joint ``j`` is a hinge in whose range a full turn fits, so that a reading
+    may jump by a turn without a motion."""
+    low, high = m.jnt_range[j]
+    return is_hinge(m, j) and bool(not m.jnt_limited[j] or high - low >= _FULL_TURN)
+
+
+def scalar_dofs(m: Any) -> dict[int, tuple[int, int]]:
+    """(place in qpos, place in qvel) of hinges and slides, by joint."""
+    return {
+        j: (int(m.jnt_qposadr[j]), int(m.jnt_dofadr[j]))
+        for j in range(m.njnt)
+        if is_scalar(m, j)
+    }
+
+
+def scalar_places(m: Any) -> np.ndarray:
+    """Places in ``qpos`` and in ``qvel`` of hinges and slides, ``(k, 2)``."""
+    return np.array([*scalar_dofs(m).values()], int).reshape(-1, 2)
 
 
 @dataclass(frozen=True)
@@ -33,21 +132,18 @@ class Configuration:
     quaternions: tuple[tuple[int, int], ...]
 
     @classmethod
-    def of(cls, model: mujoco.MjModel) -> "Configuration":
-        """The layout of ``model``."""
+    def of(cls, model: Any) -> "Configuration":
+        """The layout of ``model``, of MuJoCo or of MJX."""
         scalars: list[tuple[int, int]] = []
         quaternions: list[tuple[int, int]] = []
-        for kind, qpos, dof in zip(
-            model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, strict=True
-        ):
-            qpos, dof = int(qpos), int(dof)
-            if kind == mujoco.mjtJoint.mjJNT_FREE:
-                scalars += [(qpos + i, dof + i) for i in range(3)]
-                quaternions.append((qpos + 3, dof + 3))
-            elif kind == mujoco.mjtJoint.mjJNT_BALL:
-                quaternions.append((qpos, dof))
-            else:
+        for j in range(model.njnt):
+            qpos, dof = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
+            if is_scalar(model, j):
                 scalars.append((qpos, dof))
+                continue
+            before = widths(model, j)[0] - 4  # a free joint's position
+            scalars += [(qpos + i, dof + i) for i in range(before)]
+            quaternions.append((qpos + before, dof + before))
         return cls(
             nq=model.nq,
             nv=model.nv,
@@ -56,30 +152,47 @@ class Configuration:
             quaternions=tuple(quaternions),
         )
 
-    def difference(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    @cached_property
+    def _stretches(self) -> tuple[tuple[slice, slice, bool], ...]:
+        """Places in ``qpos`` and ``qvel``, in order: plain numbers as far as they
+        follow each other, or a quaternion (True)."""
+        out: list[tuple[slice, slice, bool]] = []
+        first = 0
+        for q, v in (*self.quaternions, (self.nq, self.nv)):
+            if q > first:
+                plain = slice(v - (q - first), v)
+                out.append((slice(first, q), plain, False))
+            if q < self.nq:
+                out.append((slice(q, q + 4), slice(v, v + 3), True))
+            first = q + 4
+        return tuple(out)
+
+    def difference(self, start: Any, end: Any) -> Any:
         """The tangent vector that leads from ``start`` to ``end`` in unit time.
 
         Equals ``mujoco.mj_differentiatePos`` with ``dt = 1``; the shorter way
-        round is taken, whatever the sign of a quaternion.
+        round is taken, whatever the sign of a quaternion. Plain numbers are
+        subtracted: angles do not wrap.
 
         Args:
             start: ``(..., nq)``, quaternions of unit length.
             end: ``(..., nq)``, broadcast against ``start``.
 
         Returns:
-            ``(..., nv)``, m and rad.
+            ``(..., nv)``, m and rad; of jax where an argument is.
         """
-        shape = np.broadcast_shapes(start.shape, end.shape)[:-1]
-        out = np.empty((*shape, self.nv))
-        qpos, qvel = list(self.scalar_qpos), list(self.scalar_qvel)
-        out[..., qvel] = end[..., qpos] - start[..., qpos]
-        for q, v in self.quaternions:
-            inverse = start[..., q : q + 4] * np.array([1.0, -1.0, -1.0, -1.0])
-            turn = _product(inverse, end[..., q : q + 4])
-            out[..., v : v + 3] = _rotation_vector(turn)
-        return out
+        if not self.quaternions:
+            return end - start
+        xp = _module(start, end)
+        parts = [
+            _rotation_vector(xp, start[..., q], end[..., q])
+            if turns
+            else end[..., q] - start[..., q]
+            for q, _, turns in self._stretches
+        ]
+        return xp.concatenate(parts, -1)
 
-    def integrate(self, start: np.ndarray, tangent: np.ndarray) -> np.ndarray:
+    def integrate(self, start: Any, tangent: Any) -> Any:
         """The configuration reached from ``start`` along ``tangent``.
 
         Equals ``mujoco.mj_integratePos`` with ``dt = 1`` and undoes
@@ -90,37 +203,54 @@ class Configuration:
             tangent: ``(..., nv)``, m and rad.
 
         Returns:
-            ``(..., nq)``, quaternions of unit length.
+            ``(..., nq)``, quaternions of unit length; of jax where an argument is.
         """
-        shape = np.broadcast_shapes(start.shape[:-1], tangent.shape[:-1])
-        out = np.empty((*shape, self.nq))
-        qpos, qvel = list(self.scalar_qpos), list(self.scalar_qvel)
-        out[..., qpos] = start[..., qpos] + tangent[..., qvel]
-        for q, v in self.quaternions:
-            turn = _quaternion(tangent[..., v : v + 3])
-            moved = _product(start[..., q : q + 4], turn)
-            norm = np.linalg.norm(moved, axis=-1, keepdims=True)
-            out[..., q : q + 4] = moved / norm
-        return out
+        if not self.quaternions:
+            return start + tangent
+        xp = _module(start, tangent)
+        parts = [
+            _turned(xp, start[..., q], tangent[..., v])
+            if turns
+            else start[..., q] + tangent[..., v]
+            for q, v, turns in self._stretches
+        ]
+        return xp.concatenate(parts, -1)
 
 
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _module(*arrays: Any) -> Any:
+    return jnp if any(isinstance(x, jax.Array) for x in arrays) else np
+
+
+def _product(xp: Any, a: Any, b: Any) -> Any:
+    """Of quaternions ``(..., 4)``."""
     aw, av = a[..., :1], a[..., 1:]
     bw, bv = b[..., :1], b[..., 1:]
-    w = aw * bw - np.sum(av * bv, axis=-1, keepdims=True)
-    return np.concatenate([w, aw * bv + bw * av + np.cross(av, bv)], axis=-1)
+    w = aw * bw - xp.sum(av * bv, -1, keepdims=True)
+    return xp.concatenate([w, aw * bv + bw * av + xp.cross(av, bv)], -1)
 
 
-def _rotation_vector(quaternion: np.ndarray) -> np.ndarray:
-    near = np.where(quaternion[..., :1] < 0, -quaternion, quaternion)
-    sine = np.linalg.norm(near[..., 1:], axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(sine, near[..., :1])
-    ratio = np.where(sine < _TINY, 2.0, angle / np.maximum(sine, _TINY))
-    return near[..., 1:] * ratio
+def _size(xp: Any, vector: Any) -> tuple[Any, Any]:
+    """Whether ``vector (..., 3)`` is more than tiny, and its length, else one: the root
+    has no slope at zero."""
+    square = xp.sum(vector * vector, -1, keepdims=True)
+    large = square > _TINY
+    return large, xp.sqrt(xp.where(large, square, 1.0))
 
 
-def _quaternion(rotation_vector: np.ndarray) -> np.ndarray:
-    angle = np.linalg.norm(rotation_vector, axis=-1, keepdims=True)
-    # numpy's sinc is sin(pi x) / (pi x)
-    half = 0.5 * np.sinc(angle / (2.0 * np.pi))
-    return np.concatenate([np.cos(angle / 2.0), rotation_vector * half], axis=-1)
+def _rotation_vector(xp: Any, start: Any, end: Any) -> Any:
+    """From unit quaternion ``start`` to ``end``, in the frame of ``start`` [rad]."""
+    inverse = xp.concatenate([start[..., :1], -start[..., 1:]], -1)
+    turn = _product(xp, inverse, end)
+    vector = xp.where(turn[..., :1] < 0, -turn[..., 1:], turn[..., 1:])
+    large, sine = _size(xp, vector)
+    angle = 2.0 * xp.arctan2(sine, xp.abs(turn[..., :1]))
+    return vector * xp.where(large, angle / sine, 2.0)
+
+
+def _turned(xp: Any, quaternion: Any, vector: Any) -> Any:
+    """``quaternion`` turned by a rotation vector in its own frame, of unit length."""
+    large, angle = _size(xp, vector)
+    real = xp.where(large, xp.cos(angle / 2.0), 1.0)
+    scale = xp.where(large, xp.sin(angle / 2.0) / angle, 0.5)
+    moved = _product(xp, quaternion, xp.concatenate([real, scale * vector], -1))
+    return moved / xp.sqrt(xp.sum(moved * moved, -1, keepdims=True))

@@ -14,8 +14,8 @@ import numpy as np
 
 from easi_jax.errors import UserError
 from easi_jax.model import addresses as language
+from easi_jax.model.joint_space import is_scalar, scalar_dofs
 from easi_jax.model.parameters import Parameter, ParameterSpace, declare
-from easi_jax.model.quantities import is_scalar, scalar_dofs
 
 _GRAVITY = 9.81
 _SHORTEST = 0.01  # m, arm of a weight

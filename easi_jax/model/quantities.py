@@ -13,6 +13,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from easi_jax.model.joint_space import dofs, is_scalar
+
 # Added to what MJX would compile out if it were zero: small against any real value,
 # and a normal number in float32.
 SEED = 1e-9
@@ -99,39 +101,8 @@ def _disabled(m: Any, *flags: tuple[Any, str]) -> Inert | None:
 # Joints ----------------------------------------------------------------------
 
 
-def dofs(m: Any, j: int) -> range:
-    """Degrees of freedom of joint ``j``."""
-    n = {int(_Joint.mjJNT_FREE): 6, int(_Joint.mjJNT_BALL): 3}.get(int(m.jnt_type[j]))
-    start = int(m.jnt_dofadr[j])
-    return range(start, start + (n or 1))
-
-
 def _dof_entries(field: str) -> Callable[[Any, int], tuple[Entry, ...]]:
     return lambda m, j: tuple(Entry(field, (d,)) for d in dofs(m, j))
-
-
-def is_scalar(m: Any, j: int) -> bool:
-    """Whether joint ``j`` is a hinge or a slide."""
-    return int(m.jnt_type[j]) in (int(_Joint.mjJNT_HINGE), int(_Joint.mjJNT_SLIDE))
-
-
-def scalar_dofs(m: Any) -> dict[int, tuple[int, int]]:
-    """(place in qpos, place in qvel) of hinges and slides, by joint."""
-    return {
-        j: (int(m.jnt_qposadr[j]), int(m.jnt_dofadr[j]))
-        for j in range(m.njnt)
-        if is_scalar(m, j)
-    }
-
-
-def scalar_places(m: Any) -> np.ndarray:
-    """Places in ``qpos`` and in ``qvel`` of hinges and slides, ``(k, 2)``."""
-    return np.array([*scalar_dofs(m).values()], int).reshape(-1, 2)
-
-
-def joint_name(m: Any, j: int) -> str:
-    """A joint's name, or its number."""
-    return m.joint(j).name or f"joint{j}"
 
 
 def actuator_name(m: Any, a: int) -> str:
@@ -307,10 +278,6 @@ def _refuse_mass(m: Any, b: int) -> str | None:
     if m.body_mass[b] <= 0:
         return Inert("it has no mass in the model, so its inertia cannot be scaled")
     return None
-
-
-def _inertia_entries(m: Any, b: int) -> tuple[Entry, ...]:
-    return tuple(Entry("body_inertia", (b, k)) for k in range(3))
 
 
 def _com_entries(axis: int) -> Callable[[Any, int], tuple[Entry, ...]]:

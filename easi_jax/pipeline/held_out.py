@@ -14,13 +14,6 @@ OPEN_LOOP = 0.2  # s
 TRAJECTORIES = 20
 
 
-def relative_errors(
-    simulator: Any, model: Any, pieces: Segments, speed_limit: Any
-) -> jax.Array:
-    """`errors_by_step` at the end of each piece, ``(2 nv,)``."""
-    return errors_by_step(simulator, model, pieces, speed_limit)[-1]
-
-
 def errors_by_step(
     simulator: Any, model: Any, pieces: Segments, speed_limit: Any
 ) -> jax.Array:

@@ -232,7 +232,9 @@ class Pipeline:
                 env.episode_length,
                 self.simulator.past_steps,
             )
-            return measured(trajectories, self.noise, k_noise)
+            return measured(
+                trajectories, self.noise, k_noise, self.simulator.configuration
+            )
 
         return jax.lax.map(one, (policies, keys))
 

@@ -290,17 +290,6 @@ class Search:
         state, losses = jax.lax.scan(update, state, keys)
         return state, losses[-1]
 
-    def simulated_states(self, state: SearchState, data: SearchData, key: Any) -> Any:
-        """What one generation simulates and nothing else, for timing.
-
-        Uniform individuals; the last positions, ``(N, M, nq)``.
-        """
-        shape = (self.config.population, self.space.size)
-        unit = jax.random.uniform(key, shape)
-        simulate = self._replay if self.config.source == "replay" else self._roll
-        theta, center = self.space.to_si(unit), self.space.to_si(state.mean)
-        return simulate(data, theta, center, key)[2].next_qpos[..., -1, :]
-
     # -- simulation ----------------------------------------------------------
 
     def _simulate(
@@ -361,8 +350,7 @@ class Search:
         (qpos, qvel), reference = (
             jax.tree.map(lambda x, s=s: x[s], out) for s in (slice(n), n)
         )
-        if seg.qpos.shape[1] == nv:
-            qpos = qpos + noise[..., :nv]
+        qpos = self.simulator.move(qpos, noise[..., :nv])
         tile = lambda x: jnp.broadcast_to(x, (n, *x.shape))  # noqa: E731
         fake = Segments(
             qpos=tile(seg.qpos),
@@ -414,7 +402,7 @@ class Search:
         nv = self.simulator.mj_model.nv
         return dataclasses.replace(
             seg,
-            qpos=jax.vmap(self.simulator.move)(seg.qpos, z[:, :nv]),
+            qpos=self.simulator.move(seg.qpos, z[:, :nv]),
             qvel=seg.qvel + z[:, nv:],
         )
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from easi_jax.data.segments import Segments
+from easi_jax.model.joint_space import Configuration
 from easi_jax.simulation.env import Env
 
 Act = Callable[[jax.Array, jax.Array], jax.Array]
@@ -88,12 +89,17 @@ def collect(
     )
 
 
-def measured(trajectories: Segments, noise: jax.Array, key: jax.Array) -> Segments:
+def measured(
+    trajectories: Segments,
+    noise: jax.Array,
+    key: jax.Array,
+    configuration: Configuration,
+) -> Segments:
     """What sensors would have recorded of trajectories ``(B, T, 1, ...)``.
 
     Noise ``(2 nv,)`` [standard deviations of positions and velocities] is drawn once
-    per row: the end of a step and the start of the next are one measurement.
-    Positions of free and ball joints stay as they are.
+    per row: the end of a step and the start of the next are one measurement. That of
+    an orientation is a rotation vector.
     """
     t = trajectories
     b, steps = t.weight.shape
@@ -101,12 +107,12 @@ def measured(trajectories: Segments, noise: jax.Array, key: jax.Array) -> Segmen
     z = noise * jax.random.normal(key, (b, steps + 1, 2 * nv))
     pos, vel = z[..., :nv], z[..., nv:]
     start, end = slice(0, steps), slice(1, steps + 1)
-    moved = t.qpos.shape[-1] == nv
+    move = configuration.integrate
     return Segments(
-        qpos=t.qpos + pos[:, start] if moved else t.qpos,
+        qpos=move(t.qpos, pos[:, start]),
         qvel=t.qvel + vel[:, start],
         ctrl=t.ctrl,
-        next_qpos=t.next_qpos + pos[:, end, None] if moved else t.next_qpos,
+        next_qpos=move(t.next_qpos, pos[:, end, None]),
         next_qvel=t.next_qvel + vel[:, end, None],
         weight=t.weight,
         past=t.past,

@@ -8,16 +8,15 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco.mjx._src import math
 
 from easi_jax.data.recording import physics_steps
 from easi_jax.devices.runtime import on_cpu
 from easi_jax.errors import UserError
 from easi_jax.model import effects
 from easi_jax.model.addresses import describe
+from easi_jax.model.joint_space import Configuration, tangent_names
 from easi_jax.model.mjx_model import Model, Sense, put_model, with_parameters
 from easi_jax.model.parameters import ParameterSpace
-from easi_jax.model.quantities import is_scalar, joint_name
 from easi_jax.model.torque_speed import TorqueSpeed
 from easi_jax.simulation.step import WRITTEN_OUT, Physics, at_rest, control_step
 
@@ -160,19 +159,13 @@ class Simulator:
     @cached_property
     def state_names(self) -> tuple[str, ...]:
         """Names of the ``2 nv`` entries of `difference`: positions, velocities."""
-        m = self.mj_model
-        pos, vel = [], []
-        for j in range(m.njnt):
-            name = joint_name(m, j)
-            n = {0: 6, 1: 3}.get(int(m.jnt_type[j]), 1)
-            ends = [""] if n == 1 else [f".{i}" for i in range(n)]
-            pos += [f"qpos.{name}{e}" for e in ends]
-            vel += [f"qvel.{name}{e}" for e in ends]
-        return (*pos, *vel)
+        names = tangent_names(self.mj_model)
+        return tuple(f"{kind}.{name}" for kind in ("qpos", "qvel") for name in names)
 
     @cached_property
-    def _hinge_only(self) -> bool:
-        return all(is_scalar(self.mj_model, j) for j in range(self.mj_model.njnt))
+    def configuration(self) -> Configuration:
+        """Where numbers and quaternions lie in the positions."""
+        return Configuration.of(self.mj_model)
 
     def difference(
         self,
@@ -181,64 +174,19 @@ class Simulator:
         qpos_b: jax.Array,
         qvel_b: jax.Array,
     ) -> jax.Array:
-        """State b minus state a, ``(2 nv,)``: positions in the tangent space
+        """State b minus state a, ``(..., 2 nv)``: positions in the tangent space
         (rotation vectors for free and ball joints), then velocities.
 
         Hinges are subtracted as they are: simulated angles do not wrap.
         """
-        dq = qpos_b - qpos_a if self._hinge_only else self._tangent(qpos_a, qpos_b)
-        return jnp.concatenate([dq, qvel_b - qvel_a])
+        dq = self.configuration.difference(qpos_a, qpos_b)
+        return jnp.concatenate([dq, qvel_b - qvel_a], -1)
 
     def move(self, qpos: jax.Array, tangent: jax.Array) -> jax.Array:
-        """Positions ``(nq,)`` moved by a tangent vector ``(nv,)``."""
-        if self._hinge_only:
-            return qpos + tangent
-        m, out = self.mj_model, []
-        for j in range(m.njnt):
-            a, v, kind = int(m.jnt_qposadr[j]), int(m.jnt_dofadr[j]), int(m.jnt_type[j])
-            if kind == 0:
-                out += [qpos[a : a + 3] + tangent[v : v + 3]]
-                a, v = a + 3, v + 3
-            if kind <= 1:
-                out += [_turned(qpos[a : a + 4], tangent[v : v + 3])]
-            else:
-                out += [qpos[a : a + 1] + tangent[v : v + 1]]
-        return jnp.concatenate(out)
-
-    def _tangent(self, qa: jax.Array, qb: jax.Array) -> jax.Array:
-        m, out = self.mj_model, []
-        for j in range(m.njnt):
-            a, kind = int(m.jnt_qposadr[j]), int(m.jnt_type[j])
-            if kind == 0:
-                out += [qb[a : a + 3] - qa[a : a + 3]]
-                a += 3
-            if kind <= 1:
-                out += [_rotation_between(qa[a : a + 4], qb[a : a + 4])]
-            else:
-                out += [qb[a : a + 1] - qa[a : a + 1]]
-        return jnp.concatenate(out)
+        """Positions ``(..., nq)`` moved by tangent vectors ``(..., nv)``."""
+        return self.configuration.integrate(qpos, tangent)
 
 
 def _steps(x: float) -> int:
     """Whole steps that cover ``x`` of them, up to rounding."""
     return int(np.ceil(x - 1e-6))
-
-
-def _turned(quat: jax.Array, vector: jax.Array) -> jax.Array:
-    # Exponential map with its slope at zero, which `math.quat_integrate` lacks.
-    n2 = vector @ vector
-    n = jnp.sqrt(jnp.where(n2 > 1e-16, n2, 1.0))
-    scale = jnp.where(n2 > 1e-16, jnp.sin(n / 2) / n, 0.5)
-    real = jnp.where(n2 > 1e-16, jnp.cos(n / 2), 1.0)
-    return math.quat_mul(quat, jnp.concatenate([real[None], scale * vector]))
-
-
-def _rotation_between(qa: jax.Array, qb: jax.Array) -> jax.Array:
-    """Rotation vector from unit quaternion a to b (w x y z), in a's frame [rad]."""
-    wa, va, wb, vb = qa[0], qa[1:], qb[0], qb[1:]
-    w = wa * wb + va @ vb
-    v = wa * vb - wb * va - jnp.cross(va, vb)
-    v = jnp.where(w < 0, -v, v)
-    n2 = v @ v
-    n = jnp.sqrt(jnp.where(n2 > 1e-16, n2, 1.0))
-    return v * jnp.where(n2 > 1e-16, 2 * jnp.arctan2(n, jnp.abs(w)) / n, 2.0)

@@ -20,7 +20,7 @@ from easi_jax.devices.mesh import own_device
 from easi_jax.model import effects
 from easi_jax.model.backlash import first_rotor
 from easi_jax.model.effects import Effects
-from easi_jax.model.quantities import scalar_places
+from easi_jax.model.joint_space import scalar_places
 from easi_jax.simulation import constraint_solver
 from easi_jax.simulation.cpu.unroll import scalarized
 from easi_jax.simulation.mjx_patches import with_velocity_products

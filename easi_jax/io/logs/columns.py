@@ -8,13 +8,8 @@ from pathlib import Path
 import mujoco
 
 from easi_jax.errors import UserError, nearest
+from easi_jax.model.joint_space import numbered, widths
 
-_COORDINATES = {
-    mujoco.mjtJoint.mjJNT_FREE: (7, 6),
-    mujoco.mjtJoint.mjJNT_BALL: (4, 3),
-    mujoco.mjtJoint.mjJNT_SLIDE: (1, 1),
-    mujoco.mjtJoint.mjJNT_HINGE: (1, 1),
-}
 _CHECKED = ("qpos.", "qvel.", "ctrl.")
 _LISTED = 5
 
@@ -61,9 +56,9 @@ def log_columns(model: mujoco.MjModel) -> LogColumns:
                 f'the model\'s joint {i} (in body "{body}") has no name; '
                 "logs find joints by name"
             )
-        size, dofs = _COORDINATES[mujoco.mjtJoint(int(model.jnt_type[i]))]
-        qpos += _numbered(f"qpos.{joint.name}", size)
-        joints.append(_numbered(f"qvel.{joint.name}", dofs))
+        size, dofs = widths(model, i)
+        qpos += numbered(f"qpos.{joint.name}", size)
+        joints.append(numbered(f"qvel.{joint.name}", dofs))
     if not qpos:
         raise UserError("the model has no joint: there is nothing to log")
     ctrl: list[str] = []
@@ -75,7 +70,7 @@ def log_columns(model: mujoco.MjModel) -> LogColumns:
             )
         ctrl.append(f"ctrl.{name}")
     sensors = {
-        model.sensor(i).name: _numbered(
+        model.sensor(i).name: numbered(
             f"sensor.{model.sensor(i).name}", int(model.sensor_dim[i])
         )
         for i in range(model.nsensor)
@@ -139,9 +134,3 @@ def check_columns(
                 "give all velocities of a joint or none"
             )
     return ignored
-
-
-def _numbered(name: str, size: int) -> tuple[str, ...]:
-    if size == 1:
-        return (name,)
-    return tuple(f"{name}.{i}" for i in range(size))

@@ -64,7 +64,9 @@ def test_the_truth_is_approached_from_a_start_that_excludes_it(
 
 def test_noise_widens_what_is_likely(task: Task, demonstrations: Segments) -> None:
     """DROPO's spread holds what the sensors add; without a floor it would vanish."""
-    noisy = measured(demonstrations, NOISE, jax.random.key(2))
+    noisy = measured(
+        demonstrations, NOISE, jax.random.key(2), task.simulator.configuration
+    )
     method = Dropo(transitions=40)
     found = method.fit(replace(task, noise=NOISE), noisy, BUDGET, jax.random.key(1))
     assert np.abs(log_ratios(task, found)[:2]).max() < 0.4

@@ -47,7 +47,9 @@ def test_sysid_finds_the_truth_where_nothing_is_noisy(
 
 def test_sysid_says_how_sure_it_is(task: Task, demonstrations: Segments) -> None:
     needs_sysid()
-    noisy = measured(demonstrations, NOISE, jax.random.key(2))
+    noisy = measured(
+        demonstrations, NOISE, jax.random.key(2), task.simulator.configuration
+    )
     method = MujocoSysid(pieces=8, horizon=20)
     found = method.fit(replace(task, noise=NOISE), noisy, BUDGET, jax.random.key(1))
     assert np.abs(log_ratios(task, found)[:2]).max() < 0.1
@@ -88,7 +90,9 @@ def test_a_budget_that_buys_no_step_is_refused(
 
 def test_npe_learns_the_posterior(task: Task, demonstrations: Segments) -> None:
     needs("sbi", "torch")()
-    noisy = measured(demonstrations, NOISE, jax.random.key(2))
+    noisy = measured(
+        demonstrations, NOISE, jax.random.key(2), task.simulator.configuration
+    )
     method = NeuralPosterior(pieces=4, horizon=10, density="mdn")
     budget = Budget(16_000)
     found = method.fit(replace(task, noise=NOISE), noisy, budget, jax.random.key(1))

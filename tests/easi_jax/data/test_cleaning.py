@@ -1,6 +1,7 @@
 """Noise, splits and segments of measured runs."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,13 +27,13 @@ from easi_jax.estimation.pieces import segments_from_runs, visible_steps
 from easi_jax.estimation.prediction_error import (
     errors_and_floor,
     misfit_of,
-    open_loop_error,
     outlier_weights,
 )
 from easi_jax.io.logs.reader import read_logs
 from easi_jax.model.found_effects import EffectEntry
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace, declare
+from easi_jax.simulation import open_loop
 from easi_jax.simulation.simulator import Simulator
 
 XML = """<mujoco><option timestep="0.01"/><worldbody><body>
@@ -273,20 +274,23 @@ def test_error_of_the_true_model_is_the_noise_floor(simulator):
     pieces = to_device(segments_from_runs(simulator, [run], 20, 10, fitted=True))
     noise = jnp.asarray(estimate_noise(run), jnp.float32)
     truth = simulator.model(jnp.asarray(simulator.space.nominal, jnp.float32))
-    error = open_loop_error(simulator, truth, pieces)
+
+    def error_of(model: Any, pieces: Any) -> Any:
+        error = open_loop.errors(simulator, model, pieces)[..., :1]
+        return np.sqrt(np.mean(error**2, (0, 1)))
+
+    error = error_of(truth, pieces)
     odd = pieces.take(slice(1, None, 2))
     key = jax.random.key(0)
     same, on_odd, floor = errors_and_floor(simulator, truth, pieces, odd, noise, key)
     np.testing.assert_allclose(error, floor, rtol=0.15)
     np.testing.assert_allclose(same, error, rtol=1e-4)
-    np.testing.assert_allclose(
-        on_odd, open_loop_error(simulator, truth, odd), rtol=1e-4
-    )
-    wrong = open_loop_error(simulator, simulator.model(jnp.asarray([5.0])), pieces)
+    np.testing.assert_allclose(on_odd, error_of(truth, odd), rtol=1e-4)
+    wrong = error_of(simulator.model(jnp.asarray([5.0])), pieces)
     assert float(wrong[0]) > 2 * float(error[0])
     first = rows_of(run, 0, 21)
     one = to_device(segments_from_runs(simulator, [first], 20, 20, fitted=True))
-    again = open_loop_error(simulator, truth, one)
+    again = error_of(truth, one)
     assert one.count == 1
     assert float(again[0]) < 5 * float(error[0])
 

@@ -1,4 +1,4 @@
-"""Windows and transitions against analytic motions."""
+"""Windows and fitted velocities against analytic motions."""
 
 import dataclasses
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from easi_jax.data.recording import Run, physics_steps
-from easi_jax.data.windows import fitted_velocity, make_windows, transitions
+from easi_jax.data.windows import fitted_velocity, make_windows
 from easi_jax.io.logs.reader import read_logs
 from easi_jax.model.joint_space import Configuration
 
@@ -138,18 +138,11 @@ def test_nothing_looks_across_the_end_of_a_run(tmp_path, model):
     calm, wild = read(np.zeros((30, 3))), read(rng.normal(size=(30, 3)) * 50)
     assert [run.name for run in calm] == ["log/1", "log/2"]
     np.testing.assert_array_equal(calm[0].qvel, wild[0].qvel)
-    for a, b in zip(transitions(calm[0]), transitions(wild[0]), strict=True):
-        np.testing.assert_array_equal(a, b)
     for a, b in zip(
         make_windows(calm[0], 0.1), make_windows(wild[0], 0.1), strict=True
     ):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(calm[1].qvel, np.zeros((30, 7)))
-    pairs = transitions(calm[0])
-    assert pairs.qpos.shape == (29, 8)
-    np.testing.assert_array_equal(pairs.next_qpos, calm[0].qpos[1:])
-    np.testing.assert_array_equal(pairs.next_qvel, calm[0].qvel[1:])
-    np.testing.assert_array_equal(pairs.ctrl[:, 0], np.arange(29.0))
 
 
 @pytest.mark.parametrize(

@@ -13,12 +13,14 @@ from benchmarks.rigs import RIGS
 from easi_jax.data.segments import Segments, cut, to_device, windows
 from easi_jax.estimation.identifiability import identifiability
 from easi_jax.estimation.levenberg_marquardt import RefineResult, jumps, refine
+from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace, declare
 from easi_jax.simulation import rollout
 from easi_jax.simulation.simulator import Simulator
 from envs.cartpole import Cartpole
 
 NOISE = jnp.array([5e-4, 2e-3, 1e-2, 2e-2])
+CARTPOLE = Configuration(2, 2, (0, 1), (0, 1), ())
 WEIGHED = ("pole_length", "pole_mass", "cart_mass")
 
 
@@ -70,7 +72,7 @@ def test_recovers_the_truth_without_noise(
 def test_is_as_good_as_the_cramer_rao_bound(
     fit: Any, start: jax.Array, space: ParameterSpace, trajectories: Segments
 ) -> None:
-    seen = rollout.measured(trajectories, NOISE, jax.random.key(7))
+    seen = rollout.measured(trajectories, NOISE, jax.random.key(7), CARTPOLE)
     out = fit(start, windows(seen, 10, 10), NOISE)
     known = identifiability(space, np.asarray(out.hessian))
     error = np.log(np.asarray(space.to_si(out.unit)) / space.nominal)
@@ -86,7 +88,7 @@ def test_is_as_good_as_the_cramer_rao_bound(
 def test_the_best_of_several_starts_is_the_result(
     fit: Any, start: jax.Array, trajectories: Segments
 ) -> None:
-    seen = rollout.measured(trajectories, NOISE, jax.random.key(7))
+    seen = rollout.measured(trajectories, NOISE, jax.random.key(7), CARTPOLE)
     pieces = windows(seen, 10, 10)
     lost = start + jnp.where(jnp.arange(start.size) % 2, 3.0, -3.0)
     alone, good = fit(lost, pieces, NOISE), fit(start, pieces, NOISE)
@@ -127,7 +129,9 @@ def test_a_value_lost_near_zero_comes_back(
     depth: float,
 ) -> None:
     """Its slope is next to nothing there, and the steps of all others count on its."""
-    pieces = windows(rollout.measured(trajectories, NOISE, jax.random.key(7)), 10, 10)
+    pieces = windows(
+        rollout.measured(trajectories, NOISE, jax.random.key(7), CARTPOLE), 10, 10
+    )
     i = space.names.index("pole_friction")
     lost = start.at[i].add(-depth / space.log_width[i])
     good, found = fit(start, pieces, NOISE), fit(lost, pieces, NOISE)
@@ -147,7 +151,9 @@ def test_a_limit_that_was_not_met_is_not_known(met: bool) -> None:
     clean = jax.jit(lambda k: rig.record(rig.simulator, theta, k, 16, 1.0))(
         jax.random.key(0)
     )
-    seen = rollout.measured(clean, jnp.asarray(rig.noise), jax.random.key(9))
+    seen = rollout.measured(
+        clean, jnp.asarray(rig.noise), jax.random.key(9), rig.simulator.configuration
+    )
     pieces = windows(seen, 25, 26)
     start = space.to_unit(theta).at[i].add(-0.5)
     run = jax.jit(
@@ -202,7 +208,7 @@ def test_a_limit_that_few_pieces_meet_is_found(
         runs = rollout.collect(
             *(cartpole, model, controller, k_run, 50, cartpole.episode_length)
         )
-        seen = rollout.measured(runs, NOISE, k_noise)
+        seen = rollout.measured(runs, NOISE, k_noise, simulator.configuration)
         few = jnp.append(jnp.arange(14), 43)  # the fastest of fifty among them
         return windows(jax.tree.map(lambda x: x[few], seen), 25, 26)
 
@@ -242,7 +248,9 @@ def test_few_pieces_do_not_hold_up_the_rest(
         runs = rollout.collect(
             *(cartpole, model, controller, k_run, 50, cartpole.episode_length)
         )
-        pieces = windows(rollout.measured(runs, NOISE, k_noise), 25, 26)
+        pieces = windows(
+            rollout.measured(runs, NOISE, k_noise, simulator.configuration), 25, 26
+        )
         fit = [refine(simulator, space, u, pieces, NOISE) for u in (truth, found)]
         return fit[0].cost[-1], fit[1].cost[-1]
 

@@ -26,7 +26,7 @@ NAMES = ["pole_armature", "cart_kp", "cart_kv", "cart_force_limit", "cart_speed_
 def problem(cartpole: Cartpole, trajectories: Segments) -> Any:
     space = cartpole.space.select(NAMES)
     simulator = Simulator(cartpole.mj_model, space, cartpole.dt)
-    noisy = measured(trajectories, NOISE, jax.random.key(3))
+    noisy = measured(trajectories, NOISE, jax.random.key(3), simulator.configuration)
     return simulator, space, windows(noisy, 10, 10)
 
 

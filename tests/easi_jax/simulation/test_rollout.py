@@ -4,10 +4,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 from easi_jax.data.segments import Segments
+from easi_jax.model.joint_space import Configuration
 from easi_jax.simulation import rollout
 from easi_jax.simulation.env import EnvState
 from easi_jax.simulation.step import Physics
@@ -90,7 +92,8 @@ def test_trajectories_are_independent(ended: Segments) -> None:
 
 def test_noise_is_drawn_once_per_row(ended: Segments) -> None:
     noise = jnp.array([0.5, 2.0])
-    seen = rollout.measured(ended, noise, jax.random.key(3))
+    joints = Configuration(1, 1, (0,), (0,), ())
+    seen = rollout.measured(ended, noise, jax.random.key(3), joints)
     dq = np.asarray(seen.qpos - ended.qpos)[..., 0]
     dv = np.asarray(seen.qvel - ended.qvel)[..., 0]
     dq_next = np.asarray(seen.next_qpos - ended.next_qpos)[..., 0, 0]
@@ -101,3 +104,32 @@ def test_noise_is_drawn_once_per_row(ended: Segments) -> None:
     assert dv.std() == pytest.approx(2.0, rel=0.15)
     assert abs(np.corrcoef(dq[:, :-1].ravel(), dq_next[:, :-1].ravel())[0, 1]) < 0.2
     np.testing.assert_array_equal(seen.ctrl, ended.ctrl)
+
+
+def test_noise_on_a_free_joint_is_a_rotation_vector() -> None:
+    """Unit quaternions stay, and off by the stated deviations; hinges get theirs."""
+    m = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><freejoint/><geom size=".1"/><body>'
+        '<joint/><geom size=".1"/></body></body></worldbody></mujoco>'
+    )
+    joints = Configuration.of(m)
+    rng = np.random.default_rng(0)
+    qpos = rng.normal(size=(30, 41, m.nq))
+    qpos[..., 3:7] /= np.linalg.norm(qpos[..., 3:7], axis=-1, keepdims=True)
+    truth = Segments(
+        qpos=jnp.asarray(qpos[:, :-1]),
+        qvel=jnp.zeros((30, 40, m.nv)),
+        ctrl=jnp.zeros((30, 40, 1, 0)),
+        next_qpos=jnp.asarray(qpos[:, 1:, None]),
+        next_qvel=jnp.zeros((30, 40, 1, m.nv)),
+        weight=jnp.ones((30, 40)),
+    )
+    std = np.array([0.1, 0.2, 0.3, 0.01, 0.02, 0.05, 0.4, *[0.0] * m.nv])
+    seen = rollout.measured(truth, jnp.asarray(std), jax.random.key(0), joints)
+    np.testing.assert_allclose(
+        np.linalg.norm(seen.qpos[..., 3:7], axis=-1), 1.0, atol=1e-6
+    )
+    off = joints.difference(truth.qpos, seen.qpos)
+    np.testing.assert_allclose(np.std(off, (0, 1)), std[: m.nv], rtol=0.1)
+    # The end of a step and the start of the next are one measurement.
+    np.testing.assert_allclose(seen.qpos[:, 1:], seen.next_qpos[:, :-1, 0], atol=1e-6)
