@@ -21,6 +21,8 @@ PAGES = sorted((ROOT / "docs").glob("*.md"))
 DOCUMENTS = [
     ROOT / "README.md",
     *PAGES,
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "CHANGELOG.md",
     *sorted((ROOT / "examples").rglob("*.md")),
     ROOT / "benchmarks" / "results" / "README.md",
 ]
