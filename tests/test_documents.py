@@ -102,6 +102,27 @@ def test_equations_become_mathml() -> None:
     assert out.count("<math") == 2 and "<mfrac>" in out and "$" not in out
 
 
+_NUMBER = re.compile(r"(?<![\w.])-?\d+(?:[.,]\d+)*%?(?![\w%])")
+
+
+def section(text: str, title: str, mark: str = "## ") -> str:
+    """What stands below a heading, up to the next of its rank."""
+    return text.split(f"\n{mark}{title}\n")[1].split(f"\n{mark}")[0]
+
+
+@pytest.mark.parametrize("page", ["README.md", "benchmarks/results/SUMMARY.md"])
+def test_results_are_those_that_were_measured(page: str) -> None:
+    """Every figure of a summary stands in the page made from the committed files."""
+    results = (ROOT / "benchmarks" / "results" / "README.md").read_text()
+    measured = set(_NUMBER.findall(results.split("\n## Speed\n")[1]))
+    title = "Results" if page == "README.md" else "Summary"
+    told = section("\n" + (ROOT / page).read_text(), title)
+    text = re.sub(r"`[^`]*`|\]\([^)]*\)|^\d+\. ", "", told, flags=re.M)
+    unknown = [n for n in _NUMBER.findall(text) if n not in measured]
+    assert len(_NUMBER.findall(text)) > 25
+    assert not unknown, f"not among the committed results: {unknown}"
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(
     importlib.util.find_spec("mkdocstrings") is None, reason="needs the extra docs"
