@@ -135,7 +135,7 @@ class Pipeline:
         if config.noise and len(config.noise) != 2 * nv:
             raise UserError(
                 f"noise has {len(config.noise)} numbers: {env.name} needs {2 * nv}, "
-                f"for {', '.join(env.machine.state_names)}"
+                f"for {', '.join(env.simulator.state_names)}"
             )
         self.env, self.config, self.mesh = env, config, mesh or make_mesh()
         self.real = env if real is None else real

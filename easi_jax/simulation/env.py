@@ -6,6 +6,8 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from easi_jax.model.checks import checked_array
+
 Model = Any
 
 
@@ -56,6 +58,19 @@ class Env(Protocol):
     def control(self, state: EnvState, action: jax.Array) -> jax.Array:
         """What ``step`` would send to the actuators, ``(nu,)``."""
         ...
+
+
+def bound_model(env: Any, theta: Any = None) -> Model:
+    """The model of ``env`` at ``theta (n,)``, SI units; nominal where None.
+
+    Raises:
+        UserError: ``theta`` of another size, or not finite.
+    """
+    given = env.space.nominal if theta is None else theta
+    names = ", ".join(env.space.names)
+    values = checked_array("theta", given, (env.space.size,), names)
+    # Compiled: one by one, its many small operations take a minute.
+    return jax.jit(env.model)(jnp.asarray(values, jnp.result_type(float)))
 
 
 def start(physics: Any, obs: jax.Array, memory: Any = ()) -> EnvState:
