@@ -85,7 +85,7 @@ def fuzz(
     and the first ``failures``."""
     found = {name: _Counts() for name, _ in jobs}
     with tempfile.TemporaryDirectory() as place:
-        left = [(name, count, 0) for name, count in jobs]
+        left: list[tuple[str, int, int]] = [(name, count, 0) for name, count in jobs]
         while left:
             at = (left[0][0], left[0][2])  # where a process that hangs or ends was
             for told in _process(left, seed, limit, place):
@@ -100,7 +100,7 @@ def fuzz(
                     found[name].add(i, *rest)
                     at = (name, i + 1)
             if left:
-                left[0] = (*left[0][:2], at[1] + 1)
+                left[0] = (left[0][0], left[0][1], at[1] + 1)
     return [c.result(name) for name, c in found.items()]
 
 

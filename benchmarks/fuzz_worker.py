@@ -102,7 +102,7 @@ def drawn(strategy: Any, count: int, seed: int) -> list[Case]:
         max_examples=count,
         database=None,
         deadline=None,
-        suppress_health_check=list(hypothesis.HealthCheck),
+        suppress_health_check=list(hypothesis.HealthCheck),  # pyright: ignore
         phases=[hypothesis.Phase.generate],
     )
     @hypothesis.given(strategy)

@@ -52,9 +52,9 @@ class GapFirst:
             for e in effects.entries
             for k, v in e.columns.items()
         ]
-        machine = simulator_with(task.machine, effects)
+        simulator = simulator_with(task.simulator, effects)
         found = Easi(refine=True).fit(
-            replace(task, machine=machine), demonstrations, budget, key
+            replace(task, simulator=simulator), demonstrations, budget, key
         )
         return own(found, task.space)
 
@@ -66,7 +66,8 @@ class GapFirst:
             parameters, out = place / "parameters.yaml", place / "gap"
             model.write_text(self.xml)
             write_parameter_file(parameters, task.space)
-            write_log(log, task.machine.mj_model, runs(task.machine, demonstrations))
+            rows = runs(task.simulator, demonstrations)
+            write_log(log, task.simulator.mj_model, rows)
             words = ["--model", model, "--data", log, "--parameters", parameters]
             done = subprocess.run(
                 [sys.executable, "-m", "train.gap", *map(str, words), "--out", out],

@@ -67,9 +67,12 @@ def solve(cell: Cell) -> dict[str, Any]:
 
     with tempfile.TemporaryDirectory() as folder:
         case = Path(folder) / "case"
-        drawn = {"effect": cell.effect, "mechanism": cell.mechanism}
         try:
-            draw_case(cell.seed, "single", case, **drawn)
+            draw_case(
+                *(cell.seed, "single", case),
+                effect=cell.effect,
+                mechanism=cell.mechanism,
+            )
         except CaseError as error:
             raise UserError(f"{cell.key}: {error}; give another --seed") from error
         seconds, told = timed(case, Path(folder))

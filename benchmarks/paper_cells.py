@@ -149,7 +149,8 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
 
     bench = _Bench.open(cell, folder)
     begun = time.monotonic()
-    policy, row = bench.policy, {"simulated": 0, "measured": 0}
+    policy = bench.policy
+    row: dict[str, Any] = {"simulated": 0, "measured": 0}
     row["udr"] = read_json(bench.run / "versions.json")["runtime"]["device_kind"]
     if cell.method in identifiers():
         policy, found = bench.identified(begun)

@@ -145,10 +145,11 @@ class _Cost:
 
     def _counted(self, convert: Callable[..., Any]) -> Callable[..., Any]:
         import jax
+        from jax.core import Tracer
 
         @functools.wraps(convert)
         def call(value: Any, *args: Any, **options: Any) -> Any:
-            if isinstance(value, jax.Array) and not isinstance(value, jax.core.Tracer):
+            if isinstance(value, jax.Array) and not isinstance(value, Tracer):
                 self._count(value)
             return convert(value, *args, **options)
 
@@ -158,9 +159,9 @@ class _Cost:
         self._transfers += 1
         self._bytes += array.nbytes
 
-    def _lasted(self, event: str, seconds: float, **_: Any) -> None:
+    def _lasted(self, event: str, duration_secs: float, **_: Any) -> None:
         if event.startswith("/jax/core/compile/"):
-            self._compile_s += seconds
+            self._compile_s += duration_secs
             self._programs += event.endswith("backend_compile_duration")
 
     def told(self) -> dict[str, Any]:

@@ -111,7 +111,7 @@ class Rig:
         time = self.simulator.dt * jnp.arange(STEPS)[:, None, None]
         sines = jnp.sin(2 * jnp.pi * rate * time + phase).mean(1)
         noise = std * jax.random.normal(k_noise, (STEPS, len(self.home)))
-        ctrl = self.home + self.reach * sines + noise
+        ctrl = jnp.asarray(self.home + self.reach * sines + noise)
 
         def step(state: Any, u: jax.Array) -> Any:
             new = simulator.step(model, state, u)

@@ -211,11 +211,12 @@ def _buffer(config: Config, env: Any, label: str) -> None:
 
     from easi_jax.io.runs import checkpoints
     from easi_jax.pipeline.stages import Pipeline, PipelineConfig, seed_keys, stage_keys
+    from easi_jax.rl.config import SacConfig
     from easi_jax.rl.presets import training_preset
 
-    training = dataclasses.replace(
-        training_preset(env, "sac"), env_steps=BUFFER, buffer_size=BUFFER
-    )
+    preset = training_preset(env, "sac")
+    assert isinstance(preset, SacConfig)
+    training = dataclasses.replace(preset, env_steps=BUFFER, buffer_size=BUFFER)
     pipe = Pipeline(env, PipelineConfig(training=training))
     keys = stage_keys(seed_keys(list(config.seeds[:1])))
     wide = pipe.spread(pipe.udr(), 1)

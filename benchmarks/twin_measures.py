@@ -50,7 +50,9 @@ def tracking(twin: Any, policy: Any, seed: int) -> dict[str, Any]:
     commands = np.repeat(COMMANDS, episodes)
     start = commanded(twin.env, commands)
     got = play(twin, policy, seed, len(commands), steps, True, start)
-    rotation = np.asarray(jax.vmap(jax.vmap(matrix))(got.true_qpos[..., 3:7]))
+    rotation = np.asarray(
+        jax.vmap(jax.vmap(matrix))(jnp.asarray(got.true_qpos[..., 3:7]))
+    )
     forward = np.einsum("btw,btw->bt", rotation[..., 0], got.true_qvel[..., :3])
     speed = forward[:, settled:].mean(1).reshape(-1, episodes)
     stood = ~got.fallen.reshape(-1, episodes)

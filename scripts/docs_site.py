@@ -33,7 +33,10 @@ def on_files(files: Any, *, config: Any) -> Any:
 
 
 def _add(files: Any, config: Any, root: Path, name: str) -> None:
-    from mkdocs.structure.files import File, InclusionLevel
+    from mkdocs.structure.files import (  # pyright: ignore[reportMissingImports]
+        File,
+        InclusionLevel,
+    )
 
     if files.get_file_from_path(name) is None:
         found = str(root / name)
@@ -52,7 +55,9 @@ def equations(text: str) -> str:
     """MathML in the place of ``$$...$$`` and ``$...$``."""
     if "$" not in text:
         return text
-    from latex2mathml.converter import convert
+    from latex2mathml.converter import (  # pyright: ignore[reportMissingImports]
+        convert,
+    )
 
     def display(found: re.Match[str]) -> str:
         return f"<div>{convert(found[1].strip(), display='block')}</div>"

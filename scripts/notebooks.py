@@ -65,9 +65,9 @@ def _packages() -> tuple[Any, Any, Any]:
     from easi_jax.errors import UserError
 
     try:
-        import jupytext
-        import nbclient
-        import nbformat
+        import jupytext  # pyright: ignore[reportMissingImports]
+        import nbclient  # pyright: ignore[reportMissingImports]
+        import nbformat  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise UserError(
             f"{error.name} is not installed: pip install -e '.[notebooks]'"

@@ -12,7 +12,9 @@ import numpy as np
 
 def write(episodes: Path, folder: Path, fps: int) -> None:
     """``episodes``: NPZ of ``state`` (E, N, 2) and ``action`` (E, N, 1), float32."""
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.datasets.lerobot_dataset import (  # pyright: ignore[reportMissingImports]
+        LeRobotDataset,
+    )
 
     names = {"observation.state": ["slider.pos", "pole.pos"], "action": ["slider.pos"]}
     features = {

@@ -212,8 +212,9 @@ def written_by_minari(name: str, episodes: int = 2) -> None:
 
     _, qpos, qvel, ctrl = motion()
     box = gymnasium.spaces.Box
+    several: Any = EpisodeBuffer  # its hints know lists and trees of arrays alone
     buffer = [
-        EpisodeBuffer(
+        several(
             id=episode,
             observations=np.concatenate([qpos, qvel], 1),
             actions=ctrl[:-1, None] + episode,

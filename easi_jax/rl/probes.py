@@ -99,6 +99,10 @@ class Probe:
             count=jnp.zeros((), jnp.int32),
         )
 
+    def control(self, state: EnvState, action: jax.Array) -> jax.Array:
+        """Nothing lies between an action and the task."""
+        return action
+
     def step(self, model: ProbeModel, state: EnvState, action: jax.Array) -> EnvState:
         """One step; never resets."""
         obs, count = state.obs[0], state.count + 1

@@ -50,7 +50,7 @@ def runs(request: pytest.FixtureRequest) -> Runs:
         simulator = converged(env)
         first = env.reset(env.model(), jax.random.key(2)).physics
         start = case.start or (first.qpos, first.qvel)
-        start = tuple(np.asarray(x, float) for x in start)
+        qpos, qvel = (np.asarray(x, float) for x in start)
 
         @jax.jit
         def simulate(thetas: jax.Array, ctrl: jax.Array) -> jax.Array:
@@ -61,15 +61,14 @@ def runs(request: pytest.FixtureRequest) -> Runs:
                     state = simulator.step(model, state, u)
                     return state, jnp.concatenate([state.qpos, state.qvel])
 
-                return jax.lax.scan(
-                    step, simulator.start(*map(jnp.asarray, start)), ctrl
-                )[1]
+                first = simulator.start(jnp.asarray(qpos), jnp.asarray(qvel))
+                return jax.lax.scan(step, first, ctrl)[1]
 
             return jax.vmap(one)(thetas)
 
         ours = np.asarray(simulate(jnp.asarray(thetas), jnp.asarray(ctrl)))
     theirs = [
-        c_rollout(env, dict(zip(env.space.names, t, strict=True)), start, ctrl)
+        c_rollout(env, dict(zip(env.space.names, t, strict=True)), (qpos, qvel), ctrl)
         for t in thetas
     ]
     return Runs(env, thetas, ours, np.array(theirs))

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import cast
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import onnxruntime
 import pytest
 import yaml
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from easi_jax.errors import UserError
 from easi_jax.io.report.video import render
@@ -182,7 +183,7 @@ def test_evaluate_draws_an_episode(chain: Path, tmp_path: Path) -> None:
     out = tmp_path / "run.gif"
     command(evaluate, "--run", chain / "easi", "--episodes", 2, "--render", out)
     with Image.open(out) as image:
-        assert image.n_frames > 10
+        assert len([*ImageSequence.Iterator(image)]) > 10
 
 
 @pytest.mark.slow
@@ -278,10 +279,12 @@ def test_export_writes_all_that_a_run_has(chain: Path, tmp_path: Path, capsys) -
 
     policy = load_policies(chain / "easi")["policies"]
     obs = np.random.default_rng(0).normal(0, 0.2, (100, 4)).astype(np.float32)
-    want = act(jax.tree.map(lambda x: x[0], policy), obs, deterministic=True)
+    want = act(
+        jax.tree.map(lambda x: x[0], policy), jnp.asarray(obs), deterministic=True
+    )
     session = onnxruntime.InferenceSession(out / "policy.onnx")
     got = session.run(["action"], {"observation": obs})[0]
-    np.testing.assert_allclose(got, want, atol=1e-5)
+    np.testing.assert_allclose(np.asarray(got), want, atol=1e-5)
 
 
 def test_export_of_a_policy_alone(chain: Path, tmp_path: Path) -> None:

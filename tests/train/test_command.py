@@ -199,7 +199,7 @@ def test_an_ignored_signal_stays_ignored(tmp_path):
 def test_progress_without_terminal_is_plain_lines(capsys, monkeypatch):
     monkeypatch.setattr(_command, "LOG_SECONDS", 0.0)
     with progress("search", total=4) as shown:
-        shown.advance(2, fitness=np.float32(1.23456), non_finite=3)
+        shown.advance(2, fitness=np.float32(1.23456).item(), non_finite=3)
         shown.advance(2)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2

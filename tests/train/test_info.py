@@ -92,6 +92,7 @@ def test_a_batch_of_simulations_runs_in_one_piece():
 
     program = go.lower(batch, jnp.zeros(simulator.mj_model.nu))
     text = program.compile(runtime.fast_loops()).as_text()
+    assert text is not None
     assert "xla_cpu_small_call" in text
 
 
@@ -121,7 +122,10 @@ def test_larger_loops_run_in_one_piece_where_asked_in_time(before, size, one_pie
     env = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
     done = subprocess.run(
         [sys.executable, "-c", _LOOP.format(before=before, size=size)],
-        **dict(capture_output=True, text=True, timeout=120, cwd=ROOT),
+        capture_output=True,
+        text=True,
+        timeout=120,
+        cwd=ROOT,
         env=env,
         check=True,
     )

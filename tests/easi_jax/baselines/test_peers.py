@@ -108,7 +108,7 @@ def test_summary_is_of_all_steps_that_count(
     task: Task, demonstrations: Segments
 ) -> None:
     pieces = some_pieces(task, demonstrations, 10, 4)
-    pieces = pieces.replace(weight=pieces.weight.at[0].set(0.0))
+    pieces = replace(pieces, weight=pieces.weight.at[0].set(0.0))
     noise = jnp.zeros((4, 10, 4))
     got = summary(task.simulator, pieces, pieces.next_qpos, pieces.next_qvel, noise)
     q = np.concatenate([pieces.qpos[:, None], pieces.next_qpos], 1)[1:]

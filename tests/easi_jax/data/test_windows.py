@@ -1,6 +1,7 @@
 """Windows and fitted velocities against analytic motions."""
 
 import dataclasses
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -128,7 +129,9 @@ def test_nothing_looks_across_the_end_of_a_run(tmp_path, model):
         qpos[:, 4] = 1.0
         qpos[:30, :3] = first
         qpos[30:, :3] = second
-        columns = dict(zip(names, [*qpos.T, np.arange(60.0)], strict=True))
+        columns: dict[str, Any] = dict(
+            zip(names, [*qpos.T, np.arange(60.0)], strict=True)
+        )
         time = 0.01 * np.arange(60)
         run = np.repeat([1, 2], 30)
         np.savez(tmp_path / "log.npz", time=time, run=run, **columns)

@@ -81,7 +81,7 @@ def test_is_as_good_as_the_cramer_rao_bound(
     assert np.abs(z).max() < 4
     # Neither far better than the bound: then the bound would be wrong.
     assert np.sqrt(np.mean(z**2)) > 0.2
-    assert not (np.diff(np.asarray(out.cost)) > 0).any()
+    assert not (np.diff(np.asarray(out.cost, float)) > 0).any()
     assert np.abs(out.delta).max() < 6 * float(NOISE.max())
 
 

@@ -165,8 +165,9 @@ def test_errors_of_late_readings_belong_to_what_was_read(
     then, told, now = (c.of_joint(turn)["moving down"] for c in (after, late, found))
     np.testing.assert_array_equal(told, then)
     assert (told != now).any()
-    lift = [c.of_joint(MODEL.joint("lift").id)["moving down"] for c in (late, found)]
-    np.testing.assert_array_equal(*lift)
+    lift = MODEL.joint("lift").id
+    told, now = (c.of_joint(lift)["moving down"] for c in (late, found))
+    np.testing.assert_array_equal(told, now)
     np.testing.assert_array_equal(
         late.positions[:-1, :, 1],
         runs[0].qpos[windows.row[:-1, None] + 3 + np.arange(H + 1), 1],

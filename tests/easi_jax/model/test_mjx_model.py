@@ -254,7 +254,7 @@ def test_forward_derivatives_of_constants() -> None:
 
 
 # type, axis of its length, size, longer size, length, mass before and after
-SHAPES = (
+SHAPES: tuple[tuple[Any, ...], ...] = (
     ("capsule", 2, (0.05, 0.2), (0.05, 0.35), 0.8, 1.5, 0.7),
     ("cylinder", 2, (0.05, 0.2), (0.05, 0.4), 0.8, 1.5, 2.0),
     ("cylinder", 2, (0.05, 0.04), (0.05, 0.4), 0.8, 1.0, 1.3),

@@ -1,5 +1,6 @@
 """One compiled training of all probes, shared by the tests that read it."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -52,7 +53,7 @@ def trained() -> Trained:
     )
     sac = Sac(Probe(), config, bind=lambda theta: theta, draw=lambda dist, key: dist)
     probes = probe_models()
-    probes["broken"] = probes["constant"].replace(constant=jnp.float32(jnp.nan))
+    probes["broken"] = replace(probes["constant"], constant=jnp.float32(jnp.nan))
     dist = jax.tree.map(lambda *x: jnp.stack(x), *probes.values())
     keys = jax.random.split(jax.random.key(0), len(probes))
     start = jax.jit(lambda k, d: init_seeds(sac, k, d, dist_axis=0))(keys, dist)

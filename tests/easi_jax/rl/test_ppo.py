@@ -54,7 +54,7 @@ def ppo() -> Ppo:
 @pytest.fixture(scope="module")
 def trained(ppo: Ppo) -> Trained:
     probes = probe_models()
-    probes["broken"] = probes["constant"].replace(constant=jnp.float32(jnp.nan))
+    probes["broken"] = replace(probes["constant"], constant=jnp.float32(jnp.nan))
     dist = jax.tree.map(lambda *x: jnp.stack(x), *probes.values())
     keys = jax.random.split(jax.random.key(0), len(probes))
     start = jax.jit(lambda k, d: init_seeds(ppo, k, d, dist_axis=0))(keys, dist)

@@ -115,7 +115,7 @@ def test_memory_keeps_the_newest(trained):
     assert set(np.unique(rows.observation)) == {2.0, 3.0, 4.0}
 
 
-class Counter:
+class Counter(Probe):
     """Observes how many steps it has done."""
 
     name = "counter"

@@ -1,5 +1,7 @@
 """Seeds at once, alone, in chunks and on fewer devices: the same training."""
 
+from dataclasses import replace
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -104,7 +106,7 @@ def test_evaluate_returns_one_episode_per_environment(trained):
     np.testing.assert_array_equal(batched, [1.0, 1.0, 1.0])
     one = evaluate(env, probes["observation"], policy, act, split(key, 16))
     assert set(np.unique(one)) == {-1.0, 1.0}
-    broken = probes["constant"].replace(constant=jnp.float32(jnp.nan))
+    broken = replace(probes["constant"], constant=jnp.float32(jnp.nan))
     assert jnp.isnan(evaluate(env, broken, policy, act, split(key, 2))).all()
 
 

@@ -282,7 +282,8 @@ def test_the_servo_is_found(source: str) -> None:
     search = make(config, simulator)
     d = data()
     if source == "policy":  # what the same controller does in the target
-        env, truth = ServoEnv(simulator), jnp.asarray(TRUTH)
+        env: Any = ServoEnv(simulator)
+        truth = jnp.asarray(TRUTH)
         seg = rollout.collect(
             env, truth, lambda o, k: act(POLICY, o, k), jax.random.key(9), 40, 12
         )
@@ -354,7 +355,8 @@ def test_a_discriminator_without_an_opinion_teaches_nothing() -> None:
     search = make(dataclasses.replace(BASE, learning_rate=0.0))
     state = search.init(jax.random.key(0), data())
     flat = jax.tree.map(jnp.zeros_like, state.critic.params)
-    state = state.replace(critic=state.critic.replace(params=flat))
+    critic = dataclasses.replace(state.critic, params=flat)
+    state = dataclasses.replace(state, critic=critic)
     new, info = jax.jit(search.step)(state, data())
     assert info.best == info.score
     np.testing.assert_array_equal(new.mean, state.mean)

@@ -44,9 +44,8 @@ STEPS = 30
 
 @pytest.fixture(scope="module")
 def ended() -> Segments:
-    return rollout.collect(
-        Walker(), jnp.asarray(0.2), forward, jax.random.key(0), 20, STEPS
-    )
+    env: Any = Walker()
+    return rollout.collect(env, jnp.asarray(0.2), forward, jax.random.key(0), 20, STEPS)
 
 
 def test_shapes(ended: Segments) -> None:

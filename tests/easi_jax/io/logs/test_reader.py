@@ -4,6 +4,7 @@ import io
 import os
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -53,7 +54,7 @@ def flyer() -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(FLYER)
 
 
-def cart_columns(rows: int = ROWS, dt: float = 0.01) -> dict[str, np.ndarray]:
+def cart_columns(rows: int = ROWS, dt: float = 0.01) -> dict[str, Any]:
     time = dt * np.arange(rows)
     return {
         "time": time,
@@ -63,7 +64,7 @@ def cart_columns(rows: int = ROWS, dt: float = 0.01) -> dict[str, np.ndarray]:
     }
 
 
-def save(path: Path, columns: dict[str, np.ndarray]) -> Path:
+def save(path: Path, columns: dict[str, Any]) -> Path:
     """Written by other code than the project's own."""
     if path.suffix == ".npz":
         np.savez(path, **columns)

@@ -114,12 +114,12 @@ EVIL = [
         lambda n: figures.returns_by_step({x: (np.arange(3), np.ones(3)) for x in n}),
         lambda n: figures.returns_by_method({x: np.ones(2) for x in n}),
         lambda n: figures.prediction_errors({x: np.ones(4) for x in n}, n, n),
-        lambda n: gap_figures.gap_steps(n, np.ones(4), 0.5, 1.5, 0.1),
+        lambda n: gap_figures.gap_steps(n, [1.0] * 4, 0.5, 1.5, 0.1),
         lambda n: gap_figures.residual_maps(
             n, n, np.ones((4, 4)), np.ones((4, 4)), np.ones(4)
         ),
         lambda n: gap_figures.traces(
-            np.arange(3.0), *[np.zeros((1, 3, 4)) for _ in range(3)], n, n
+            np.arange(3.0), *[np.zeros((1, 3, 4))] * 3, names=n, units=n
         ),
     ],
 )

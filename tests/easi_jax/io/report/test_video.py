@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from easi_jax.errors import UserError
 from easi_jax.io.report.video import render, strip, write_video
@@ -34,7 +34,7 @@ def test_gif_holds_all_frames(frames: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / "new" / "run.gif"
     write_video(path, frames, 20)
     with Image.open(path) as image:
-        assert image.size == (160, 120) and image.n_frames == 5
+        assert image.size == (160, 120) and len([*ImageSequence.Iterator(image)]) == 5
     assert [p.name for p in path.parent.iterdir()] == ["run.gif"]
 
 
