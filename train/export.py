@@ -152,7 +152,7 @@ def _model_files(
     theta = np.array([values[name] for name in simulator.space.names], float)
     model = identified_model(source, simulator, theta, entries)
     if model.left:
-        say(f"note: MJCF has no word for {', '.join(model.left)}: not in model.xml")
+        say(f"note: not in model.xml: {', '.join(model.left)}")
     assets = {name: place.read_bytes() for name, place in model.assets.items()}
     return {**assets, "model.xml": model.xml}
 

@@ -1,11 +1,10 @@
 """An identified machine as MJCF that plain MuJoCo loads."""
 
 import dataclasses
-import re
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
 import mujoco
 import numpy as np
 
@@ -30,26 +29,22 @@ def identified_model(
         entries: effects that the machine has besides.
 
     Raises:
-        UserError: ``source`` is another model than the machine's.
+        UserError: ``source`` is another model than the machine's, or MuJoCo cannot
+            write it.
     """
-    unit = np.asarray(simulator.space.to_unit(theta), float)
-    write = InMujoco(simulator)
-    model = write.at(unit)
-    # MuJoCo writes numbers of a model back into the text that it read last.
     read = mujoco.MjModel.from_xml_path(str(source))
-    if _sizes(read) != _sizes(model):
+    if _sizes(read) != _sizes(simulator.mj_model):
         raise UserError(f"{source} is not the model that these parameters are of")
+    write = InMujoco(simulator)
+    with jax.enable_x64(True):  # a space of its own, as in `InMujoco`
+        space = dataclasses.replace(simulator.space)
+        unit = np.asarray(space.to_unit(np.asarray(theta, np.float64)))
+    model = repaired_model(source, entries, write.at(unit))
     lost = [
         name
         for name, reached in zip(simulator.space.names, write.reaches, strict=True)
         if not reached
     ]
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "model.xml"
-        mujoco.mj_saveLastXML(str(path), model)
-        # MuJoCo writes it and then warns that it is of no use.
-        text = re.sub(r'\s*meaninertia="[^"]*"', "", path.read_text())
-    model = repaired_model(source, entries, text)
     return dataclasses.replace(model, left=[*lost, *model.left])
 
 

@@ -49,19 +49,31 @@ def read_mjcf(path: Path, allowed: Sequence[Path] = ()) -> mujoco.MjModel:
             not accept it.
     """
     check_assets(path, allowed)
-    said: list[str] = []
-    # Without a handler MuJoCo writes warnings to a file in the working folder.
-    mujoco.set_mju_user_warning(said.append)
-    try:
-        model = mujoco.MjModel.from_xml_path(str(path))
-    except (ValueError, RuntimeError, MemoryError) as error:
-        reason = " ".join(f"{error} {' '.join(said)}".split())
-        raise UserError(f"{path}: MuJoCo cannot read this model: {reason}") from None
-    finally:
-        mujoco.set_mju_user_warning(None)
+    with mujoco_warnings() as said:
+        try:
+            model = mujoco.MjModel.from_xml_path(str(path))
+        except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
+            reason = " ".join(f"{error} {' '.join(said)}".split())
+            raise UserError(
+                f"{path}: MuJoCo cannot read this model: {reason}"
+            ) from None
     for text in said:
         warnings.warn(f"{path}: {text}", stacklevel=2)
     return model
+
+
+@contextlib.contextmanager
+def mujoco_warnings() -> Iterator[list[str]]:
+    """Collects what MuJoCo warns of, which otherwise goes to a file in the working
+    folder."""
+    said: list[str] = []
+    mujoco.set_mju_user_warning(said.append)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield said
+    finally:
+        mujoco.set_mju_user_warning(None)
 
 
 def check_assets(path: Path, allowed: Sequence[Path] = ()) -> None:

@@ -1,33 +1,49 @@
-"""``model.xml``: a model with the effects that MJCF can express added to it."""
+"""``model.xml``: a model with other numbers and effects, that plain MuJoCo loads.
 
+Numbers are set in the compiled model, as the simulator sets them, and MuJoCo writes
+them back into the text. What it derives from others when it compiles (inertias, gains
+of a damping ratio, inherited ranges) is made explicit first. The text is loaded again
+and every number compared with what was meant.
+"""
+
+import contextlib
+import ctypes
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from easi_jax.io.models.mjcf import ways
+from easi_jax.errors import UserError
+from easi_jax.io.models.mjcf import mujoco_warnings, ways
 from easi_jax.model.contact_pairs import contact_pairs, geom_name, pair_names
+from easi_jax.model.effects import tilted
 from easi_jax.model.found_effects import EffectEntry
+from easi_jax.model.quantities import (
+    actuator_name,
+    body_name,
+    direct_solref,
+    joint_name,
+)
 
 _ASSETS = "assets"  # folder beside the model
-_ROUNDING = 1e-9  # rad
-_SAID = {
-    "coulomb_friction",
-    "viscous_damping",
-    "joint_stiffness",
-    "armature",
-    "actuator_gain",
-    "actuator_delay",
-    "actuator_lag",
-    "actuator_saturation",
-    "payload_mass",
-    "com_offset",
-    "gravity_tilt",
-    "contact_friction",
-    "contact_softness",
+_DIGITS = 17  # of a double, so that it is read as it was
+_LONG_NUMBER = re.compile(r'(?<=[\s"])-?(?=[\d.]{16})\d*\.?\d+(?:e[-+]?\d+)?(?=[\s"])')
+_RELATIVE = 1e-9  # of a number that is read again: far above rounding, below any use
+_ABSOLUTE = 1e-12  # of one that is about zero, in its own unit
+_TOLD = 20  # deviations that are listed one by one
+# Places of names and files in tables of bytes.
+_NO_NUMBERS = re.compile(r"names|paths|.*adr$|.*_adr|signature|nbuffer|nnames|npaths")
+_OBJECTS = {
+    **{"body": "nbody", "jnt": "njnt", "geom": "ngeom", "actuator": "nu"},
+    **{"dof": "nv", "tendon": "ntendon", "eq": "neq", "sensor": "nsensor"},
+    **{"site": "nsite", "cam": "ncam", "mesh": "nmesh", "key": "nkey"},
 }
 
 
@@ -39,8 +55,9 @@ class Repaired:
         xml: its text.
         assets: files that it names (meshes, textures, height fields), by the names
             that it has for them; they belong beside it.
-        left: what MJCF has no word for (a constant torque at a joint, torque ripple,
-            late sensors ...).
+        left: what is not in it: effects that MJCF has no word for (a constant torque
+            at a joint, torque ripple, late sensors ...), and numbers that are not
+            those that were meant, each with both values.
     """
 
     xml: str
@@ -49,29 +66,190 @@ class Repaired:
 
 
 def repaired_model(
-    path: Path, entries: Sequence[EffectEntry], text: str | None = None
+    path: Path, entries: Sequence[EffectEntry], meant: mujoco.MjModel | None = None
 ) -> Repaired:
     """A model with effects.
 
     Args:
         path: the model as given.
         entries: effects.
-        text: taken in place of what ``path`` holds; its files are still looked for
-            from there.
+        meant: a compiled model with the numbers that it shall have before effects;
+            those of ``path`` where not given.
+
+    Raises:
+        UserError: MuJoCo cannot write this model.
     """
-    if text is None:
-        spec = mujoco.MjSpec.from_file(str(path))
-        spec.compile()  # says where files named by included ones are
-    else:
-        spec = mujoco.MjSpec.from_string(text)
-    assets = _gathered(spec, path.parent)
+    try:
+        with mujoco_warnings(), _all_digits():
+            return _repaired(path, entries, meant)
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
+        reason = " ".join(str(error).split())
+        raise UserError(
+            f"{path}: MuJoCo cannot write this model with other numbers ({reason}); "
+            "state what it derives (inertias, ranges, gains) as numbers"
+        ) from None
+
+
+def _repaired(
+    path: Path, entries: Sequence[EffectEntry], meant: mujoco.MjModel | None
+) -> Repaired:
+    spec, given, assets = _explicit(path)
+    off = _set_all(spec, given if meant is None else meant)
     left = []
     for e in entries:
-        # Compiled anew each time: two effects may sit at one body.
-        if e.effect not in _SAID or not _add(spec, spec.compile(), e):
+        before = spec.copy()
+        before.assets = spec.assets
+        try:
+            added = _add(spec, e)
+        except (ValueError, mujoco.FatalError):
+            added = None
+        if added is None:
             left.append(f"{e.effect}@{e.at}" if e.at else e.effect)
+            spec = before
+        else:
+            off += added
+    wanted = spec.compile()
+    xml = _LONG_NUMBER.sub(lambda n: repr(float(n[0])), spec.to_xml())
+    read = mujoco.MjSpec.from_string(xml, assets=spec.assets).compile()
+    off += deviations(read, wanted)
+    off = list(dict.fromkeys(off))
+    more = [f"and {len(off) - _TOLD} more numbers"] if len(off) > _TOLD else []
+    return Repaired(xml, assets, [*left, *off[:_TOLD], *more])
+
+
+@contextlib.contextmanager
+def _all_digits() -> Iterator[None]:
+    """MuJoCo writes numbers with 6 digits unless told by a function of its own."""
+    folder = Path(mujoco.__file__).parent
+    library = next(folder.glob("*mujoco*.so*"), None) or next(
+        folder.glob("*mujoco*.d[yl]*l*"), None
+    )
+    if library is None:
+        raise RuntimeError(f"no MuJoCo library in {folder}")
+    private: Any = ctypes.CDLL(str(library))
+    before = private._mjPRIVATE__get_xml_precision()
+    private._mjPRIVATE__set_xml_precision(_DIGITS)
+    try:
+        yield
+    finally:
+        private._mjPRIVATE__set_xml_precision(before)
+
+
+def _explicit(
+    path: Path,
+) -> tuple[mujoco.MjSpec, mujoco.MjModel, dict[str, Path]]:
+    """A model in which nothing is derived that can be stated, its numbers as given,
+    and its files."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    given = spec.compile()  # says where files named by included ones are, too
+    assets = _gathered(spec, path.parent)
     spec.compile()
-    return Repaired(spec.to_xml(), assets, left)
+    own = spec.compiler
+    infer = own.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    least = (own.boundmass, own.boundinertia, own.settotalmass)
+    if infer or own.balanceinertia or any(x > 0 for x in least):
+        own.saveinertial = True
+    out = mujoco.MjSpec.from_string(spec.to_xml(), assets=spec.assets)
+    out.assets = spec.assets
+    stated = out.compiler
+    stated.boundmass = stated.boundinertia = stated.settotalmass = 0.0
+    stated.balanceinertia = False
+    stated.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    return out, given, assets
+
+
+def _set_all(spec: mujoco.MjSpec, meant: mujoco.MjModel) -> list[str]:
+    """Gives a model all numbers of another one of the same structure.
+
+    Returns:
+        What could not be set.
+    """
+    fields = [n for n, x in _numbers(spec.compile()) if np.size(x)]
+    try:
+        _changed(spec, lambda m: _copy(m, meant, fields))
+    except ValueError:
+        for name in fields:
+            # One by one: what cannot be said is found by comparing.
+            with contextlib.suppress(ValueError):
+                _changed(spec, lambda m, name=name: _copy(m, meant, [name]))
+    return deviations(spec.compile(), meant)
+
+
+def _copy(m: mujoco.MjModel, other: mujoco.MjModel, fields: Sequence[str]) -> None:
+    theirs = dict(_numbers(other))
+    for name, value in _numbers(m):
+        wanted = theirs[name]
+        if name not in fields or np.array_equal(value, wanted):
+            continue
+        *path, last = name.split(".")
+        owner = getattr(m, path[0]) if path else m
+        if np.ndim(value):
+            getattr(owner, last)[:] = wanted
+        else:
+            setattr(owner, last, wanted)
+
+
+def _changed(
+    spec: mujoco.MjSpec, change: Callable[[mujoco.MjModel], None]
+) -> mujoco.MjModel:
+    """The compiled model after a change of its numbers, which ``spec`` then has.
+
+    Raises:
+        ValueError: MJCF cannot say it; ``spec`` is as before.
+    """
+    m = spec.compile()
+    change(m)
+    mujoco.mj_setConst(m, mujoco.MjData(m))
+    spec.copy_back(m)
+    return m
+
+
+def _numbers(m: mujoco.MjModel) -> Iterator[tuple[str, Any]]:
+    """Name and value of every number and array that a simulation may use: not names,
+    and not ``stat`` and ``vis``, which are for drawing."""
+    for prefix, owner in (("", m), ("opt.", m.opt)):
+        for name in dir(owner):
+            value = None if name[0] == "_" else getattr(owner, name)
+            number = isinstance(value, int | float | np.ndarray)
+            if number and not _NO_NUMBERS.fullmatch(name):
+                yield prefix + name, value
+
+
+def deviations(got: mujoco.MjModel, meant: mujoco.MjModel) -> list[str]:
+    """Numbers of a compiled model that are not those of another one, as text.
+
+    Every size and every array is compared, to 1e-9 of its value.
+    """
+    out = []
+    theirs = dict(_numbers(meant))
+    for name, value in _numbers(got):
+        a, b = np.asarray(value), np.asarray(theirs[name])
+        if a.shape != b.shape:
+            out.append(f"{name}: {len(a)} in place of {len(b)}")
+            continue
+        if a.dtype.kind not in "fiub":
+            continue
+        a, b = a.astype(float), b.astype(float)
+        near = np.isclose(a, b, _RELATIVE, _ABSOLUTE, equal_nan=True)
+        for index in np.argwhere(~near):
+            at = tuple(index)
+            where = _place(got, name, at)
+            out.append(f"{name}{where}: {a[at]:.9g} in place of {b[at]:.9g}")
+    return out
+
+
+def _place(m: mujoco.MjModel, name: str, index: tuple[int, ...]) -> str:
+    """`` of NAME`` where an array has a row for each of something that has a name."""
+    if not index:
+        return ""
+    kind = name.split("_")[0]
+    if kind == "dof":
+        return f" of {joint_name(m, int(m.dof_jntid[index[0]]))}"
+    count = _OBJECTS.get(kind)
+    access: Any = getattr(m, {"jnt": "joint", "cam": "camera"}.get(kind, kind), None)
+    if count is None or getattr(m, count) <= index[0] or access is None:
+        return f"[{', '.join(map(str, index))}]"
+    return f" of {access(int(index[0])).name or f'{kind} {index[0]}'}"
 
 
 def _gathered(spec: mujoco.MjSpec, folder: Path) -> dict[str, Path]:
@@ -111,149 +289,181 @@ def _found(file: str, folder: Path, below: str) -> Path | None:
     return next((place.resolve() for place in tried if place.is_file()), None)
 
 
-def _set(joint: mujoco.MjsJoint, quantity: str, value: float) -> None:
-    old = getattr(joint, quantity)
-    if np.ndim(old):
-        old = np.array(old)
-        old[0] = value
-        setattr(joint, quantity, old)
-    else:
-        setattr(joint, quantity, value)
+def _add(spec: mujoco.MjSpec, e: EffectEntry) -> list[str] | None:
+    """Adds an effect.
+
+    Returns:
+        Numbers that are not as meant; None: MJCF has no word for the effect.
+
+    Raises:
+        ValueError: as before, found only when it was written.
+    """
+    if e.effect not in _WRITERS:
+        return None
+    m = spec.compile()
+    build, write = _WRITERS[e.effect]
+    if not build(spec, m, e):
+        return None
+    meant = _changed(spec, lambda m: write(m, e))
+    return deviations(spec.compile(), meant)
 
 
-def _get(joint: mujoco.MjsJoint, quantity: str) -> float:
-    return float(np.ravel(getattr(joint, quantity))[0])
+def _index(m: mujoco.MjModel, e: EffectEntry) -> int:
+    """The joint, actuator or body that an effect is at; ValueError without it."""
+    count, name = {
+        "joint": (m.njnt, joint_name),
+        "actuator": (m.nu, actuator_name),
+        "body": (m.nbody, body_name),
+    }[e.kind]
+    return [name(m, i) for i in range(count)].index(e.at)
 
 
-def _add(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
-    """Whether it could be added."""
-    c = e.columns
-    if e.kind == "joint":
-        joint = spec.joint(e.at)
-        if e.effect == "joint_stiffness":
-            return _spring(spec, m, e)
-        quantity = {
-            "coulomb_friction": ("frictionloss", "coulomb"),
-            "viscous_damping": ("damping", "damping"),
-            "armature": ("armature", "armature"),
-        }[e.effect]
-        _set(joint, quantity[0], _get(joint, quantity[0]) + c[quantity[1]])
-        return True
-    if e.kind == "actuator":
-        return _actuator(spec.actuator(e.at), e, float(m.opt.timestep))
-    if e.kind == "body":
-        _body(spec.body(e.at), m, e)
-        return True
-    if e.effect == "gravity_tilt":
-        import jax.numpy as jnp
-
-        from easi_jax.model.effects import tilted
-
-        spec.option.gravity = np.asarray(
-            tilted(
-                jnp.asarray(spec.option.gravity),
-                jnp.array([c["tilt.0"], c["tilt.1"]]),
-            )
-        )
-        return True
-    _contacts(spec, m, e)
+def _nothing(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
     return True
 
 
-def _spring(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
+def _of_joint(field: str, column: str) -> Callable[[mujoco.MjModel, EffectEntry], None]:
+    def write(m: mujoco.MjModel, e: EffectEntry) -> None:
+        getattr(m, field)[m.jnt_dofadr[_index(m, e)]] += e.columns[column]
+
+    return write
+
+
+def _springy(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
+    return m.jnt_stiffness[_index(m, e)] + e.columns["stiffness"] > 0
+
+
+def _spring(m: mujoco.MjModel, e: EffectEntry) -> None:
     """Another spring at a joint that may have one: stiffnesses and torques add up."""
-    joint, there = spec.joint(e.at), m.joint(e.at)
-    q = int(there.qposadr[0])
-    old = float(np.ravel(there.stiffness)[0])
-    stiffness = old + e.columns["stiffness"]
-    if stiffness <= 0:
-        return False
+    j = _index(m, e)
+    q, old = m.jnt_qposadr[j], float(m.jnt_stiffness[j])
     torque = old * float(m.qpos_spring[q]) + e.columns["spring"]
-    _set(joint, "stiffness", stiffness)
-    joint.springref = torque / stiffness
-    # Angles of a text are in degrees unless it says otherwise.
-    if abs(spec.compile().qpos_spring[q] - torque / stiffness) > _ROUNDING:
-        joint.springref = math.degrees(torque / stiffness)
+    m.jnt_stiffness[j] = old + e.columns["stiffness"]
+    m.qpos_spring[q] = torque / m.jnt_stiffness[j]
+
+
+def _gain(m: mujoco.MjModel, e: EffectEntry) -> None:
+    m.actuator_gainprm[_index(m, e), :3] *= e.columns["gain"]
+
+
+def _saturation(m: mujoco.MjModel, e: EffectEntry) -> None:
+    a, limit = _index(m, e), e.columns["limit"]
+    edges = -limit, limit
+    if m.actuator_forcelimited[a]:
+        low, high = m.actuator_forcerange[a]
+        edges = max(low, -limit), min(high, limit)
+    m.actuator_forcelimited[a] = True
+    m.actuator_forcerange[a] = edges
+
+
+def _filtered(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
+    actuator = spec.actuators[_index(m, e)]
+    if actuator.dyntype != mujoco.mjtDyn.mjDYN_NONE:
+        return False
+    actuator.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
     return True
 
 
-def _actuator(actuator: mujoco.MjsActuator, e: EffectEntry, timestep: float) -> bool:
-    c = e.columns
-    if e.effect == "actuator_gain":
-        gain = np.array(actuator.gainprm)
-        gain[0] *= c["gain"]
-        actuator.gainprm = gain
-        return True
-    if e.effect == "actuator_saturation":
-        actuator.forcelimited = True
-        actuator.forcerange = [-c["limit"], c["limit"]]
-        return True
-    if e.effect == "actuator_lag":
-        if actuator.dyntype != mujoco.mjtDyn.mjDYN_NONE:
-            return False
-        actuator.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
-        prm = np.array(actuator.dynprm)
-        prm[0] = c["lag"]
-        actuator.dynprm = prm
-        return True
+def _lag(m: mujoco.MjModel, e: EffectEntry) -> None:
+    m.actuator_dynprm[_index(m, e), 0] = e.columns["lag"]
+
+
+def _delayed(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
     # MuJoCo C keeps a history of commands; MJX does not.
-    actuator.delay = c["delay"]
-    actuator.nsample = math.ceil(c["delay"] / timestep) + 2
+    actuator, delay = spec.actuators[_index(m, e)], e.columns["delay"]
+    actuator.delay = delay
+    actuator.nsample = math.ceil(delay / m.opt.timestep) + 2
     return True
 
 
-def _body(body: mujoco.MjsBody, m: mujoco.MjModel, e: EffectEntry) -> None:
-    b = m.body(body.name).id
-    mass = float(m.body_mass[b])
-    c = e.columns
-    extra = c.get("mass", 0.0)
-    shift = np.array([c.get(f"com.{i}", 0.0) for i in range(3)])
-    body.explicitinertial = True
-    body.mass = mass + extra
-    body.ipos = m.body_ipos[b] + shift
-    body.iquat = m.body_iquat[b]
-    body.inertia = m.body_inertia[b] * (1 + c.get("spread", 0.0) * extra / mass)
+def _body(m: mujoco.MjModel, e: EffectEntry) -> None:
+    b, c = _index(m, e), e.columns
+    extra, mass = c.get("mass", 0.0), float(m.body_mass[b])
+    m.body_mass[b] = mass + extra
+    m.body_ipos[b] += [c.get(f"com.{i}", 0.0) for i in range(3)]
+    if mass > 0:
+        m.body_inertia[b] *= 1 + c.get("spread", 0.0) * extra / mass
 
 
-def _contacts(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> None:
-    """Contacts of one pair of geoms, or all: pairs hold their own numbers, geoms those
-    of the others."""
-    one, c = e.kind == "geom", e.columns
-    items = [_pair(spec, m, e.at)] if one else [*spec.geoms, *spec.pairs]
-    slip, give = ("slip", "give") if one else ("friction", "softness")
-    for item in items:
-        if e.effect == "contact_friction":
-            friction = np.array(item.friction)
-            # A geom has one sliding friction, a pair two.
-            friction[: 1 if len(friction) == 3 else 2] *= c[slip]
-            item.friction = friction
-        else:
-            factors = np.array([c[f"{give}.0"], c[f"{give}.1"]])
-            item.solref = _softer(np.array(item.solref), factors)
+def _gravity(m: mujoco.MjModel, e: EffectEntry) -> None:
+    with jax.enable_x64(True):
+        tilt = jnp.array([e.columns["tilt.0"], e.columns["tilt.1"]])
+        m.opt.gravity = np.asarray(tilted(jnp.asarray(m.opt.gravity), tilt))
 
 
-def _softer(solref: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Contacts whose stiffness and damping are multiplied by ``factors (2,)``."""
-    if (solref <= 0).any():
-        return solref * factors
-    # Stiffness goes with the inverse square of the time constant, damping with its
-    # inverse.
-    time, ratio = solref
-    time /= factors[1]
-    return np.array([time, ratio * factors[1] / np.sqrt(factors[0])])
-
-
-def _pair(spec: mujoco.MjSpec, m: mujoco.MjModel, at: str) -> mujoco.MjsPair:
-    """The ``<pair>`` of two geoms, made from their numbers where there is none."""
-    p = contact_pairs(m)[pair_names(m)[at]]
+def _pair_made(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
+    """Makes the ``<pair>`` of two geoms from their numbers where there is none."""
+    if e.kind != "geom":
+        return True
+    p = contact_pairs(m)[pair_names(m)[e.at]]
     names = [geom_name(m, g) for g in p.geoms]
     for g, name in zip(p.geoms, names, strict=True):
         spec.geoms[g].name = name
-    # Compiled pairs are in another order.
-    there = [q for q in spec.pairs if {q.geomname1, q.geomname2} == set(names)]
-    if there:
-        return there[-1]
-    pair = spec.add_pair(geomname1=names[0], geomname2=names[1])
-    pair.condim, pair.margin, pair.solimp = p.dim, p.margin, p.solimp
-    pair.friction, pair.solref = p.friction, p.solref
-    return pair
+    if _pair_of(m, e.at) is None:
+        pair = spec.add_pair(geomname1=names[0], geomname2=names[1])
+        pair.condim, pair.margin, pair.solimp = p.dim, p.margin, p.solimp
+        pair.friction, pair.solref = p.friction, p.solref
+    return True
+
+
+def _pair_of(m: mujoco.MjModel, at: str) -> int | None:
+    """The stated pair of two geoms."""
+    geoms = {*contact_pairs(m)[pair_names(m)[at]].geoms}
+    stated = zip(m.pair_geom1.tolist(), m.pair_geom2.tolist(), strict=True)
+    return next((k for k, pair in enumerate(stated) if {*pair} == geoms), None)
+
+
+def _slip(m: mujoco.MjModel, e: EffectEntry) -> None:
+    """Pairs hold their own numbers, geoms those of the other contacts."""
+    if e.kind == "geom":
+        m.pair_friction[_pair_of(m, e.at), :2] *= e.columns["slip"]
+    else:
+        m.geom_friction[:, 0] *= e.columns["friction"]
+        m.pair_friction[:, :2] *= e.columns["friction"]
+
+
+def _soft(m: mujoco.MjModel, e: EffectEntry) -> None:
+    name = "give" if e.kind == "geom" else "softness"
+    factors = np.array([e.columns[f"{name}.{i}"] for i in range(2)])
+    if e.kind == "geom":
+        k = _pair_of(m, e.at)
+        m.pair_solref[k] = _softer(m, m.pair_solref[[k]], factors)[0]
+    else:
+        m.geom_solref[:] = _softer(m, m.geom_solref, factors)
+        m.pair_solref[:] = _softer(m, m.pair_solref, factors)
+
+
+def _softer(m: mujoco.MjModel, solref: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Contacts ``(n, 2)`` whose stiffness and damping are multiplied by ``factors``."""
+    safe = not m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE
+    least = 2 * m.opt.timestep if safe else 0.0
+    # Stiffness goes with the inverse square of the time constant, damping with its
+    # inverse. MuJoCo takes weighed means of both numbers of two geoms.
+    out = solref * np.array([1, factors[1] / np.sqrt(factors[0])])
+    out[:, 0] = np.maximum(solref[:, 0], least) / factors[1]
+    if (solref > 0).all() and (out[:, 0] >= least).all():
+        return out
+    direct = -np.array([direct_solref(m, row) for row in solref]) * factors
+    if len(np.unique(direct[solref[:, 0] > 0], axis=0)) > 1:
+        raise ValueError("contacts of unequal time constants at the least that is safe")
+    return direct
+
+
+_Build = Callable[[mujoco.MjSpec, mujoco.MjModel, EffectEntry], bool]
+_Write = Callable[[mujoco.MjModel, EffectEntry], None]
+# What must be there before an effect's numbers, whether it can; and those numbers.
+_WRITERS: dict[str, tuple[_Build, _Write]] = {
+    "coulomb_friction": (_nothing, _of_joint("dof_frictionloss", "coulomb")),
+    "viscous_damping": (_nothing, _of_joint("dof_damping", "damping")),
+    "armature": (_nothing, _of_joint("dof_armature", "armature")),
+    "joint_stiffness": (_springy, _spring),
+    "actuator_gain": (_nothing, _gain),
+    "actuator_saturation": (_nothing, _saturation),
+    "actuator_lag": (_filtered, _lag),
+    "actuator_delay": (_delayed, lambda m, e: None),
+    "payload_mass": (_nothing, _body),
+    "com_offset": (_nothing, _body),
+    "gravity_tilt": (_nothing, _gravity),
+    "contact_friction": (_pair_made, _slip),
+    "contact_softness": (_pair_made, _soft),
+}
