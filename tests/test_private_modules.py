@@ -12,6 +12,7 @@ TOPS = ("easi_jax", "envs", "train", "scripts", "benchmarks", "examples", "tests
 # Public by name, yet changed from release to release without notice.
 UNSTABLE = ("jax.extend", "brax.training", "evosax.algorithms.distribution_based")
 STATE = "mujoco.mjx.Data._impl"  # and of `mujoco.mjx.Model`
+FUNCTIONS = "_mjPRIVATE"  # of MuJoCo's library, reached through ctypes
 
 
 def _private(name: str) -> str | None:
@@ -50,6 +51,8 @@ def _names(tree: ast.Module) -> Iterator[str]:
         if isinstance(node, ast.Attribute):
             if node.attr == "_impl":
                 yield STATE
+            elif node.attr.startswith(FUNCTIONS):
+                yield f"mujoco.{FUNCTIONS}"
             elif name := dotted(node):
                 yield name
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):

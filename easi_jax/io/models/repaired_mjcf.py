@@ -25,12 +25,8 @@ from easi_jax.io.models.mjcf import mujoco_warnings, ways
 from easi_jax.model.contact_pairs import contact_pairs, geom_name, pair_names
 from easi_jax.model.effects import tilted
 from easi_jax.model.found_effects import EffectEntry
-from easi_jax.model.quantities import (
-    actuator_name,
-    body_name,
-    direct_solref,
-    joint_name,
-)
+from easi_jax.model.joint_space import joint_name
+from easi_jax.model.quantities import actuator_name, body_name, direct_solref
 
 _ASSETS = "assets"  # folder beside the model
 _DIGITS = 17  # of a double, so that it is read as it was
