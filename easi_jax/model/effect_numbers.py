@@ -250,7 +250,9 @@ EFFECT_TABLE: dict[str, EffectNumber] = {
     ),
     "resistance": _body("resistance", "coefficient", "N s^2/m^2", low=0.0),
     **{
-        f"com.{i}": _body("com", axis, "m", i, refuse=_heavy, acts="model")
+        f"com.{i}": _body(
+            "com", axis, "m", i, refuse=_heavy, acts="model", moves_center=True
+        )
         for i, axis in enumerate("xyz")
     },
     **{f"force.{i}": _body("force", axis, "N", i) for i, axis in enumerate("xyz")},

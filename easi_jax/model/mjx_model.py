@@ -111,7 +111,7 @@ def put_model(
     except NotImplementedError as error:
         reason = " ".join(str(error).split())
         raise UserError(f"MJX cannot simulate this model: {reason}") from error
-    if any(w.quantity in MOVES_CENTERS for w in writers):
+    if any(w.row.moves_center for w in writers):
         put = full_structure(put)
     n = len(per_parameter)
     lasting = [replace(w, parameter=w.parameter - n) for w in writers]
@@ -129,9 +129,6 @@ def put_model(
     return _written(model, values).replace(
         writers=tuple(w for w in writers if w.parameter < n)
     )
-
-
-MOVES_CENTERS = ("com_x", "com_y", "com_z", "length", "com.0", "com.1", "com.2")
 
 
 def full_structure(m: mjx.Model) -> mjx.Model:

@@ -63,6 +63,7 @@ class Quantity:
         open: sets types, flags and seeds in a model that is about to be put.
         read: the value in a model; None: the first entry of the model.
         derived: MuJoCo derives constants from it, to be computed again.
+        moves_center: it moves a body's center of mass away from where it was.
         extra: further numbers that writing it sets, so that no other may set them.
     """
 
@@ -74,6 +75,7 @@ class Quantity:
     open: Callable[[Any, int], None] = lambda m, i: None
     read: Callable[[Any, int], float] | None = None
     derived: bool = False
+    moves_center: bool = False
     extra: Callable[[Any, int], tuple[Entry, ...]] = lambda m, i: ()
 
     def lower(self, m: Any, i: int) -> float:
@@ -441,6 +443,7 @@ _com = {
         low=-_INF,
         refuse=_refuse_mass,
         derived=True,
+        moves_center=True,
     )
     for axis, name in enumerate("xyz")
 }
@@ -552,6 +555,7 @@ TABLE: dict[str, dict[str, Quantity]] = {
             refuse=_refuse_length,
             read=_read_length,
             derived=True,
+            moves_center=True,
             extra=_length_extra,
         ),
     },

@@ -12,7 +12,6 @@ import mujoco
 import numpy as np
 
 from easi_jax.model.addresses import open_gates, resolve
-from easi_jax.model.mjx_model import MOVES_CENTERS
 from easi_jax.simulation.simulator import Simulator
 
 # What `mj_setConst` computes, and the compiler.
@@ -68,7 +67,7 @@ class InMujoco:
         )
         for w in resolve(simulator.mj_model, space.addresses):
             # MuJoCo C, too, leaves out of such a body's inertia what is zero.
-            if w.quantity in MOVES_CENTERS and _simple(simulator.mj_model, w):
+            if w.row.moves_center and _simple(simulator.mj_model, w):
                 self.reaches[w.parameter] = False
 
     def at(self, unit: np.ndarray) -> mujoco.MjModel:
