@@ -1,5 +1,6 @@
 # make demo   set up, train and identify Cartpole, print the results
-# make test   set up, lint, type-check and test
+# make test   set up, lint, type-check and test; under 10 minutes on 2 cores
+# make test-slow   every test, as users compile, with the coverage of lines; hours
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -9,7 +10,7 @@ DEMO := results/demo
 TARGET := 'cart_kp*0.25'
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test install install-dev clean
+.PHONY: demo test test-slow install install-dev clean
 
 demo: $(RUN_STAMP)
 	$(BIN)/python -m train.udr --target $(TARGET) --out $(DEMO)/udr --overwrite
@@ -20,7 +21,12 @@ test: $(DEV_STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations=25
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations=10
+
+test-slow: $(DEV_STAMP)
+	EASI_JAX_TESTS=optimized $(BIN)/python -m pytest -n 2 --dist loadfile \
+	    --no-loadscope-reorder -m 'not gpu' --durations=25 \
+	    --cov=easi_jax --cov=envs --cov=train --cov-report=term-missing:skip-covered
 
 install: $(RUN_STAMP)
 

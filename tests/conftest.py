@@ -1,11 +1,30 @@
-"""Readies jax as users get it, before any test imports it."""
+"""Readies jax before any test imports it: quick to compile, one cache for the run.
 
+Three quarters of the default tests' time is compiling (`benchmarks.where_tests_spend`).
+So they compile without LLVM's optimizations. ``EASI_JAX_TESTS=optimized`` compiles as
+users get it; `make test-slow` sets it.
+"""
+
+import atexit
+import os
+import shutil
 import signal
+import tempfile
 from pathlib import Path
 
 import pytest
 
-import easi_jax  # noqa: F401
+if os.environ.get("EASI_JAX_TESTS") != "optimized":
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "xla_backend_optimization_level" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_backend_optimization_level=0".strip()
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    # The workers of pytest-xdist and the commands that tests start inherit it.
+    _cache = tempfile.mkdtemp(prefix="easi_jax_tests_")
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache
+    atexit.register(shutil.rmtree, _cache, ignore_errors=True)
+
+import easi_jax  # noqa: F401, E402
 
 # A shell that starts the tests in the background lets them ignore Ctrl-C, and what
 # they start as well; the tests of interruption need it.
