@@ -24,7 +24,7 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache
     atexit.register(shutil.rmtree, _cache, ignore_errors=True)
 
-import easi_jax  # noqa: F401, E402
+import easi_jax  # noqa: F401
 
 # A shell that starts the tests in the background lets them ignore Ctrl-C, and what
 # they start as well; the tests of interruption need it.

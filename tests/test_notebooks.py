@@ -67,6 +67,7 @@ def test_every_notebook_has_a_test() -> None:
     assert {p.stem for p in notebooks.SOURCES.glob("*.py")} <= tested
 
 
+@pytest.mark.slow
 def test_cartpole_to_transfer(tmp_path: Path) -> None:
     told = executed(
         "cartpole_to_transfer", tmp_path, "stiffness", "before", "after", "returns"
@@ -80,6 +81,7 @@ def test_cartpole_to_transfer(tmp_path: Path) -> None:
     assert all(-10 < r <= 200 for (r,) in told["returns"].values())
 
 
+@pytest.mark.slow
 def test_your_own_robot(tmp_path: Path) -> None:
     wanted = ("mean", "std", "true", "nominal", "held", "result")
     told = executed("your_own_robot", tmp_path, *wanted)
@@ -109,6 +111,7 @@ def test_gap_on_a_log(tmp_path: Path) -> None:
     assert told["rms"]["repaired"] < 0.3 * told["rms"]["model as given"]
 
 
+@pytest.mark.slow
 def test_reproduce_a_table(tmp_path: Path) -> None:
     told = executed("reproduce_a_table", tmp_path, "table", "rows", "names", "ROWS")
     lines = (tmp_path / "results/reproduce_a_table/paper.jsonl").read_text()

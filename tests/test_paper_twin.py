@@ -192,7 +192,9 @@ POLICIES = {
 }
 
 
-@pytest.mark.parametrize("name", ENVS)
+@pytest.mark.parametrize(
+    "name", ["cartpole", pytest.param("go2", marks=pytest.mark.slow)]
+)
 def test_play_is_the_environments_own_episode(name: str) -> None:
     """Rewards, ends and observations, where the twin has no gap."""
     env = make(name)

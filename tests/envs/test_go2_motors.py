@@ -59,6 +59,7 @@ def _commands(env: Any) -> np.ndarray:
     return np.array([low if k % 2 else high for k in range(5)])
 
 
+@pytest.mark.slow
 def test_equals_mujoco_c_with_limits_set_before_each_step(kicked: Any) -> None:
     env = make("go2")
     m, d = env.mj_model, mujoco.MjData(env.mj_model)

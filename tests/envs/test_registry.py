@@ -1,5 +1,6 @@
 """What every robot must do, by being registered."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,7 +35,12 @@ class Runs:
     theirs: np.ndarray
 
 
-@pytest.fixture(scope="module", params=list(CASES))
+def either(names: Iterable[str], *slow: str) -> list[Any]:
+    """All ``names``, of which these take a minute to compile."""
+    return [pytest.param(n, marks=pytest.mark.slow) if n in slow else n for n in names]
+
+
+@pytest.fixture(scope="module", params=either(CASES, "ballbalance", "go2_full"))
 def runs(request: pytest.FixtureRequest) -> Runs:
     case = CASES[request.param]
     env = case.make()
@@ -91,7 +97,10 @@ def test_every_parameter_moves_the_rollout(runs: Runs) -> None:
 
 
 # Go2's 25 parameters reach no further than its 8 do.
-@pytest.fixture(scope="module", params=[c for c in CASES if c != "go2_full"])
+@pytest.fixture(
+    scope="module",
+    params=either((c for c in CASES if c != "go2_full"), "ant", "ballbalance", "go2"),
+)
 def episodes(request: pytest.FixtureRequest) -> Any:
     """Random actions from a reset, at random corners of the parameter box."""
     case = CASES[request.param]

@@ -219,6 +219,7 @@ def test_retraining_too_short_to_train_is_told_at_once(
     assert "env_steps=2000" in said and not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_robot_gets_what_the_physics_of_a_file_says(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -54,6 +54,7 @@ def write_log(path: Path, m: mujoco.MjModel, seed: int) -> None:
     path.write_text("\n".join([",".join(head), *text]) + "\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("left", "right", "at"),
     [(0.9, 0.6, "floor/left_foot"), (0.9, 0.9, "")],

@@ -50,7 +50,7 @@ def write_log(path: Path, late: tuple[int, ...]) -> None:
 @pytest.mark.parametrize(
     "late",
     [
-        pytest.param((15, 15, 15), id="alike"),
+        pytest.param((15, 15, 15), id="alike", marks=pytest.mark.slow),
         pytest.param((15, 15, 30), id="one more"),
         pytest.param((0, 15, 0), id="one", marks=pytest.mark.slow),
     ],

@@ -13,8 +13,9 @@ from train import pipeline
 pytestmark = pytest.mark.timeout(1500)
 
 ARGS = (
+    *("--env", Path(__file__).parents[1] / "tiny_robot" / "env.py"),
     *("--env-steps", 2400, "--eval-episodes", 4, "--generations", 2, "--no-refine"),
-    *("--population", 8, "--trajectories", 4, "--target", "cart_kp*0.5"),
+    *("--population", 8, "--trajectories", 4, "--target", "gear*0.5"),
     *("--set", "segments=16", "real_batch=64", "discriminator_updates=2"),
 )
 ENDS = ("results.json", "distribution.json")

@@ -42,7 +42,15 @@ METHODS: dict[str, tuple[Method, tuple[float, float]]] = {
 }
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(n, marks=pytest.mark.slow)
+        if n in ("simopt", "easi_refined", "cma_es")
+        else n
+        for n in METHODS
+    ],
+)
 def test_the_truth_is_approached_from_a_start_that_excludes_it(
     name: str, task: Task, demonstrations: Segments
 ) -> None:

@@ -107,6 +107,7 @@ def test_training_in_the_target_mends_a_poor_policy(
     assert mean_return(poor, got.policy) > mean_return(poor, poor.policy) + 2.0
 
 
+@pytest.mark.slow
 def test_a_range_that_holds_the_target_mends_a_poor_policy(poor: Practice) -> None:
     none: Any = None
     got = Udr(2.0).fit(poor, none, Budget(), jax.random.key(1))
@@ -156,6 +157,7 @@ def test_random_actions_are_for_sac_alone(practice: Practice) -> None:
         FineTune().fit(ppo, none, Budget(), jax.random.key(1))
 
 
+@pytest.mark.slow
 def test_garat_learns_what_the_drive_does(practice: Practice) -> None:
     """The simulation with the transformer moves like the machine, half as far."""
     demonstrations = jax.jit(

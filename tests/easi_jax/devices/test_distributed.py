@@ -34,7 +34,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return walked(tmp_path_factory.mktemp("alone") / "run", 1, devices=2)[0]
 
 
-@pytest.mark.parametrize("count", [2, 4])
+@pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_several_processes_give_what_one_gives(
     tmp_path: Path, alone: Any, count: int
 ) -> None:
@@ -54,7 +54,7 @@ def test_several_processes_give_what_one_gives(
     assert all("error" not in error for _, _, error in again[1:])
 
 
-@pytest.mark.parametrize("victim", [0, 1])
+@pytest.mark.parametrize("victim", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.fault("one of several processes lost")
 def test_one_is_killed_all_end_and_resume(
     tmp_path: Path, alone: Any, victim: int

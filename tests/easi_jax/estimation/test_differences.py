@@ -45,7 +45,7 @@ def exact(problem: Any) -> dict[bool, Normal]:
     return {free: normal(problem, free) for free in (True, False)}
 
 
-@pytest.mark.parametrize("free", [True, False])
+@pytest.mark.parametrize("free", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_equal_forward_mode(
     problem: Any, exact: dict[bool, Normal], free: bool, monkeypatch: Any
 ) -> None:

@@ -103,6 +103,7 @@ def test_the_best_of_several_starts_is_the_result(
     np.testing.assert_array_equal(worse.unit, good.unit)
 
 
+@pytest.mark.slow
 def test_what_is_as_good_as_zero_comes_back_though_little_is_known(
     cartpole: Cartpole, fit: Any, space: ParameterSpace, trajectories: Segments
 ) -> None:
@@ -140,7 +141,7 @@ def test_a_value_lost_near_zero_comes_back(
     assert abs(off[i]) < 0.3, dict(zip(space.names, off.round(3), strict=True))
 
 
-@pytest.mark.parametrize("met", [True, False])
+@pytest.mark.parametrize("met", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_a_limit_that_was_not_met_is_not_known(met: bool) -> None:
     """Noise digs a dip into the edge of the plateau, where a fit from below stops."""
     rig = RIGS["cartpole"]()
@@ -174,6 +175,7 @@ def test_a_limit_that_was_not_met_is_not_known(met: bool) -> None:
         assert out.hessian[i, i] < 1.0
 
 
+@pytest.mark.slow
 def test_a_limit_that_nothing_meets_is_found_from_a_narrow_start(
     cartpole: Cartpole, space: ParameterSpace, trajectories: Segments
 ) -> None:
@@ -191,6 +193,7 @@ def test_a_limit_that_nothing_meets_is_found_from_a_narrow_start(
     assert float(far.to_si(out.unit)[i]) == pytest.approx(far.nominal[i], rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_limit_that_few_pieces_meet_is_found(
     cartpole: Cartpole, space: ParameterSpace
 ) -> None:
@@ -280,6 +283,7 @@ _KINDS = ("stiffness", "damping", "frictionloss")
 _WRONG = (1.64, -0.45, 0.25, -2.36, 1.27, 0.19)
 
 
+@pytest.mark.slow
 def test_a_short_first_stage_leads_past_wrong_minima() -> None:
     """Over many swings the error has a minimum for each number of swings."""
     m = mujoco.MjModel.from_xml_string(_MASSES)

@@ -71,6 +71,7 @@ def test_steps_that_weigh_nothing_need_no_simulation(
         assert np.abs(all_[:, 2:] - start[:, None]).max() > 1e-2
 
 
+@pytest.mark.slow
 def test_nine_of_eleven_directions_are_seen(found: Identifiability) -> None:
     assert found.rank == 9 and len(found.undetermined) == 2
     assert found.null.shape == (11, 2)

@@ -63,6 +63,7 @@ def far(a: RefineResult, b: RefineResult) -> float:
     return float(np.sqrt(off @ np.asarray(b.hessian) @ off))
 
 
+@pytest.mark.slow
 def test_few_pieces_end_where_all_have_it(problem: Any, run: Any, fits: Any) -> None:
     few, known = fits
     found = run(few, problem[2])

@@ -92,6 +92,7 @@ def slow(fits: Any) -> Any:
     return fits()
 
 
+@pytest.mark.slow
 def test_friction_is_neither_too_high_nor_too_sure(slow: Any) -> None:
     fit, adjusted, left = slow
     friction = 1
@@ -136,7 +137,7 @@ def test_what_scatters_more_than_its_information_is_less_sure() -> None:
     np.testing.assert_allclose(wide[5], 0.0, atol=1e-20)
 
 
-@pytest.mark.parametrize("limit", [10.0, 1.5])
+@pytest.mark.parametrize("limit", [pytest.param(10.0, marks=pytest.mark.slow), 1.5])
 def test_a_limit_that_was_not_met_is_not_known(limit: float) -> None:
     """Noise digs a dip into the edge of its plateau, and no score leads out of it."""
     bounds = f'joint="a" forcerange="{-limit} {limit}"'

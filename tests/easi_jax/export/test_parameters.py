@@ -47,7 +47,15 @@ def moved(m: mujoco.MjModel, seed: int = 0) -> np.ndarray:
     return np.array(rows)
 
 
-@pytest.mark.parametrize("robot", ["cartpole", "ant", "ballbalance", "go2"])
+@pytest.mark.parametrize(
+    "robot",
+    [
+        "cartpole",
+        pytest.param("ant", marks=pytest.mark.slow),
+        pytest.param("ballbalance", marks=pytest.mark.slow),
+        "go2",
+    ],
+)
 def test_the_model_moves_as_identified(robot: str, tmp_path: Path) -> None:
     env = make(robot)
     unit = np.random.default_rng(0).uniform(0.2, 0.8, env.space.size)

@@ -27,7 +27,14 @@ def rollout(m: mujoco.MjModel, start: tuple[Any, Any], ctrl: np.ndarray) -> np.n
     return np.array(rows)
 
 
-@pytest.mark.parametrize("name", ["cartpole", "ballbalance", "go2"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cartpole",
+        pytest.param("ballbalance", marks=pytest.mark.slow),
+        pytest.param("go2", marks=pytest.mark.slow),
+    ],
+)
 def test_moves_as_a_model_compiled_with_the_values(name: str) -> None:
     case = CASES[name]
     env, rng = case.make(), np.random.default_rng(0)
