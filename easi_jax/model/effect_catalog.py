@@ -16,6 +16,7 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
+from easi_jax.model import effect_mjcf
 from easi_jax.model.contact_pairs import ContactPair
 from easi_jax.model.effect_numbers import NO_FORCE_LIMIT, NUMBERS, EffectNumber
 
@@ -249,6 +250,7 @@ class Effect:
         is_sine: its numbers are amplitude, cycles and phase of a sine; the cycles that
             a fit starts from come from a grid.
         told: parameters as people know them, from the numbers.
+        mjcf: how MJCF says it; None where it has no word for it.
     """
 
     name: str
@@ -261,6 +263,7 @@ class Effect:
     is_shared: bool = False
     is_sine: bool = False
     told: Callable[[Told], Told] = lambda got: got
+    mjcf: effect_mjcf.InMjcf | None = None
 
     @property
     def is_shift(self) -> bool:
@@ -395,12 +398,14 @@ _ROWS = (
         },
         'body "{at}" carries {mass} more',
         refits=("body", "mass"),
+        mjcf=effect_mjcf.BODY,
     ),
     Effect(
         "com_offset",
         {"body": _vector("com", "xyz", lambda o: 2 * o.size, lambda o: 0.02 * o.size)},
         'the mass of body "{at}" sits elsewhere',
         is_rare=True,
+        mjcf=effect_mjcf.BODY,
     ),
     Effect(
         "coulomb_friction",
@@ -416,6 +421,7 @@ _ROWS = (
         },
         'joint "{at}" has about {torque} of dry friction',
         refits=("joint", "frictionloss"),
+        mjcf=effect_mjcf.COULOMB,
     ),
     Effect(
         "viscous_damping",
@@ -429,6 +435,7 @@ _ROWS = (
         },
         'joint "{at}" has {damping} of viscous damping',
         refits=("joint", "damping"),
+        mjcf=effect_mjcf.DAMPING,
     ),
     Effect(
         "quadratic_drag",
@@ -481,6 +488,7 @@ _ROWS = (
         contains="constant_force",
         refits=("joint", "stiffness"),
         told=_told_spring,
+        mjcf=effect_mjcf.SPRING,
     ),
     Effect(
         "stribeck_friction",
@@ -519,6 +527,7 @@ _ROWS = (
         },
         'joint "{at}" carries {armature} of inertia',
         refits=("joint", "armature"),
+        mjcf=effect_mjcf.ARMATURE,
     ),
     Effect(
         "sensor_bias",
@@ -595,12 +604,14 @@ _ROWS = (
         # load that nobody told of.
         usual=(0.4, 2.5),
         refits=("actuator", "gain"),
+        mjcf=effect_mjcf.GAIN,
     ),
     Effect(
         "actuator_delay",
         {"actuator": _alone("delay", "delay", _late, _instant, _delays)},
         'commands arrive at actuator "{at}" {delay} late',
         is_shared=True,
+        mjcf=effect_mjcf.DELAY,
     ),
     Effect(
         "actuator_lag",
@@ -613,6 +624,7 @@ _ROWS = (
         'actuator "{at}" responds with a time constant of {time_constant}',
         refits=("actuator", "time_constant"),
         is_shared=True,
+        mjcf=effect_mjcf.LAG,
     ),
     Effect(
         "actuator_saturation",
@@ -628,6 +640,7 @@ _ROWS = (
         'actuator "{at}" gives no more than {limit}',
         is_rare=True,
         refits=("actuator", "force_limit"),
+        mjcf=effect_mjcf.LIMIT,
     ),
     Effect(
         "actuator_deadband",
@@ -652,16 +665,19 @@ _ROWS = (
         "the base is tilted (roll {roll}, pitch {pitch})",
         is_rare=True,
         usual=(-0.25, 0.25),
+        mjcf=effect_mjcf.TILT,
     ),
     Effect(
         "contact_friction",
         {"model": _contact_friction("friction"), "geom": _contact_friction("slip")},
         "contacts{pair} have a sliding friction of {friction}",
+        mjcf=effect_mjcf.FRICTION,
     ),
     Effect(
         "contact_softness",
         {"model": _contact_softness("softness"), "geom": _contact_softness("give")},
         "contacts{pair} have a stiffness of {stiffness}",
+        mjcf=effect_mjcf.SOFTNESS,
     ),
 )
 CATALOG: Mapping[str, Effect] = {row.name: row for row in _ROWS}

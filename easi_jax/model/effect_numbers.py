@@ -6,7 +6,7 @@ vector), of the same kind as those of `easi_jax.model.quantities`. Which effects
 make up: `easi_jax.model.effect_catalog`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -295,3 +295,36 @@ def fields_that_act(where: Acts) -> tuple[str, ...]:
     return tuple(
         dict.fromkeys(field_of(c) for c, n in NUMBERS.items() if n.acts == where)
     )
+
+
+_READINGS = fields_that_act("readings")
+
+
+@dataclass(frozen=True)
+class EffectEntry:
+    """One effect.
+
+    Attributes:
+        effect: name.
+        at: joint, actuator or body; "" for the whole model.
+        kind: what ``at`` is.
+        columns: values of fields of `easi_jax.model.effects.Effects`, by name; vectors
+            have a name for each entry, such as ``com.0``.
+        std: their standard deviations, where known.
+    """
+
+    effect: str
+    at: str
+    kind: str
+    columns: Mapping[str, float]
+    std: Mapping[str, float]
+
+    @property
+    def of_readings(self) -> bool:
+        """Whether it is in the readings of a sensor, not in the physics."""
+        return all(field_of(column) in _READINGS for column in self.columns)
+
+    def address(self, column: str) -> str:
+        """The address of one of its numbers."""
+        field, *part = column.split(".")
+        return ".".join(["effect", field, *([self.at] if self.at else []), *part])

@@ -14,43 +14,12 @@ import numpy as np
 from easi_jax.errors import UserError
 from easi_jax.model import addresses as language
 from easi_jax.model.effect_catalog import SHARED
-from easi_jax.model.effect_numbers import EFFECT_TABLE, field_of, fields_that_act
+from easi_jax.model.effect_numbers import EFFECT_TABLE, EffectEntry
 from easi_jax.model.parameters import Parameter, ParameterSpace
 
-_READINGS = fields_that_act("readings")
 _STDS = 3.0
 _SHARE = 0.1  # of a value, at least, that it is taken to be uncertain by
 _FARTHER = 2.0  # times the upper end of where a search starts, that a delay may reach
-
-
-@dataclass(frozen=True)
-class EffectEntry:
-    """One effect.
-
-    Attributes:
-        effect: name.
-        at: joint, actuator or body; "" for the whole model.
-        kind: what ``at`` is.
-        columns: values of fields of `easi_jax.model.effects.Effects`, by name; vectors
-            have a name for each entry, such as ``com.0``.
-        std: their standard deviations, where known.
-    """
-
-    effect: str
-    at: str
-    kind: str
-    columns: Mapping[str, float]
-    std: Mapping[str, float]
-
-    @property
-    def of_readings(self) -> bool:
-        """Whether it is in the readings of a sensor, not in the physics."""
-        return all(field_of(column) in _READINGS for column in self.columns)
-
-    def address(self, column: str) -> str:
-        """The address of one of its numbers."""
-        field, *part = column.split(".")
-        return ".".join(["effect", field, *([self.at] if self.at else []), *part])
 
 
 @dataclass(frozen=True)

@@ -8,25 +8,20 @@ and every number compared with what was meant.
 
 import contextlib
 import ctypes
-import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from easi_jax.errors import UserError
 from easi_jax.io.models.mjcf import mujoco_warnings, ways
-from easi_jax.model.contact_pairs import contact_pairs, geom_name, pair_names
-from easi_jax.model.effects import tilted
-from easi_jax.model.found_effects import EffectEntry
+from easi_jax.model.effect_catalog import CATALOG
+from easi_jax.model.effect_numbers import EffectEntry
 from easi_jax.model.joint_space import joint_name
-from easi_jax.model.quantities import actuator_name, body_name, direct_solref
 
 _ASSETS = "assets"  # folder beside the model
 _DIGITS = 17  # of a double, so that it is read as it was
@@ -294,172 +289,8 @@ def _add(spec: mujoco.MjSpec, e: EffectEntry) -> list[str] | None:
     Raises:
         ValueError: as before, found only when it was written.
     """
-    if e.effect not in _WRITERS:
+    mjcf = CATALOG[e.effect].mjcf
+    if mjcf is None or not mjcf.build(spec, spec.compile(), e):
         return None
-    m = spec.compile()
-    build, write = _WRITERS[e.effect]
-    if not build(spec, m, e):
-        return None
-    meant = _changed(spec, lambda m: write(m, e))
+    meant = _changed(spec, lambda m: mjcf.write(m, e))
     return deviations(spec.compile(), meant)
-
-
-def _index(m: mujoco.MjModel, e: EffectEntry) -> int:
-    """The joint, actuator or body that an effect is at; ValueError without it."""
-    count, name = {
-        "joint": (m.njnt, joint_name),
-        "actuator": (m.nu, actuator_name),
-        "body": (m.nbody, body_name),
-    }[e.kind]
-    return [name(m, i) for i in range(count)].index(e.at)
-
-
-def _nothing(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
-    return True
-
-
-def _of_joint(field: str, column: str) -> Callable[[mujoco.MjModel, EffectEntry], None]:
-    def write(m: mujoco.MjModel, e: EffectEntry) -> None:
-        getattr(m, field)[m.jnt_dofadr[_index(m, e)]] += e.columns[column]
-
-    return write
-
-
-def _springy(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
-    return m.jnt_stiffness[_index(m, e)] + e.columns["stiffness"] > 0
-
-
-def _spring(m: mujoco.MjModel, e: EffectEntry) -> None:
-    """Another spring at a joint that may have one: stiffnesses and torques add up."""
-    j = _index(m, e)
-    q, old = m.jnt_qposadr[j], float(m.jnt_stiffness[j])
-    torque = old * float(m.qpos_spring[q]) + e.columns["spring"]
-    m.jnt_stiffness[j] = old + e.columns["stiffness"]
-    m.qpos_spring[q] = torque / m.jnt_stiffness[j]
-
-
-def _gain(m: mujoco.MjModel, e: EffectEntry) -> None:
-    m.actuator_gainprm[_index(m, e), :3] *= e.columns["gain"]
-
-
-def _saturation(m: mujoco.MjModel, e: EffectEntry) -> None:
-    a, limit = _index(m, e), e.columns["limit"]
-    edges = -limit, limit
-    if m.actuator_forcelimited[a]:
-        low, high = m.actuator_forcerange[a]
-        edges = max(low, -limit), min(high, limit)
-    m.actuator_forcelimited[a] = True
-    m.actuator_forcerange[a] = edges
-
-
-def _filtered(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
-    actuator = spec.actuators[_index(m, e)]
-    if actuator.dyntype != mujoco.mjtDyn.mjDYN_NONE:
-        return False
-    actuator.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
-    return True
-
-
-def _lag(m: mujoco.MjModel, e: EffectEntry) -> None:
-    m.actuator_dynprm[_index(m, e), 0] = e.columns["lag"]
-
-
-def _delayed(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
-    # MuJoCo C keeps a history of commands; MJX does not.
-    actuator, delay = spec.actuators[_index(m, e)], e.columns["delay"]
-    actuator.delay = delay
-    actuator.nsample = math.ceil(delay / m.opt.timestep) + 2
-    return True
-
-
-def _body(m: mujoco.MjModel, e: EffectEntry) -> None:
-    b, c = _index(m, e), e.columns
-    extra, mass = c.get("mass", 0.0), float(m.body_mass[b])
-    m.body_mass[b] = mass + extra
-    m.body_ipos[b] += [c.get(f"com.{i}", 0.0) for i in range(3)]
-    if mass > 0:
-        m.body_inertia[b] *= 1 + c.get("spread", 0.0) * extra / mass
-
-
-def _gravity(m: mujoco.MjModel, e: EffectEntry) -> None:
-    with jax.enable_x64(True):
-        tilt = jnp.array([e.columns["tilt.0"], e.columns["tilt.1"]])
-        m.opt.gravity = np.asarray(tilted(jnp.asarray(m.opt.gravity), tilt))
-
-
-def _pair_made(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
-    """Makes the ``<pair>`` of two geoms from their numbers where there is none."""
-    if e.kind != "geom":
-        return True
-    p = contact_pairs(m)[pair_names(m)[e.at]]
-    names = [geom_name(m, g) for g in p.geoms]
-    for g, name in zip(p.geoms, names, strict=True):
-        spec.geoms[g].name = name
-    if _pair_of(m, e.at) is None:
-        pair = spec.add_pair(geomname1=names[0], geomname2=names[1])
-        pair.condim, pair.margin, pair.solimp = p.dim, p.margin, p.solimp
-        pair.friction, pair.solref = p.friction, p.solref
-    return True
-
-
-def _pair_of(m: mujoco.MjModel, at: str) -> int | None:
-    """The stated pair of two geoms."""
-    geoms = {*contact_pairs(m)[pair_names(m)[at]].geoms}
-    stated = zip(m.pair_geom1.tolist(), m.pair_geom2.tolist(), strict=True)
-    return next((k for k, pair in enumerate(stated) if {*pair} == geoms), None)
-
-
-def _slip(m: mujoco.MjModel, e: EffectEntry) -> None:
-    """Pairs hold their own numbers, geoms those of the other contacts."""
-    if e.kind == "geom":
-        m.pair_friction[_pair_of(m, e.at), :2] *= e.columns["slip"]
-    else:
-        m.geom_friction[:, 0] *= e.columns["friction"]
-        m.pair_friction[:, :2] *= e.columns["friction"]
-
-
-def _soft(m: mujoco.MjModel, e: EffectEntry) -> None:
-    name = "give" if e.kind == "geom" else "softness"
-    factors = np.array([e.columns[f"{name}.{i}"] for i in range(2)])
-    if e.kind == "geom":
-        k = _pair_of(m, e.at)
-        m.pair_solref[k] = _softer(m, m.pair_solref[[k]], factors)[0]
-    else:
-        m.geom_solref[:] = _softer(m, m.geom_solref, factors)
-        m.pair_solref[:] = _softer(m, m.pair_solref, factors)
-
-
-def _softer(m: mujoco.MjModel, solref: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Contacts ``(n, 2)`` whose stiffness and damping are multiplied by ``factors``."""
-    safe = not m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE
-    least = 2 * m.opt.timestep if safe else 0.0
-    # Stiffness goes with the inverse square of the time constant, damping with its
-    # inverse. MuJoCo takes weighed means of both numbers of two geoms.
-    out = solref * np.array([1, factors[1] / np.sqrt(factors[0])])
-    out[:, 0] = np.maximum(solref[:, 0], least) / factors[1]
-    if (solref > 0).all() and (out[:, 0] >= least).all():
-        return out
-    direct = -np.array([direct_solref(m, row) for row in solref]) * factors
-    if len(np.unique(direct[solref[:, 0] > 0], axis=0)) > 1:
-        raise ValueError("contacts of unequal time constants at the least that is safe")
-    return direct
-
-
-_Build = Callable[[mujoco.MjSpec, mujoco.MjModel, EffectEntry], bool]
-_Write = Callable[[mujoco.MjModel, EffectEntry], None]
-# What must be there before an effect's numbers, whether it can; and those numbers.
-_WRITERS: dict[str, tuple[_Build, _Write]] = {
-    "coulomb_friction": (_nothing, _of_joint("dof_frictionloss", "coulomb")),
-    "viscous_damping": (_nothing, _of_joint("dof_damping", "damping")),
-    "armature": (_nothing, _of_joint("dof_armature", "armature")),
-    "joint_stiffness": (_springy, _spring),
-    "actuator_gain": (_nothing, _gain),
-    "actuator_saturation": (_nothing, _saturation),
-    "actuator_lag": (_filtered, _lag),
-    "actuator_delay": (_delayed, lambda m, e: None),
-    "payload_mass": (_nothing, _body),
-    "com_offset": (_nothing, _body),
-    "gravity_tilt": (_nothing, _gravity),
-    "contact_friction": (_pair_made, _slip),
-    "contact_softness": (_pair_made, _soft),
-}

@@ -1,0 +1,187 @@
+"""How MJCF says an effect: numbers of a compiled model, and what must be there first.
+
+MuJoCo writes the numbers back into a model's text; see
+`easi_jax.io.models.repaired_mjcf`.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from easi_jax.model.contact_pairs import contact_pairs, geom_name, pair_names
+from easi_jax.model.effect_numbers import EffectEntry
+from easi_jax.model.effects import tilted
+from easi_jax.model.joint_space import joint_name
+from easi_jax.model.quantities import actuator_name, body_name, direct_solref
+
+
+@dataclass(frozen=True)
+class InMjcf:
+    """An effect in MJCF.
+
+    Attributes:
+        write: sets its numbers in a compiled model.
+        build: makes what must be there before, in the model's text and from that
+            compiled; whether it can.
+    """
+
+    write: Callable[[mujoco.MjModel, EffectEntry], None]
+    build: Callable[[mujoco.MjSpec, mujoco.MjModel, EffectEntry], bool] = (
+        lambda spec, m, e: True
+    )
+
+
+def _index(m: mujoco.MjModel, e: EffectEntry) -> int:
+    """The joint, actuator or body that an effect is at; ValueError without it."""
+    count, name = {
+        "joint": (m.njnt, joint_name),
+        "actuator": (m.nu, actuator_name),
+        "body": (m.nbody, body_name),
+    }[e.kind]
+    return [name(m, i) for i in range(count)].index(e.at)
+
+
+def _of_joint(field: str, column: str) -> Callable[[mujoco.MjModel, EffectEntry], None]:
+    def write(m: mujoco.MjModel, e: EffectEntry) -> None:
+        getattr(m, field)[m.jnt_dofadr[_index(m, e)]] += e.columns[column]
+
+    return write
+
+
+def _springy(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
+    return m.jnt_stiffness[_index(m, e)] + e.columns["stiffness"] > 0
+
+
+def _spring(m: mujoco.MjModel, e: EffectEntry) -> None:
+    """Another spring at a joint that may have one: stiffnesses and torques add up."""
+    j = _index(m, e)
+    q, old = m.jnt_qposadr[j], float(m.jnt_stiffness[j])
+    torque = old * float(m.qpos_spring[q]) + e.columns["spring"]
+    m.jnt_stiffness[j] = old + e.columns["stiffness"]
+    m.qpos_spring[q] = torque / m.jnt_stiffness[j]
+
+
+def _gain(m: mujoco.MjModel, e: EffectEntry) -> None:
+    m.actuator_gainprm[_index(m, e), :3] *= e.columns["gain"]
+
+
+def _saturation(m: mujoco.MjModel, e: EffectEntry) -> None:
+    a, limit = _index(m, e), e.columns["limit"]
+    edges = -limit, limit
+    if m.actuator_forcelimited[a]:
+        low, high = m.actuator_forcerange[a]
+        edges = max(low, -limit), min(high, limit)
+    m.actuator_forcelimited[a] = True
+    m.actuator_forcerange[a] = edges
+
+
+def _filtered(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
+    actuator = spec.actuators[_index(m, e)]
+    if actuator.dyntype != mujoco.mjtDyn.mjDYN_NONE:
+        return False
+    actuator.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
+    return True
+
+
+def _lag(m: mujoco.MjModel, e: EffectEntry) -> None:
+    m.actuator_dynprm[_index(m, e), 0] = e.columns["lag"]
+
+
+def _delayed(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
+    # MuJoCo C keeps a history of commands; MJX does not.
+    actuator, delay = spec.actuators[_index(m, e)], e.columns["delay"]
+    actuator.delay = delay
+    actuator.nsample = math.ceil(delay / m.opt.timestep) + 2
+    return True
+
+
+def _body(m: mujoco.MjModel, e: EffectEntry) -> None:
+    b, c = _index(m, e), e.columns
+    extra, mass = c.get("mass", 0.0), float(m.body_mass[b])
+    m.body_mass[b] = mass + extra
+    m.body_ipos[b] += [c.get(f"com.{i}", 0.0) for i in range(3)]
+    if mass > 0:
+        m.body_inertia[b] *= 1 + c.get("spread", 0.0) * extra / mass
+
+
+def _gravity(m: mujoco.MjModel, e: EffectEntry) -> None:
+    with jax.enable_x64(True):
+        tilt = jnp.array([e.columns["tilt.0"], e.columns["tilt.1"]])
+        m.opt.gravity = np.asarray(tilted(jnp.asarray(m.opt.gravity), tilt))
+
+
+def _pair_made(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
+    """Makes the ``<pair>`` of two geoms from their numbers where there is none."""
+    if e.kind != "geom":
+        return True
+    p = contact_pairs(m)[pair_names(m)[e.at]]
+    names = [geom_name(m, g) for g in p.geoms]
+    for g, name in zip(p.geoms, names, strict=True):
+        spec.geoms[g].name = name
+    if _pair_of(m, e.at) is None:
+        pair = spec.add_pair(geomname1=names[0], geomname2=names[1])
+        pair.condim, pair.margin, pair.solimp = p.dim, p.margin, p.solimp
+        pair.friction, pair.solref = p.friction, p.solref
+    return True
+
+
+def _pair_of(m: mujoco.MjModel, at: str) -> int | None:
+    """The stated pair of two geoms."""
+    geoms = {*contact_pairs(m)[pair_names(m)[at]].geoms}
+    stated = zip(m.pair_geom1.tolist(), m.pair_geom2.tolist(), strict=True)
+    return next((k for k, pair in enumerate(stated) if {*pair} == geoms), None)
+
+
+def _slip(m: mujoco.MjModel, e: EffectEntry) -> None:
+    """Pairs hold their own numbers, geoms those of the other contacts."""
+    if e.kind == "geom":
+        m.pair_friction[_pair_of(m, e.at), :2] *= e.columns["slip"]
+    else:
+        m.geom_friction[:, 0] *= e.columns["friction"]
+        m.pair_friction[:, :2] *= e.columns["friction"]
+
+
+def _soft(m: mujoco.MjModel, e: EffectEntry) -> None:
+    name = "give" if e.kind == "geom" else "softness"
+    factors = np.array([e.columns[f"{name}.{i}"] for i in range(2)])
+    if e.kind == "geom":
+        k = _pair_of(m, e.at)
+        m.pair_solref[k] = _softer(m, m.pair_solref[[k]], factors)[0]
+    else:
+        m.geom_solref[:] = _softer(m, m.geom_solref, factors)
+        m.pair_solref[:] = _softer(m, m.pair_solref, factors)
+
+
+def _softer(m: mujoco.MjModel, solref: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Contacts ``(n, 2)`` whose stiffness and damping are multiplied by ``factors``."""
+    safe = not m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE
+    least = 2 * m.opt.timestep if safe else 0.0
+    # Stiffness goes with the inverse square of the time constant, damping with its
+    # inverse. MuJoCo takes weighed means of both numbers of two geoms.
+    out = solref * np.array([1, factors[1] / np.sqrt(factors[0])])
+    out[:, 0] = np.maximum(solref[:, 0], least) / factors[1]
+    if (solref > 0).all() and (out[:, 0] >= least).all():
+        return out
+    direct = -np.array([direct_solref(m, row) for row in solref]) * factors
+    if len(np.unique(direct[solref[:, 0] > 0], axis=0)) > 1:
+        raise ValueError("contacts of unequal time constants at the least that is safe")
+    return direct
+
+
+COULOMB = InMjcf(_of_joint("dof_frictionloss", "coulomb"))
+DAMPING = InMjcf(_of_joint("dof_damping", "damping"))
+ARMATURE = InMjcf(_of_joint("dof_armature", "armature"))
+SPRING = InMjcf(_spring, _springy)
+GAIN = InMjcf(_gain)
+LIMIT = InMjcf(_saturation)
+LAG = InMjcf(_lag, _filtered)
+DELAY = InMjcf(lambda m, e: None, _delayed)
+BODY = InMjcf(_body)
+TILT = InMjcf(_gravity)
+FRICTION = InMjcf(_slip, _pair_made)
+SOFTNESS = InMjcf(_soft, _pair_made)
