@@ -1,63 +1,83 @@
-"""Where the default tests spend their time: compiling, in child processes, the rest.
+"""``python -m benchmarks.where_tests_spend``: what the default tests' time goes into.
 
-    python -m benchmarks.where_tests_spend --out results/test_times.json [pytest's options]
-
-Runs pytest with itself as a plugin. For each test: seconds in all, seconds jax spent
-tracing, lowering and compiling, seconds its child processes ran, and their number.
+Runs pytest with this module as a plugin. For each test it counts seconds in all,
+seconds in which jax traced, lowered and compiled, and seconds spent waiting for child
+processes. Seconds of compiling overlap where one program is traced inside another.
 """
 
-import argparse
 import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-FOLDER = "EASI_TEST_TIMES"
+from benchmarks._common import markdown_table, write_result
+from train._command import main, say
+
+FOLDER = "EASI_JAX_TEST_TIMES"  # environment variable: where workers write their rows
+STAGES = ("jaxpr_trace", "jaxpr_to_mlir_module", "backend_compile")
+SLOWEST = 10
 _spent: dict[str, float] = defaultdict(float)
+_waiting: list[bool] = []
 
 
-def _on_duration(event: str, seconds: float, **_: object) -> None:
-    for name in ("jaxpr_trace", "jaxpr_to_mlir_module", "backend_compile"):
+@dataclass(frozen=True)
+class Config:
+    """Times the default tests and writes ``NAME.json`` beside the other results."""
+
+    name: str = "test_times"
+    """Name of the result."""
+    workers: int = 2
+    """Processes that share the tests."""
+    paths: tuple[str, ...] = ()
+    """Test files; not given: all."""
+    limit: float = 7200.0
+    """Seconds after which the tests are stopped."""
+
+
+def _on_duration(event: str, duration_secs: float, **_: str | int) -> None:
+    for name in STAGES:
         if event.endswith(f"{name}_duration"):
-            _spent[name] += seconds
+            _spent[name] += duration_secs
+
+
+def _timed(call: Callable[..., Any]) -> Callable[..., Any]:
+    """``call`` with the seconds of its outermost run counted."""
+
+    def inner(*args: Any, **kwargs: Any) -> Any:
+        begin = time.perf_counter()
+        _waiting.append(True)
+        try:
+            return call(*args, **kwargs)
+        finally:
+            _waiting.pop()
+            if not _waiting:
+                _spent["processes"] += time.perf_counter() - begin
+
+    return inner
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Listens to jax and to child processes."""
+    del config
     import jax
 
     jax.monitoring.register_event_duration_secs_listener(_on_duration)
-    wait = subprocess.Popen.wait
-    communicate = subprocess.Popen.communicate
-
-    def timed(call):  # type: ignore[no-untyped-def]
-        def inner(self, *args, **kwargs):  # type: ignore[no-untyped-def]
-            begin = time.perf_counter()
-            nested = _spent["nested"]
-            _spent["nested"] = 1.0
-            try:
-                return call(self, *args, **kwargs)
-            finally:
-                _spent["nested"] = nested
-                if not nested:
-                    _spent["processes"] += time.perf_counter() - begin
-                    _spent["process_waits"] += 1
-
-        return inner
-
-    subprocess.Popen.wait = timed(wait)
-    subprocess.Popen.communicate = timed(communicate)
+    for name in ("wait", "communicate"):
+        setattr(subprocess.Popen, name, _timed(getattr(subprocess.Popen, name)))
 
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Writes one line a test."""
+    """Writes one line a test; a fixture counts where it is first asked for."""
     _spent.clear()
     begin, cpu = time.perf_counter(), time.process_time()
     yield
@@ -65,56 +85,63 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
         "test": item.nodeid,
         "seconds": time.perf_counter() - begin,
         "cpu": time.process_time() - cpu,
-        **{k: v for k, v in _spent.items() if k != "nested"},
+        **_spent,
     }
     with (Path(os.environ[FOLDER]) / f"{os.getpid()}.jsonl").open("a") as file:
         file.write(json.dumps(row) + "\n")
 
 
-def main() -> int:
-    """Runs the tests, adds up, writes the file."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True)
-    args, rest = parser.parse_known_args()
-    parts = args.out.with_suffix(".parts")
-    parts.mkdir(parents=True, exist_ok=True)
-    for old in parts.glob("*.jsonl"):
-        old.unlink()
-    begin = time.perf_counter()
-    status = subprocess.run(
-        [sys.executable, "-m", "pytest", "-p", "benchmarks.where_tests_spend", *rest],
-        env={**os.environ, FOLDER: str(parts.absolute())},
-        timeout=4 * 3600,
-        check=False,
-    ).returncode
-    rows = [
-        json.loads(line)
-        for path in sorted(parts.glob("*.jsonl"))
-        for line in path.read_text().splitlines()
-    ]
-    rows.sort(key=lambda r: -r["seconds"])
+def summed(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Sums of all numbers of ``rows``, to a tenth of a second."""
     total: dict[str, float] = defaultdict(float)
     for row in rows:
         for key, value in row.items():
             if key != "test":
                 total[key] += value
-    args.out.write_text(
-        json.dumps(
-            {
-                "wall": time.perf_counter() - begin,
-                "status": status,
-                "tests": len(rows),
-                "total": {k: round(v, 1) for k, v in total.items()},
-                "rows": [
-                    {k: v if k == "test" else round(v, 3) for k, v in r.items()}
-                    for r in rows
-                ],
-            },
-            indent=1,
-        )
+    return {key: round(value, 1) for key, value in total.items()}
+
+
+def run(config: Config) -> None:
+    """Runs the tests, adds up, writes and shows the result."""
+    begin = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        status = subprocess.run(
+            [
+                *(sys.executable, "-m", "pytest", "-q", "-n", str(config.workers)),
+                *("--dist", "loadfile", "--no-loadscope-reorder"),
+                *("-p", "benchmarks.where_tests_spend", *config.paths),
+            ],
+            env={**os.environ, FOLDER: folder},
+            timeout=config.limit,
+            check=False,
+        ).returncode
+        rows = [
+            json.loads(line)
+            for path in sorted(Path(folder).glob("*.jsonl"))
+            for line in path.read_text().splitlines()
+        ]
+    wall = time.perf_counter() - begin
+    rows.sort(key=lambda row: -row["seconds"])
+    files: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for row in rows:
+        files[row["test"].partition("::")[0]].append(row)
+    by_file = {name: summed(part) for name, part in files.items()}
+    slowest = [{"test": row["test"], **summed([row])} for row in rows[:SLOWEST]]
+    path = write_result(
+        config.name,
+        "python -m benchmarks.where_tests_spend",
+        config,
+        exit_status=status,
+        wall=round(wall, 1),
+        tests=len(rows),
+        total=summed(rows),
+        slowest=slowest,
+        files=dict(sorted(by_file.items(), key=lambda item: -item[1]["seconds"])),
     )
-    return status
+    table = [(row["test"], row["seconds"]) for row in slowest]
+    say(markdown_table(("test", "s"), table))
+    say(f"{len(rows)} tests in {wall:.0f} s, exit status {status}: {path}")
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main(Config, run, name="benchmarks.where_tests_spend")

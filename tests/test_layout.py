@@ -3,6 +3,7 @@
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -60,6 +61,7 @@ def _imports(tree: ast.Module) -> Iterator[str]:
                 yield alias.name
 
 
+@cache
 def _ours() -> dict[str, tuple[Path, ast.Module]]:
     tops = ("easi_jax", "envs", "train", "benchmarks", "scripts")
     return {_name(p): (p, t) for top in tops for p, t in _modules(top)}
