@@ -3,7 +3,17 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import mujoco
+    import numpy as np
+
+    from easi_jax.data.recording import Run
+    from easi_jax.gap.sensor_faults import ReadingFault
+    from easi_jax.model.parameters import ParameterSpace
+    from envs.robot import Robot
+    from train._gap_config import Config
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,8 +29,8 @@ class GivenModel:
 
     name: str
     path: Path | None
-    mj_model: Any
-    env: Any
+    mj_model: "mujoco.MjModel"
+    env: "Robot | None"
 
     @property
     def source(self) -> Path:
@@ -50,13 +60,13 @@ class GapProblem:
     """
 
     model: GivenModel
-    space: Any
-    fit: list[Any]
-    held: list[Any]
+    space: "ParameterSpace"
+    fit: "list[Run]"
+    held: "list[Run]"
     held_name: str
     held_names: list[str]
-    noise: Any
-    readings: list[Any]
+    noise: "np.ndarray"
+    readings: "list[ReadingFault]"
     notes: list[str]
 
     @property
@@ -67,7 +77,7 @@ class GapProblem:
         return set_by_none(self.model.mj_model, self.space, self.model.fixed)
 
 
-def read_gap_problem(config: Any) -> GapProblem:
+def read_gap_problem(config: "Config") -> GapProblem:
     """Reads and checks everything; nothing is written yet.
 
     Raises:
@@ -103,7 +113,7 @@ def read_gap_problem(config: Any) -> GapProblem:
     )
 
 
-def beyond_mjcf(space: Any) -> dict[str, float]:
+def beyond_mjcf(space: "ParameterSpace") -> dict[str, float]:
     """Nominal values of a built-in robot's parameters that MJCF has no word for."""
     return {
         address: p.nominal

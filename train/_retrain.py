@@ -1,7 +1,10 @@
 """What ``train.gap --retrain`` does: is a policy better for knowing the effects?"""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from easi_jax.model.results import Retrained
 
 
 def check_robot(robot: str, mj_model: Any, env_steps: int | None = None) -> None:
@@ -41,16 +44,14 @@ def retrain(
     seeds: tuple[int, ...],
     env_steps: int | None,
     resume: bool = False,
-) -> dict[str, Any]:
+) -> "Retrained":
     """Trains a policy with the effects and one without, and tests both with them.
 
     Runs of ``train.udr`` in ``folder/retrain_with`` and ``folder/retrain_without``; the
     robot with the effects stands for the real one. ``resume`` goes on with them.
-
-    Returns:
-        ``robot``, ``env_steps`` and returns by seed, ``without`` and ``with``.
     """
     from easi_jax.io.files import read_json
+    from easi_jax.model.results import Retrained
     from train import udr
     from train._command import say
 
@@ -75,4 +76,4 @@ def retrain(
         told = read_json(out / "results.json")
         (returns[which],) = told["returns"].values()
         steps = told["env_steps"]
-    return {"robot": robot, "env_steps": steps, **returns}
+    return Retrained(robot, steps, returns["without"], returns["with"])

@@ -642,6 +642,7 @@ class Analysis:
                     explained(gap, fair[1].gap, floor_gap) / (1.0 + odds),
                     [k for k in dict.fromkeys(p.key for p in same) if k not in mine],
                     figures.gap,
+                    numbers.fitted(place),
                     numbers.deviations(place),
                     parts,
                 )

@@ -37,8 +37,8 @@ class Found:
             among them.
         indistinguishable: rivals that predict the held-out data as well.
         gap_after: held-out gap with it and those before it.
-        deviations: standard deviation of each of the place's columns that the fit
-            moved, by its number among them.
+        fitted: value of each of the place's columns, by its number among them.
+        deviations: standard deviations of those that the fit moved.
         parts: of a shared effect (`Place.shared`), the actuators that it is seen at.
     """
 
@@ -47,6 +47,7 @@ class Found:
     confidence: float
     indistinguishable: list[str]
     gap_after: float
+    fitted: dict[int, float] = field(default_factory=dict)
     deviations: dict[int, float] = field(default_factory=dict)
     parts: tuple[Part, ...] = ()
 
@@ -85,7 +86,6 @@ class Outcome:
         disagreeing: runs that the model predicts far worse than the others, with how
             many times.
         horizon: of the predictions [s].
-        record_next: what to record to tell names apart, a sentence for each pair.
     """
 
     verdict: str
@@ -102,7 +102,6 @@ class Outcome:
     active: list[int]
     notes: list[str] = field(default_factory=list)
     disagreeing: dict[str, float] = field(default_factory=dict)
-    record_next: list[str] = field(default_factory=list)
     seconds: float = 0.0
     horizon: float = 0.0
 
@@ -120,6 +119,11 @@ class Numbers:
         active = model.fit.active.tolist()
         std = _deviations(selector, model).tolist()
         self._std = dict(zip(active, std, strict=True))
+
+    def fitted(self, place: Place) -> dict[int, float]:
+        """Values of a place's columns, by number."""
+        index = self.selector.columns(place, fitted=False)
+        return dict(enumerate(self.model.fit.x[index].tolist()))
 
     def deviations(self, place: Place) -> dict[int, float]:
         """Of a place's columns that the fit moved, by number."""

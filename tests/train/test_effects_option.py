@@ -166,13 +166,13 @@ def test_the_whole_chain_in_one_program(files: Path) -> None:
 def test_retraining_tests_both_policies_with_the_effects(files: Path) -> None:
     out = files / "retrained"
     told = retrain("cartpole", out, files / "found.yaml", (0, 3), 2400)
-    assert told["env_steps"] == 2400 and told["robot"] == "cartpole"
-    for which in ("with", "without"):
-        assert set(told[which]) == {"0", "3"}
+    assert told.env_steps == 2400 and told.robot == "cartpole"
+    for which, returns in (("with", told.with_effects), ("without", told.without)):
+        assert set(returns) == {"0", "3"}
         results = read(out / f"retrain_{which}" / "results.json")
         assert results["target"][NAMES[0]] == 0.3
         assert ("effects" in results) == (which == "with")
-    assert told["with"] != told["without"]
+    assert told.with_effects != told.without
 
 
 def test_retraining_needs_a_robot_with_the_places() -> None:

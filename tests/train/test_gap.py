@@ -287,6 +287,6 @@ def test_what_a_parameter_sets_is_not_fixed_beside_it() -> None:
     some = space.select([n for n in space.names if n != "cart_speed_limit"])
     (address,) = space.parameters[space.index("cart_speed_limit")].addresses
     for own, left in ((some, {address}), (space, set())):
-        problem = GapProblem(model, own, [], [], "", [], None, [], [])
+        problem = GapProblem(model, own, [], [], "", [], np.zeros(0), [], [])
         assert problem.fixed.keys() == left
         Simulator(model.mj_model, own, 0.02, fixed=problem.fixed)

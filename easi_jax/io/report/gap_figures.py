@@ -64,17 +64,26 @@ def traces(
 
 @styled
 def gap_steps(
-    labels: Sequence[str], gaps: Sequence[float], low: float, high: float, floor: float
+    labels: Sequence[str],
+    gaps: Sequence[float],
+    low: float,
+    high: float,
+    floor: float,
+    rising: Sequence[int] = (),
 ) -> str:
     """The held-out gap as given, refitted and after each effect, and the noise floor.
 
     Args:
         low, high: 95 % interval of the last.
+        rising: places of effects with which the gap rises.
     """
     figure, (axis,) = grid(1, 1, 0.42 * len(labels) + 0.9)
     y = np.arange(len(labels))[::-1]
     colors = [VERMILION, *([FAINT] * (len(labels) - 2)), BLUE][: len(labels)]
-    axis.barh(y, gaps, color=colors, height=0.6)
+    bars = axis.barh(y, gaps, color=colors, height=0.6)
+    for k in rising:
+        bars[k].set(hatch="///", edgecolor=VERMILION)
+    labels = [f"{t} (rises)" if k in rising else t for k, t in enumerate(labels)]
     axis.plot([low, high], [y[-1], y[-1]], color=INK, lw=2)
     axis.axvline(floor, **DASHED)
     axis.text(floor, len(labels) - 0.45, " noise floor", color=INK, va="bottom")

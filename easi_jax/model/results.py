@@ -1,0 +1,200 @@
+"""What commands found, as plain values: files and reports are made from these."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+Values = Mapping[str, tuple[float, float, str]]  # value, standard deviation, unit
+
+
+@dataclass(frozen=True)
+class NamedEffect:
+    """One effect that a model lacks, or that is in a sensor's readings.
+
+    Attributes:
+        effect: name.
+        kind: what its places are: joint, actuator, body, sensor, geom or model.
+        at: its places; several where like actuators have it alike, ``("",)`` for the
+            whole model.
+        values: of its parameters.
+        confidence: probability of this name against its rivals.
+        indistinguishable: rivals that predict the held-out data as well.
+        gap_before: held-out gap before it.
+        gaps: held-out gap with it at each of ``at`` and those before.
+        columns: values of fields of `easi_jax.model.effects.Effects`, by name.
+        std: their standard deviations, where known.
+        shared: whether it was found as one of all actuators.
+    """
+
+    effect: str
+    kind: str
+    at: tuple[str, ...]
+    values: Values
+    confidence: float
+    indistinguishable: tuple[str, ...]
+    gap_before: float
+    gaps: tuple[float, ...]
+    columns: Mapping[str, float]
+    std: Mapping[str, float]
+    shared: bool = False
+
+    @property
+    def label(self) -> str:
+        """``effect@at``, or ``effect@all``."""
+        return f"{self.effect}@{'all' if self.shared else self.at[0]}"
+
+    @property
+    def gap_after(self) -> float:
+        """Held-out gap with it and those before it."""
+        return self.gaps[-1]
+
+    @property
+    def rises(self) -> bool:
+        """Whether the held-out gap rises with it."""
+        return self.gap_after > self.gap_before
+
+
+@dataclass(frozen=True)
+class Refitted:
+    """A model's own parameter that a refit moved, SI units."""
+
+    address: str
+    nominal: float
+    value: float
+    std: float
+
+
+@dataclass(frozen=True)
+class GapFigures:
+    """Held-out gap of one model.
+
+    Attributes:
+        gap: in units of the motion.
+        interval: its 95 % interval.
+        si: RMS error of each channel, in its unit.
+        not_finite: windows whose prediction is not.
+    """
+
+    gap: float
+    interval: tuple[float, float]
+    si: tuple[float, ...]
+    not_finite: int = 0
+
+
+@dataclass(frozen=True)
+class ErrorPlace:
+    """A joint's share of the squared gap, and when its error is largest."""
+
+    at: str
+    share: float
+    when: str
+
+
+@dataclass(frozen=True)
+class ErrorMap:
+    """RMS errors of joints under conditions, as shares of their motion.
+
+    Attributes:
+        joints, conditions: names.
+        before, after: ``(joints, conditions)``; NaN where it did not occur.
+        floor: of each joint, ``(joints,)``.
+    """
+
+    joints: tuple[str, ...]
+    conditions: tuple[str, ...]
+    before: np.ndarray
+    after: np.ndarray
+    floor: np.ndarray
+
+
+@dataclass(frozen=True)
+class Traces:
+    """Measured and predicted motion in some windows.
+
+    Attributes:
+        time: ``(H + 1,)`` [s].
+        measured, before, after: ``(windows, H + 1, channels)``.
+        names, units: of the channels.
+    """
+
+    time: np.ndarray
+    measured: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Retrained:
+    """Returns of policies in the repaired model, by seed.
+
+    Attributes:
+        env_steps: of each training; None where the preset's.
+        without, with_effects: trained without what was found, and with it.
+    """
+
+    robot: str
+    env_steps: int | None
+    without: Mapping[str, float]
+    with_effects: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class GapResult:
+    """What the gap workflow found; see the log format's ``gap.json``.
+
+    Attributes:
+        model: name.
+        verdict: ``explained``, ``no_gap`` or ``unexplained``.
+        effects: that the model lacks, in their order.
+        readings: effects in the readings of sensors.
+        before, refit, after: as given, own parameters refitted, with the effects.
+        floor: gap of a perfect model; ``floor_si`` of each channel, in its unit.
+        channels, units: what is compared.
+        ignored: reason for each channel that is left out.
+        held_out: runs; ``held_name`` says it in words.
+        horizon: of the predictions [s].
+        disagreeing: runs that the model predicts far worse than the others, with how
+            many times.
+        seconds: that it took.
+        notes: what the user should know.
+        where: places of the remaining error, largest first; None where not known.
+        record_next: what to record to tell names apart, a sentence for each pair.
+        not_in_model_xml: what MJCF has no word for; None where it was not written.
+        retrained: None where no policy was.
+    """
+
+    model: str
+    verdict: str
+    effects: tuple[NamedEffect, ...]
+    readings: tuple[NamedEffect, ...]
+    refitted: tuple[Refitted, ...]
+    before: GapFigures
+    refit: GapFigures
+    after: GapFigures
+    floor: float
+    floor_si: tuple[float, ...]
+    channels: tuple[str, ...]
+    units: tuple[str, ...]
+    ignored: Mapping[str, str]
+    held_out: tuple[str, ...]
+    held_name: str
+    horizon: float
+    disagreeing: Mapping[str, float]
+    seconds: float
+    notes: tuple[str, ...] = ()
+    where: tuple[ErrorPlace, ...] | None = None
+    record_next: tuple[str, ...] = ()
+    not_in_model_xml: tuple[str, ...] | None = None
+    retrained: Retrained | None = None
+
+    def times_floor(self, gap: float) -> float:
+        """A gap in units of that of a perfect model."""
+        return gap / self.floor if self.floor > 0 else math.inf
+
+    def noted(self, notes: Sequence[str]) -> "GapResult":
+        """With more notes."""
+        return replace(self, notes=(*self.notes, *notes))
