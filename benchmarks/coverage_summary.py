@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks._cells import read_rows
 from benchmarks._common import commits_of, markdown_table
+from benchmarks._page import Section, met
 from benchmarks.coverage import WAYS
 from benchmarks.gap_score import wilson
 
@@ -19,37 +19,27 @@ _NINETY, _FAR = 1.645, 3.0  # standard deviations
 
 def section(folder: Path) -> list[str]:
     """Coverage of the regions, and errors beside the Cramer-Rao bound."""
-    return [*_right(folder), *_late(folder)]
+    return [*_RIGHT(folder), *_LATE(folder)]
 
 
-def _late(folder: Path) -> list[str]:
+def _late(rows: list[dict[str, Any]]) -> list[str]:
     """Coverage where commands come late, which the model knows nothing of."""
-    out = ["### Spreads where the model falls short"]
-    rows = read_rows(folder / "coverage_late.jsonl")
-    if not rows:
-        return [*out, "Not run: `python -m benchmarks.coverage --late 0.005`."]
     lines = []
     for late in sorted({r["late"] for r in rows}):
         mine = [r for r in rows if r["late"] == late]
         plain = [{**r, "plain": {"distance": r[WAYS[-1]]["bound"]}} for r in mine]
-        lines.append(
-            (
-                f"{1000 * late:g} ms",
-                str(len(mine)),
-                *(
-                    f"{covered(found, way, q).mean():.0%}"
-                    for found, way in ((plain, "plain"), (mine, WAYS[-1]))
-                    for q in (0.5, 0.9)
-                ),
-                f"{np.median(beside_bound(mine, WAYS[-1])):.3g}",
-            )
+        inside = (
+            f"{covered(found, way, q).mean():.0%}"
+            for found, way in ((plain, "plain"), (mine, WAYS[-1]))
+            for q in (0.5, 0.9)
         )
+        error = f"{np.median(beside_bound(mine, WAYS[-1])):.3g}"
+        lines.append((f"{1000 * late:g} ms", len(mine), *inside, error))
     head = (
         *("late by", "targets", "50 %, information", "90 %, information"),
         *("50 %, as stated", "90 %, as stated", "error / bound"),
     )
     return [
-        *out,
         "`python -m benchmarks.coverage --late 0.005 --targets 12`, commits "
         f"{commits_of(rows)}. The same Cartpoles with commands that come late, which "
         "the model does not know: truths inside the regions of the data's information "
@@ -59,12 +49,9 @@ def _late(folder: Path) -> list[str]:
     ]
 
 
-def _right(folder: Path) -> list[str]:
-    out = ["## What the stated spread is worth"]
-    rows = read_rows(folder / "coverage.jsonl")
-    if not rows:
-        return [*out, "Not run: `python -m benchmarks.coverage`."]
+def _right(rows: list[dict[str, Any]]) -> list[str]:
     lines = []
+    few = f" by {len(rows)} of {TARGETS} targets" if len(rows) < TARGETS else ""
     for way in WAYS:
         inside = {q: covered(rows, way, q) for q in (0.5, 0.9)}
         ratio, most = np.quantile(beside_bound(rows, way), (0.5, 0.95))
@@ -74,13 +61,11 @@ def _right(folder: Path) -> list[str]:
             cells.append(f"{hit.mean():.0%} [{low:.0%}, {high:.0%}]")
         if way in MEANT:
             good = REGION[0] <= inside[0.9].mean() <= REGION[1]
-            few = f" by {len(rows)} of {TARGETS} targets" if len(rows) < TARGETS else ""
-            cells[1] += f", met{few}" if good else f", **missed**{few}"
-        met = "met" if ratio <= BOUND else "**missed**"
-        told = f"{ratio:.2f}" + (f", {met}" if way == WAYS[-1] else "")
+            cells[1] += f", {met(good)}{few}"
+        told = f"{ratio:.2f}" + (f", {met(ratio <= BOUND)}" if way == WAYS[-1] else "")
         lines.append((way, *cells, told, f"{most:.3g}"))
+    head = ("", "50 % region", "90 % region", "error / bound", "of 95 %")
     return [
-        *out,
         f"`python -m benchmarks.coverage`, {len(rows)} Cartpoles with parameters drawn "
         f"from UDR's range, sensor noise, commits {commits_of(rows)}. Share of "
         "truths inside the stated regions along the directions that the data "
@@ -89,11 +74,18 @@ def _right(folder: Path) -> list[str]:
         f"most {BOUND:g} after refinement; and what 95 % of the targets stay below. "
         "`search, own spread` is what the evolution strategy ends with, `search` has "
         "the spread that is stated without refinement.",
-        markdown_table(
-            ("", "50 % region", "90 % region", "error / bound", "of 95 %"), lines
-        ),
+        markdown_table(head, lines),
         *_unseen(rows),
     ]
+
+
+_RIGHT = Section(
+    *("## What the stated spread is worth", "coverage.jsonl", "coverage", _right)
+)
+_LATE = Section(
+    *("### Spreads where the model falls short", "coverage_late.jsonl"),
+    *("coverage --late 0.005", _late),
+)
 
 
 def _unseen(rows: list[dict[str, Any]]) -> list[str]:

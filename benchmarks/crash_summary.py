@@ -1,66 +1,52 @@
 """Sections of the results page on kills and on long use."""
 
 from pathlib import Path
+from typing import Any
 
-from benchmarks._cells import read_rows
 from benchmarks._common import commits_of, markdown_table
+from benchmarks._page import Section, load, not_run, table
 from benchmarks.crash import COMMANDS
 
 
-def crashes(folder: Path) -> list[str]:
+def _crashes(rows: list[Any]) -> list[str]:
     """Kills by command, and how many went on to the same end."""
-    out = ["## Killed and gone on"]
-    rows = read_rows(folder / "crash.jsonl")
-    if not rows:
-        return [*out, "Not run: `python -m benchmarks.crash`."]
-    lines = []
-    for command in COMMANDS:
-        mine = [r for r in rows if r["command"] == command]
-        lines.append(
-            (
-                f"train.{command}",
-                len(mine) or "not run",
-                sum(r["checkpoints"] > 0 for r in mine),
-                sum(not r["different"] for r in mine),
-                "; ".join(
-                    f"{r['key']}: {r['different'][0]}" for r in mine if r["different"]
-                ),
-            )
-        )
-    head = ("command", "kills", "with a checkpoint", "to the same end", "others")
+    columns = {
+        "command": lambda c: f"train.{c[0]}",
+        "kills": lambda c: len(c[1]) or "not run",
+        "with a checkpoint": lambda c: sum(r["checkpoints"] > 0 for r in c[1]),
+        "to the same end": lambda c: sum(not r["different"] for r in c[1]),
+        "others": lambda c: "; ".join(
+            f"{r['key']}: {r['different'][0]}" for r in c[1] if r["different"]
+        ),
+    }
+    by_command = [(c, [r for r in rows if r["command"] == c]) for c in COMMANDS]
     return [
-        *out,
         f"`python -m benchmarks.crash`, commits {commits_of(rows)}: killed by signal "
         "9 at moments drawn from the time that the command takes, then gone on with "
         "`--resume`; every number and policy is compared, to the last bit, with those "
         "of a job that was left alone.",
-        markdown_table(head, lines),
+        table(by_command, columns),
     ]
 
 
 def faults(folder: Path) -> list[str]:
     """Everything that was broken on purpose, in one table."""
-    from easi_jax.io.files import read_json
-
-    out = ["## Faults tried and survived"]
-    lines: list[tuple[object, ...]] = []
-    path = folder / "faults.json"
-    if path.exists():
-        r = read_json(path)
+    out, lines = ["## Faults tried and survived"], []
+    r = load(folder, "faults.json")
+    if r:
         out.append(f"Tests: `{r['command']}`, commit {commits_of([r])}.")
         lines += [
             (fault, "tests", c["tried"], c["survived"])
             for fault, c in r["counts"].items()
         ]
     else:
-        out.append("Not run: `python -m benchmarks.faults`.")
-    path = folder / "fuzz.json"
-    if path.exists():
-        total = read_json(path)["total"]
-        cases, failed = total["cases"], total["failed"]
+        out.append(not_run("faults"))
+    r = load(folder, "fuzz.json")
+    if r:
+        cases, failed = r["total"]["cases"], r["total"]["failed"]
         what = "files changed, drawn or written to do harm"
         lines.append((what, "`benchmarks.fuzz`", cases, cases - failed))
-    rows = read_rows(folder / "crash.jsonl")
+    rows = load(folder, "crash.jsonl")
     if rows:
         same = sum(not r["different"] for r in rows)
         what = "commands killed at random moments"
@@ -69,20 +55,12 @@ def faults(folder: Path) -> list[str]:
     return [*out, markdown_table(head, lines)] if lines else out
 
 
-def soak(folder: Path) -> list[str]:
+def _soak(r: Any) -> list[str]:
     """Memory over many searches in one process."""
-    from easi_jax.io.files import read_json
-
-    out = ["## Many searches in one process"]
-    path = folder / "soak.json"
-    if not path.exists():
-        return [*out, "Not run: `python -m benchmarks.soak`."]
-    r = read_json(path)
     counts = [k for k in r["megabytes"] if int(k) % 500 == 0]
     first = str(r["config"]["warm_up"])
     shown = {k: r["megabytes"][k] for k in dict.fromkeys((first, *counts))}
     return [
-        *out,
         f"`{r['command']}`, commit {commits_of([r])}: "
         f"{r['config']['searches']} searches, {r['finite']} with finite results, in "
         f"{r['seconds']:.0f} s; the process "
@@ -92,3 +70,7 @@ def soak(folder: Path) -> list[str]:
             [("memory [MB]", *(f"{x:.1f}" for x in shown.values()))],
         ),
     ]
+
+
+crashes = Section("## Killed and gone on", "crash.jsonl", "crash", _crashes)
+soak = Section("## Many searches in one process", "soak.json", "soak", _soak)

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import gap_score, summary, transfer
+from benchmarks import gap_score, lines, summary, transfer
 from benchmarks._common import RESULTS
+from easi_jax.errors import UserError
 from envs import make
 from train._command import main
 
@@ -106,6 +107,17 @@ def test_wilson_interval() -> None:
     # R. G. Newcombe, Stat. Med. 17 (1998), table I
     assert gap_score.wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
     assert gap_score.wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
+
+
+def test_lines_are_counted_by_package() -> None:
+    packages = {"easi_jax/io": [5, 3], "train": [2, 4], "tests": [1000, 2000]}
+    result = {"command": "lines", "summed": lines.SUMMED, "packages": packages}
+    *_, told = lines.paragraphs(result)
+    assert "| easi_jax/io | 5 | 3 | -2 |" in told
+    assert "| **easi_jax, train, benchmarks** | 7 | 7 | +0 |" in told
+    assert told.endswith("| **in all** | 1,007 | 2,007 | +1,000 |")
+    with pytest.raises(UserError, match="no such commit"):
+        lines.counts("no such commit")
 
 
 @pytest.mark.slow
