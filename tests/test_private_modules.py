@@ -1,4 +1,4 @@
-"""Every place that leans on another package's private modules is listed, with a bound."""
+"""Places that lean on private modules of other packages are listed, with a bound."""
 
 import ast
 import re
@@ -55,9 +55,10 @@ def _names(tree: ast.Module) -> Iterator[str]:
                 yield f"mujoco.{FUNCTIONS}"
             elif name := dotted(node):
                 yield name
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            if re.fullmatch(r"_impl\.\w+", node.value):
-                yield STATE
+        elif isinstance(node, ast.Constant) and re.fullmatch(
+            r"_impl\.\w+", str(node.value)
+        ):
+            yield STATE
 
 
 def _used(tree: ast.Module) -> set[str]:
