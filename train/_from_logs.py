@@ -46,12 +46,16 @@ def run(config: Any) -> None:
             one = jax.tree.map(lambda x: x[None], found.distribution)
             found_check([seed], search.space.names, one)
         problem.notes.extend(outliers)
-        columns, rows, errors = write(
-            folder, problem, search, estimates, seeds, errors()
+        report = write(
+            *(folder, problem, search.space, search.config.generations),
+            *(estimates, seeds, errors()),
         )
-    show_table(f"Parameters of {problem.name}", columns, rows)
-    show_table(*errors)
-    for note in problem.notes:
+    from easi_jax.io.report.parameters import parameter_table
+
+    show_table(f"Parameters of {problem.name}", *parameter_table(report.parameters))
+    errors = report.tables[0]
+    show_table(errors.title, errors.columns, errors.rows)
+    for note in (*report.undetermined, *problem.notes):
         say(f"note: {note}")
     say(f"report: {config.out / 'report.html'}")
 

@@ -4,10 +4,11 @@ import dataclasses
 from pathlib import Path
 
 from train._command import main, say, show_table
+from train._options import RobotOptions, RunOptions, TrainingOptions
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(RunOptions, TrainingOptions, RobotOptions):
     """Trains a policy under uniformly random physics (UDR), the rough start of EASI.
 
     Each episode draws the robot's parameters from [nominal / k, k nominal]. The policy
@@ -15,14 +16,6 @@ class Config:
     by side, one on each device.
     """
 
-    robot: str = "cartpole"
-    """Built-in robot."""
-    option: tuple[str, ...] = ()
-    """Options of the built-in robot, NAME=VALUE: for go2 parameters=full (25 instead of
-    8), torque_speed=true."""
-    env: Path | None = None
-    """An environment of your own, a Python file, in place of --robot (template:
-    examples/my_robot/env.py)."""
     out: Path = Path("results/udr")
     """Folder of the run."""
     seeds: tuple[int, ...] = (0,)
@@ -41,22 +34,11 @@ class Config:
     start_from: Path | None = None
     """Run folder of train.udr whose networks the training goes on from (fine-tuning);
     a seed that it lacks starts from its first."""
-    env_steps: int | None = None
-    """Control steps of training; the robot's preset where not given."""
-    algorithm: str | None = None
-    """sac or ppo; the robot's own where not given."""
     eval_episodes: int = 100
     """Episodes of the final evaluation."""
     chunk: int | None = None
     """Iterations between checkpoints: steps of all environments (sac) or unrolls
     (ppo); about 50,000 control steps where not given."""
-    resume: bool = False
-    """Go on with the run in the folder."""
-    overwrite: bool = False
-    """Delete the run in the folder first."""
-    distributed: bool = False
-    """One of several processes (srun, mpirun, Kubernetes) whose devices share the
-    work."""
 
 
 def run(config: Config) -> None:
@@ -77,6 +59,7 @@ def run(config: Config) -> None:
     import jax.numpy as jnp
     import numpy as np
 
+    from easi_jax.io.report.easi_report import motion_strip
     from easi_jax.io.report.figures import returns_by_step
     from easi_jax.io.report.html import Picture, Report, Table, write_report
     from easi_jax.io.runs.folder import RunFolder
@@ -90,7 +73,7 @@ def run(config: Config) -> None:
     )
     from easi_jax.rl.presets import algorithm_of
     from envs import open_env
-    from train._results import motion_strip, per_seed_json
+    from train._results import per_seed_json
     from train._stages import jit_chunks, run_stage, training_curve, training_rows
 
     given = read_given(config)
@@ -150,7 +133,7 @@ def run(config: Config) -> None:
         }
         folder.write_json("results.json", results)
         steps, curve = training_curve(folder.path, "train", config.seeds)
-        pictures = motion_strip(env, motion[0], method, notes)
+        pictures = motion_strip(env.mj_model, env.dt, motion[0], method, notes)
         if steps:
             svg = returns_by_step({method: (steps, curve)})
             folder.write("figures/returns.svg", svg)

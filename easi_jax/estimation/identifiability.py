@@ -2,14 +2,25 @@
 
 import re
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from easi_jax.estimation.normal_equations import _NUMERIC
-from easi_jax.model.parameters import ParameterSpace
+from easi_jax.model.parameters import Parameter, ParameterSpace
+from easi_jax.model.results import (
+    LEAK,
+    Flag,
+    Relative,
+    SeedResult,
+    Undetermined,
+)
 
 _WEAK = 0.5  # std of a log ratio beyond which a direction is called undetermined
 _ALONE = 0.998  # of a parameter's own direction unseen: it leaves no trace
+_PART = 0.3  # of a mass in what is unseen: enough to settle a direction
+_AT = 1e-3  # unit coordinates from a bound that count as at it
 
 
 @dataclass(frozen=True)
@@ -65,8 +76,8 @@ def identifiability(
     cov = (vectors / safe) @ vectors.T
     leak = np.sqrt((null**2).sum(1)) if null.size else np.zeros(len(scale))
     std = np.sqrt(np.diag(cov))
-    determined = (leak < 0.05) & (std < weak)
-    std = np.where(leak < 0.05, std, np.inf)
+    determined = (leak < LEAK) & (std < weak)
+    std = np.where(leak < LEAK, std, np.inf)
     return Identifiability(
         names=space.names,
         std=std,
@@ -152,3 +163,125 @@ def describe(direction: dict[str, float]) -> str:
         return f"{', '.join(rounded)} times one common factor change nothing"
     terms = ", ".join(f"{k}^{v:g}" for k, v in rounded.items())
     return f"moving together as {terms} changes nothing that these data show"
+
+
+def flags(
+    space: ParameterSpace, ident: Identifiability, unit_mean: np.ndarray
+) -> list[Flag]:
+    """What may be believed of each parameter by itself."""
+    low, high = (np.asarray(b) for b in space.unit_bounds)
+    at_bound = (unit_mean <= low + _AT) | (unit_mean >= high - _AT)
+    return [
+        "at bound" if b else "determined" if d else "not determined"
+        for b, d in zip(at_bound, ident.determined, strict=True)
+    ]
+
+
+def seed_result(
+    space: ParameterSpace, unit_mean: ArrayLike, unit_cov: ArrayLike, hessian: ArrayLike
+) -> SeedResult:
+    """One seed's result in SI units, and what may be believed of it.
+
+    Args:
+        unit_mean: ``(n,)``.
+        unit_cov: ``(n, n)``.
+        hessian: Fisher information, ``(n, n)``; all in unit coordinates.
+    """
+    ident = identifiability(space, np.asarray(hessian))
+    mean, cov = np.asarray(unit_mean), np.asarray(unit_cov, float)
+    below, above = _ends(space, mean, cov)
+    return SeedResult(
+        mean=_si(space, mean).tolist(),
+        std=(0.5 * (above - below)).tolist(),
+        interval_68=np.stack([below, above], 1).tolist(),
+        unit_mean=np.asarray(mean, float).tolist(),
+        unit_covariance=cov.tolist(),
+        flags=flags(space, ident, mean),
+        cramer_rao_std=ident.std.tolist(),
+        determined_directions=ident.rank,
+        undetermined=[Undetermined(d, describe(d)) for d in ident.undetermined],
+        relative=relative(space, ident, mean, cov),
+    )
+
+
+def relative(
+    space: ParameterSpace, ident: Identifiability, unit_mean: np.ndarray, cov: Any
+) -> Relative | None:
+    """The result given what the owner of a machine knows: masses and lengths in the
+    undetermined directions are taken at their nominal values, and all move with them.
+
+    ``cov (n, n)`` in unit coordinates. None where there are none.
+    """
+    gain, chosen = settled(space, ident)
+    if not chosen:
+        return None
+    names, n = ident.names, space.size
+    nominal = np.asarray(space.to_unit(space.nominal), float)
+    move = np.eye(n)
+    move[:, chosen] -= gain
+    scaled = np.asarray(unit_mean, float) * ident.scale
+    off = scaled[chosen] - nominal[chosen] * ident.scale[chosen]
+    center = (scaled - gain @ off) / ident.scale
+    outer = np.outer(ident.scale, ident.scale)
+    spread = move @ (cov * outer) @ move.T
+    below, above = _ends(space, center, spread / outer)
+    bound = move @ (ident.covariance * outer) @ move.T
+    alone = (ident.null**2).sum(1) > _ALONE
+    unseen = np.linalg.norm(move @ np.where(alone[:, None], 0.0, ident.null), axis=1)
+    known = (np.sqrt(np.maximum(np.diag(bound), 0.0)) < _WEAK) & (unseen < LEAK)
+    known &= ~alone
+    known[chosen] = False
+    return Relative(
+        taken={names[i]: float(space.nominal[i]) for i in chosen},
+        mean=_si(space, center).tolist(),
+        std=(0.5 * (above - below)).tolist(),
+        determined=known.tolist(),
+        gain=gain.tolist(),
+    )
+
+
+def settled(
+    space: ParameterSpace, ident: Identifiability
+) -> tuple[np.ndarray, list[int]]:
+    """Masses and lengths that, once known, settle undetermined directions: an owner can
+    weigh and measure those. Directions without them stay open.
+
+    Returns:
+        ``(n, k)``: how far each parameter moves with the ``k`` that are chosen, in
+        scaled coordinates; their places.
+    """
+    alone = (ident.null**2).sum(1) > _ALONE
+    free = np.where(alone[:, None], 0.0, ident.null)
+    left, size, _ = np.linalg.svd(free, full_matrices=False)
+    basis = left = left[:, size > _PART]
+    nominal = np.asarray(space.to_unit(space.nominal), float)
+    simple = np.array([_weighed(p) for p in space.parameters]) & np.isfinite(nominal)
+    chosen: list[int] = []
+    while basis.shape[1]:
+        part = np.where(simple & ~alone, np.linalg.norm(basis, axis=1), 0.0)
+        i = int(np.argmax(part))
+        if part[i] < _PART:
+            break
+        chosen.append(i)
+        # What is left of the directions with that parameter held.
+        basis = basis @ np.linalg.svd(basis[i : i + 1])[2][1:].T
+    gain = left @ np.linalg.pinv(left[chosen]) if chosen else np.zeros((len(left), 0))
+    return gain, chosen
+
+
+def _weighed(parameter: Parameter) -> bool:
+    """Whether an owner can weigh or measure it: mass or size of a part of the model."""
+    parts = all(a.startswith(("body.", "geom.")) for a in parameter.addresses)
+    return parts and parameter.unit in ("kg", "m")
+
+
+def _si(space: ParameterSpace, unit: np.ndarray) -> np.ndarray:
+    return np.asarray(space.to_si(unit), float)
+
+
+def _ends(
+    space: ParameterSpace, unit_mean: np.ndarray, cov: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """One standard deviation below and above, SI, ``(n,)`` each."""
+    std = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    return _si(space, unit_mean - std), _si(space, unit_mean + std)

@@ -3,9 +3,16 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
+from easi_jax.model.parameters import ParameterSpace
+
+Flag = Literal["determined", "not determined", "at bound"]
+LEAK = 0.05  # part of a parameter in what is unseen, above which it is not known
+# Steps (s,) and returns (s, seeds) of a training.
+Curve = tuple[list[int], list[list[float]]]
 Values = Mapping[str, tuple[float, float, str]]  # value, standard deviation, unit
 
 
@@ -198,3 +205,148 @@ class GapResult:
     def noted(self, notes: Sequence[str]) -> "GapResult":
         """With more notes."""
         return replace(self, notes=(*self.notes, *notes))
+
+
+@dataclass(frozen=True)
+class Undetermined:
+    """A direction in which data see nothing.
+
+    Attributes:
+        coefficients: parameter to its power (or step, where it is linear).
+        meaning: the same as a sentence.
+    """
+
+    coefficients: dict[str, float]
+    meaning: str
+
+
+@dataclass(frozen=True)
+class Relative:
+    """Parameters once some are known that data alone do not determine.
+
+    Masses and lengths along undetermined directions are taken as the model has them,
+    as their owner has weighed or measured them. The other parameters move with them.
+
+    Attributes:
+        taken: these parameters and their values in the model, SI.
+        mean, std: of all parameters then, ``n`` each, SI.
+        determined: of each parameter, whether the data determine it then.
+        gain: ``(n, k)``: how far each parameter moves with each of ``taken``, both as
+            log ratios, or in initial ranges where a parameter is linear.
+    """
+
+    taken: dict[str, float]
+    mean: list[float]
+    std: list[float]
+    determined: list[bool]
+    gain: list[list[float]]
+
+    def depends(self, i: int) -> list[str]:
+        """Those of ``taken`` that the value of parameter ``i`` rests on."""
+        pairs = zip(self.taken, self.gain[i], strict=True)
+        return [name for name, gain in pairs if abs(gain) > LEAK]
+
+    def settle(self, space: ParameterSpace, values: np.ndarray) -> np.ndarray:
+        """SI values ``(n,)`` moved along the undetermined directions, to where
+        ``taken`` have their values; NaN stays NaN."""
+        low, high = space.initial
+        width = high - low
+        off = np.zeros(len(self.taken))
+        for k, (name, known) in enumerate(self.taken.items()):
+            i = space.index(name)
+            ratio = np.log(values[i] / known) if space.log[i] and values[i] > 0 else 0.0
+            off[k] = ratio if space.log[i] else (values[i] - known) / width[i]
+        step = np.asarray(self.gain) @ np.nan_to_num(off)
+        log = space.log
+        return np.where(log, values * np.exp(-step * log), values - step * width)
+
+
+@dataclass(frozen=True)
+class SeedResult:
+    """What one seed found, as ``distribution.json`` holds it.
+
+    Attributes:
+        mean, std: ``n`` each, SI.
+        interval_68: ``(n, 2)``, SI.
+        unit_mean, unit_covariance: in unit coordinates.
+        flags: what may be believed of each parameter by itself.
+        cramer_rao_std: least standard deviation of log ratios that the data allow.
+        determined_directions: how many there are.
+        undetermined: the other directions.
+        relative: None where no mass or length settles a direction.
+    """
+
+    mean: list[float]
+    std: list[float]
+    interval_68: list[list[float]]
+    unit_mean: list[float]
+    unit_covariance: list[list[float]]
+    flags: list[Flag]
+    cramer_rao_std: list[float]
+    determined_directions: int
+    undetermined: list[Undetermined]
+    relative: Relative | None = None
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Prediction errors as shares of the motion, on motion that no search has seen.
+
+    Attributes:
+        channels: positions and velocities, ``2 nv``.
+        one_step, open_loop: model to errors ``(S, 2 nv)``, after one control step and
+            after 0.2 s.
+    """
+
+    channels: tuple[str, ...]
+    one_step: Mapping[str, np.ndarray]
+    open_loop: Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """How policies do in a pseudo-real target.
+
+    Attributes:
+        robot: its name.
+        returns: method to ``(S,)``; the first is what recorded the demonstrations.
+        episodes: for each seed.
+        curves: method to its training, evaluated in the target.
+        held_out: prediction errors of the models.
+        non_finite: simulations of the search that were lost.
+    """
+
+    robot: str
+    returns: Mapping[str, np.ndarray]
+    episodes: int
+    curves: Mapping[str, Curve]
+    held_out: Shares
+    non_finite: int
+
+
+@dataclass(frozen=True)
+class HeldOutErrors:
+    """Open-loop errors on held-out logs, a number a channel, SI.
+
+    Attributes:
+        what: which data were held out.
+        horizon: of the prediction [s].
+        before: of the model as given.
+        after: of each seed's model.
+        floor: of each seed's model, were it perfect.
+        fit: of each seed, the error on its own data, which chooses the seed shown.
+    """
+
+    what: str
+    horizon: float
+    channels: list[str]
+    units: list[str]
+    before: list[float]
+    after: list[list[float]]
+    floor: list[list[float]]
+    fit: list[float]
+
+    @property
+    def best(self) -> int:
+        """Place of the seed that fits its own data best."""
+        return int(np.argmin(self.fit))

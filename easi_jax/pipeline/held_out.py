@@ -4,8 +4,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from easi_jax.data.segments import Segments, windows
+from easi_jax.devices import distributed
+from easi_jax.estimation.posterior import Estimate
+from easi_jax.model.results import Shares
 from easi_jax.rl.networks import act
 from easi_jax.simulation import open_loop
 from easi_jax.simulation.rollout import collect
@@ -62,3 +66,28 @@ def shares(
         return error[0], error[-1]
 
     return jax.lax.map(one, (policies, theta, keys))
+
+
+def held_out_shares(
+    pipe: Any, estimate: Estimate, theta: np.ndarray, policies: Any, keys: jax.Array
+) -> Shares:
+    """`shares` of the nominal model and of what was found, on fresh demonstrations.
+
+    Args:
+        theta: of the robot that stands for the real one, SI.
+        policies: that move it, ``(S, ...)``.
+        keys: of the evaluation, ``(S,)``.
+    """
+    env = pipe.env
+    fresh = jax.vmap(lambda k: jax.random.fold_in(k, 7))(keys)
+    target = jnp.asarray(theta, jnp.float32)
+    nominal = jnp.asarray(env.space.nominal, jnp.float32)
+    means = jax.vmap(pipe.space.to_si)(estimate.distribution.mean)
+    models = {"nominal": jnp.broadcast_to(nominal, means.shape), "EASI": means}
+    compute = jax.jit(lambda m: shares(pipe, policies, target, m, fresh))
+    out = {name: distributed.local(compute(m)) for name, m in models.items()}
+    return Shares(
+        channels=tuple(env.simulator.state_names),
+        one_step={k: np.asarray(v[0]) for k, v in out.items()},
+        open_loop={k: np.asarray(v[1]) for k, v in out.items()},
+    )

@@ -5,8 +5,9 @@ alone, so that the stages compose into one compiled program; the commands cut th
 functions at their seams.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -75,6 +76,50 @@ class PipelineConfig:
                 raise UserError(f"{name} is {value}: give at least 1")
         if any(not np.isfinite(x) or x < 0 for x in self.noise):
             raise UserError(f"noise is {self.noise}: give finite numbers, 0 or more")
+
+
+class Runner(Protocol):
+    """How the stages of a chain are run."""
+
+    def stage(
+        self,
+        name: str,
+        total: int,
+        init: Callable[[], Any],
+        step: Callable[..., tuple[Any, Any]],
+        *args: Any,
+    ) -> tuple[Any, Any]:
+        """The state after ``total`` steps, and what was told of them.
+
+        ``step(state, *args, n) -> (state, info)`` takes ``n`` of them.
+        """
+        ...
+
+    def kept(self, name: str, fun: Callable[..., Any], *args: Any) -> Any:
+        """``fun(*args)``, a result that is costly to make again."""
+        ...
+
+    def call(self, fun: Callable[..., Any], *args: Any) -> Any:
+        """``fun(*args)``."""
+        ...
+
+
+class Whole:
+    """Each stage in one piece, so that a chain is a pure function."""
+
+    def stage(
+        self, name: str, total: int, init: Any, step: Any, *args: Any
+    ) -> tuple[Any, Any]:
+        """As `Runner.stage`."""
+        return step(init(), *args, total)
+
+    def kept(self, name: str, fun: Any, *args: Any) -> Any:
+        """As `Runner.kept`."""
+        return fun(*args)
+
+    def call(self, fun: Any, *args: Any) -> Any:
+        """As `Runner.call`."""
+        return fun(*args)
 
 
 def target_parameters(space: ParameterSpace, changes: tuple[str, ...]) -> np.ndarray:
@@ -320,49 +365,90 @@ class Pipeline:
 
     # -- all of it -----------------------------------------------------------
 
-    def run(self, keys: jax.Array, target: jax.Array) -> dict[str, Any]:
-        """The whole chain for seeds ``keys (S,)``; one jit makes it one program.
+    def chain(
+        self,
+        keys: jax.Array,
+        target: jax.Array,
+        runner: "Runner",
+        first: Any = None,
+        oracle: bool = False,
+    ) -> dict[str, Any]:
+        """UDR, demonstrations, search, final training and evaluation for seeds.
+
+        Args:
+            keys: ``(S,)``, of `seed_keys`.
+            target: parameters of the real robot, ``(n,)``.
+            runner: how the stages are run.
+            first: training states of the policy that records the demonstrations,
+                where it is trained already.
+            oracle: train a policy in the target itself, too.
 
         Returns:
-            ``udr``, ``easi``: policies; ``udr_returns``, ``easi_returns``
-            ``(S, episodes)`` in the target; ``motion``: EASI's `play`;
-            ``udr_history``, ``easi_history``;
-            ``search``: SearchInfo; ``estimate``: Estimate.
+            ``estimate``; of each policy, ``udr``, ``easi`` and, where asked for,
+            ``oracle``: its parameters, its ``_returns (S, episodes)`` in the target,
+            and its ``_history`` as the runner has it, as is ``search``; ``motion``:
+            positions of EASI's first episodes, ``(S, T + 1, nq)``.
         """
-        n = self.config.training.iterations
-        k = stage_keys(keys)
-        wide = self.spread(self.udr(), len(keys))
-        first, udr_history = self.train_chunk(
-            self.train_init(k["udr"], wide), wide, target, n
-        )
-        udr = self.policies(first)
-        demos = self.demonstrate(udr, target, k["demonstrate"])
+        n, k = self.config.training.iterations, stage_keys(keys)
+        out: dict[str, Any] = {}
+
+        def train(
+            name: str, stage: str, dist: Any, total: int, init: Any, pipe: Pipeline
+        ) -> Any:
+            step = pipe.train_chunk
+            states, history = runner.stage(stage, total, init, step, dist, target)
+            out[name] = pipe.policies(states)
+            out[f"{name}_history"] = history
+            return states
+
+        if first is None:
+            wide = self.spread(self.udr(), len(keys))
+            first = train(
+                "udr", "udr", wide, n, lambda: self.train_init(k["udr"], wide), self
+            )
+        else:
+            out["udr"] = self.policies(first)
+        udr = out["udr"]
+        demos = runner.call(self.demonstrate, udr, target, k["demonstrate"])
         training = first if self.search.trainer else ()
-        state = self.search_init(k["search"], demos, udr, training)
-        state, info = self.search_chunk(
-            state, demos, udr, self.config.search.generations
+        state, out["search"] = runner.stage(
+            "search",
+            self.config.search.generations,
+            lambda: self.search_init(k["search"], demos, udr, training),
+            self.search_chunk,
+            demos,
+            udr,
         )
-        found = self.estimate(state, demos)
-        final, easi_history = self.train_chunk(
-            self.final_init(k["final"], found.distribution, state, first),
-            found.distribution,
-            target,
-            self.final_iterations(),
+        found = out["estimate"] = runner.kept("estimate", self.estimate, state, demos)
+        dist = found.distribution
+        train(
+            *("easi", "final", dist, self.final_iterations()),
+            lambda: self.final_init(k["final"], dist, state, first),
+            self,
         )
-        easi = self.policies(final)
-        udr_returns, _ = self.play(udr, target, k["evaluate"])
-        easi_returns, motion = self.play(easi, target, k["evaluate"])
-        return {
-            "udr": udr,
-            "easi": easi,
-            "udr_history": udr_history,
-            "easi_history": easi_history,
-            "udr_returns": udr_returns,
-            "easi_returns": easi_returns,
-            "motion": motion,
-            "search": info,
-            "estimate": found,
-        }
+        if oracle:
+            there = self if self.real is self.env else Pipeline(self.real, self.config)
+            point = there.spread(there.point(target), len(keys))
+            warm = first if self.config.warm_start else None
+            train(
+                *("oracle", "oracle", point, n),
+                lambda: there.train_init(k["oracle"], point, warm),
+                there,
+            )
+        for name in ("udr", "easi", "oracle"):
+            if name in out:
+                played = runner.call(self.play, out[name], target, k["evaluate"])
+                out[f"{name}_returns"], motion = played
+                if name == "easi":
+                    out["motion"] = motion
+        return out
+
+    def run(self, keys: jax.Array, target: jax.Array) -> dict[str, Any]:
+        """`chain`, each stage in one piece; one jit makes it one program.
+
+        Histories are of every step, ``(S, n, ...)``; ``search`` is a `SearchInfo`.
+        """
+        return self.chain(keys, target, Whole())
 
     def final_init(
         self, keys: jax.Array, dist: Any, search: SearchState, first: Any = None

@@ -32,6 +32,8 @@ DASHED: Any = {"color": INK, "lw": 1.2, "ls": (0, (4, 2.5))}
 _TOLD = "told-"
 _WIDTH = 9.0  # inches; the report's text column
 _LETTERS = 140  # of a legend, in a row
+_CELL = 0.88  # of a heat map's cell that its label may fill
+_SMALLEST = 4.0  # points; a browser enlarges what is smaller than one can read
 _STYLE: Any = {
     "svg.fonttype": "none",
     "svg.hashsalt": "easi-jax",
@@ -142,6 +144,23 @@ def labelled_map(
     axis.grid(visible=False)
 
 
+def _fit_cells(figure: Figure) -> None:
+    """Makes the labels of heat maps as small as the narrowest cell needs."""
+    maps = [a for a in figure.axes if a.images and a.texts]
+    if maps:
+        figure.draw_without_rendering()  # the layout is known from here on
+    for axis in maps:
+        left, right, bottom, top = axis.images[0].get_extent()
+        box = axis.get_window_extent()
+        width = _CELL * box.width / abs(right - left)
+        height = _CELL * box.height / abs(top - bottom)
+        labels = [text.get_window_extent() for text in axis.texts]
+        most = max(max(x.width / width, x.height / height) for x in labels)
+        for text in axis.texts:
+            size = float(text.get_fontsize()) / max(1.0, most)
+            text.set_fontsize(max(_SMALLEST, size))
+
+
 def legend_above(figure: Figure, handles: list[Any]) -> None:
     """One legend for all axes at the top left; in a row where that is not too long."""
     wide = [len(str(h.get_label())) + 8 for h in handles]
@@ -179,6 +198,7 @@ def _titled(found: re.Match[str]) -> str:
 
 def svg(figure: Figure) -> str:
     """SVG text, the same for the same figure: no date, no random names."""
+    _fit_cells(figure)
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     text = re.sub(rf'<g id="{_TOLD}([^"]*)">', _titled, buffer.getvalue())

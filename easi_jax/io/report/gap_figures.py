@@ -19,6 +19,7 @@ from easi_jax.io.report.figure_style import (
     tell,
     with_unit,
 )
+from easi_jax.io.report.numbers import number
 
 _DASHES: Any = {"color": VERMILION, "lw": 1.3, "ls": (0, (4, 2))}
 
@@ -119,7 +120,7 @@ def residual_maps(
         )
         dark = np.log10(shown) > 0.6 * np.log10(most)
         labels = {
-            (i, j): (f"{shown[i, j]:.2g}", bool(dark[i, j]))
+            (i, j): (number(float(shown[i, j]), 2), bool(dark[i, j]))
             for i, j in np.argwhere(np.isfinite(shown)).tolist()
         }
         labelled_map(axis, labels, joints, conditions)

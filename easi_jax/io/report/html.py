@@ -11,10 +11,17 @@ import jinja2
 
 from easi_jax.io.files import atomic_write, to_plain
 from easi_jax.io.report.figure_style import BLUE, FAINT, GREEN, GRID, INK, VERMILION
-from easi_jax.io.report.numbers import cell, quantity
+from easi_jax.io.report.numbers import cell, number, quantity
+from easi_jax.model.results import Flag
 
-Flag = Literal["determined", "not determined", "at bound"]
+# `Flag`, or what follows from what the owner of the machine knows.
+Known = Literal[Flag, "relative", "taken"]
 
+_KINDS = {
+    **dict.fromkeys(("determined", "relative"), "good"),
+    "taken": "plain",
+    "at bound": "bad",
+}
 # Colors that need another shade on a dark page.
 _THEMED = {
     INK: "--ink",
@@ -40,6 +47,8 @@ class ParameterRow:
         flag: what may be believed of it.
         truth: where it is known.
         bounds: where it may go; given with the flag ``at bound``.
+        nominal: the model's value.
+        depends: parameters taken from the model that a ``relative`` value rests on.
     """
 
     name: str
@@ -48,9 +57,32 @@ class ParameterRow:
     initial: tuple[float, float]
     mean: float
     std: float
-    flag: Flag
+    flag: Known
     truth: float | None = None
     bounds: tuple[float, float] | None = None
+    nominal: float | None = None
+    depends: tuple[str, ...] = ()
+
+    @property
+    def found(self) -> str:
+        """What was found, with its standard deviation."""
+        if self.flag == "taken":
+            return number(self.mean)
+        return quantity(self.mean, self.std)
+
+    @property
+    def change(self) -> str:
+        """A multiple of the model's value, where what was found can be believed."""
+        if self.flag not in ("determined", "relative") or not self.nominal:
+            return "-"
+        return f"x {number(self.mean / self.nominal, 3)}"
+
+    @property
+    def verdict(self) -> str:
+        """What may be believed of it."""
+        if self.flag == "relative":
+            return f"given {', '.join(self.depends)}"
+        return "taken from the model" if self.flag == "taken" else self.flag
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,12 +111,14 @@ class Picture:
         svg: its SVG text; trusted, so it must not come from outside.
         alt: what it shows, for who cannot see it.
         caption: one sentence below.
+        file: name of its file in a run's ``figures/``, where it has one.
     """
 
     title: str
     svg: str
     alt: str
     caption: str = ""
+    file: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,6 +193,7 @@ def render(report: Report) -> str:
         report=report,
         parameters=[_parameter_cells(row) for row in report.parameters],
         has_truth=any(row.truth is not None for row in report.parameters),
+        has_model=any(row.nominal is not None for row in report.parameters),
         pictures=[(p, inline_svg(p, i)) for i, p in enumerate(report.pictures)],
         config=list(flatten(to_plain(report.config))),
         versions=list(flatten(to_plain(report.versions))),
@@ -210,11 +245,13 @@ def _parameter_cells(row: ParameterRow) -> dict[str, Any]:
         "addresses": row.addresses,
         "unit": row.unit,
         "initial": f"{cell(row.initial[0])} to {cell(row.initial[1])}",
-        "value": quantity(row.mean, row.std),
+        "model": cell(row.nominal),
+        "value": row.found,
+        "change": row.change,
         "truth": cell(row.truth),
         "error": error,
-        "flag": flag,
-        "kind": {"determined": "good", "at bound": "bad"}.get(flag, "unsure"),
+        "flag": row.verdict,
+        "kind": _KINDS.get(flag, "unsure"),
         "note": note,
     }
 

@@ -13,6 +13,7 @@ import pytest
 from mujoco import mjx
 
 from easi_jax.errors import UserError
+from easi_jax.estimation.identifiability import seed_result
 from easi_jax.export.mjcf import identified_model
 from easi_jax.export.randomization import (
     domain_randomizer,
@@ -25,7 +26,7 @@ from easi_jax.model.parameters import ParameterSpace, declare
 from easi_jax.simulation.mujoco_c import InMujoco
 from easi_jax.simulation.simulator import Simulator
 from envs import make
-from train._results import distribution_json, seed_result
+from train._results import distribution_json
 
 FRICTION = EffectEntry("coulomb_friction", "pole", "joint", {"coulomb": 0.05}, {})
 LATE = EffectEntry("sensor_delay", "cart", "joint", {"late": 0.01}, {})

@@ -130,3 +130,17 @@ def test_names_are_text_and_nothing_else(draw):
     tags = {node.tag.removeprefix(SVG) for node in ET.fromstring(svg).iter()}
     assert not tags & {"script", "img", "a", "foreignObject"}
     harmless(inline_svg(Picture("t", svg, EVIL[1]), 0))
+
+
+def _map_font(columns: int) -> float:
+    names = [f"speed_{i}" for i in range(columns)]
+    values = np.linspace(1.0, 777.0, 3 * columns).reshape(3, columns)
+    svg = gap_figures.residual_maps(["a", "b", "c"], names, values, values, np.ones(3))
+    shown = re.findall(r"<text[^>]*font-size: ([\d.]+)px[^>]*>([\d.]+)</text>", svg)
+    sizes = [size for size, text in shown if text in ("1", "777")]
+    assert len(sizes) == 4
+    return float(sizes[0])
+
+
+def test_labels_of_a_heat_map_fit_their_cells():
+    assert _map_font(40) < _map_font(24) < _map_font(3)

@@ -1,0 +1,100 @@
+"""Options that several commands share, each stated once."""
+
+import dataclasses
+from pathlib import Path
+
+
+@dataclasses.dataclass(frozen=True)
+class RobotOptions:
+    """The robot to train."""
+
+    robot: str = "cartpole"
+    """Built-in robot."""
+    option: tuple[str, ...] = ()
+    """Options of the built-in robot, NAME=VALUE: for go2 parameters=full (25 instead of
+    8), torque_speed=true."""
+    env: Path | None = None
+    """An environment of your own, a Python file, in place of --robot (template:
+    examples/my_robot/env.py)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TargetOptions:
+    """The pseudo-real robot, and what it has that the model lacks."""
+
+    target: tuple[str, ...] | None = None
+    """The pseudo-real robot: parameters that differ from the nominal ones, as
+    NAME*FACTOR or NAME=VALUE; not given: half of what the paper's Fig. 6 changes, such
+    as cart_kp*0.5 for cartpole."""
+    effects: Path | None = None
+    """Effects that the model lacks (effects.yaml of train.gap): the robot gets them,
+    and their parameters vary with the others."""
+    target_effects: Path | None = None
+    """An effects file for the pseudo-real robot alone: it has these effects whether
+    --effects names them or not (without --target, nothing else differs)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingOptions:
+    """A policy's training."""
+
+    env_steps: int | None = None
+    """Control steps of each training; the robot's preset where not given."""
+    algorithm: str | None = None
+    """sac or ppo; the robot's own where not given."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchOptions:
+    """The search, and the least-squares finish after it."""
+
+    preset: str = "default"
+    """Search settings: default, or paper (the reference's recipe, defects included)."""
+    strategy: str | None = None
+    """Evolution strategy: mu_lambda, CMA_ES, Sep_CMA_ES, SNES, ..."""
+    generations: int | None = None
+    """Generations of the search (preset: 50)."""
+    population: int | None = None
+    """Individuals in a generation (preset: 300)."""
+    set: tuple[str, ...] = ()
+    """Further search settings, NAME=VALUE: loss=gan, regularizer=gradient_penalty,
+    innovation_inputs=false, policy_updates_per_generation=20, ..."""
+    start: tuple[float, float] | None = None
+    """Where the search starts, as factors on the nominal values; not given: where UDR
+    trained."""
+    refine: bool = True
+    """Finish with least squares on the paired data."""
+    restarts: int | None = None
+    """More starts of the least-squares finish, drawn from the search's spread; the best
+    fit counts. Not given: 2 for noisy data, none for clean ones, larger robots and
+    logs."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ChainOptions:
+    """Demonstrations, final training and evaluation."""
+
+    trajectories: int = 200
+    """Demonstration trajectories."""
+    noise: tuple[float, ...] = ()
+    """Sensor noise (standard deviations of positions, then velocities, SI): added to
+    pseudo-real demonstrations; for logs it is estimated where not given."""
+    warm_start: bool = False
+    """Final training goes on from the networks of the UDR policy in place of new ones
+    (the Oracle's, too): it gets further where a training of its length has not settled.
+    """
+    eval_episodes: int = 100
+    """Episodes of the final evaluation."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RunOptions:
+    """The folder of a run, and the processes that share it."""
+
+    resume: bool = False
+    """Go on with the run in the folder."""
+    overwrite: bool = False
+    """Delete the run in the folder first."""
+    distributed: bool = False
+    """One of several processes (srun, mpirun, Kubernetes) whose devices share the
+    work."""
