@@ -20,14 +20,12 @@ class _Object(NamedTuple):
     """Something of the model that effects sit at.
 
     Attributes:
-        kind: what it is.
         name: "" for the whole model and for all actuators alike.
         index: where its numbers are in fields of `Effects`.
         spot: the same for the catalog.
         is_all: it stands for all of its kind.
     """
 
-    kind: str
     name: str
     index: tuple[int, ...]
     spot: Spot
@@ -51,40 +49,41 @@ def ripples(
 
 
 def _joint(m: mujoco.MjModel, j: int, s: Scales) -> _Object:
-    spot = Spot(m, j, s)
-    return _Object("joint", name_of(m, "joint", j), (spot.dof,), spot)
+    dof = int(m.jnt_dofadr[j])
+    return _Object(name_of(m, "joint", j), (dof,), Spot(m, "joint", j, s))
 
 
 def _objects(m: mujoco.MjModel, s: Scales) -> Iterator[_Object]:
     for j in scalar_dofs(m):
         yield _joint(m, j, s)
     for a in range(m.nu):
-        yield _Object("actuator", name_of(m, "actuator", a), (a,), Spot(m, a, s))
+        yield _Object(name_of(m, "actuator", a), (a,), Spot(m, "actuator", a, s))
     if m.nu > 1:
         # A number of each drive would be one of dozens, and hardly help alone.
-        yield _Object("actuator", "", (), Spot(m, 0, s), is_all=True)
+        yield _Object("", (), Spot(m, "actuator", 0, s), is_all=True)
     for b in range(1, m.nbody):
         if m.body_mass[b] > 0:
-            yield _Object("body", name_of(m, "body", b), (b,), Spot(m, b, s))
+            yield _Object(name_of(m, "body", b), (b,), Spot(m, "body", b, s))
     pairs = tuple(contact_pairs(m))
-    yield _Object("model", "", (), Spot(m, 0, s, pairs))
+    yield _Object("", (), Spot(m, "model", 0, s, pairs))
     often = [int(k) for k in np.argsort(-s.touching) if s.touching[k] > _SELDOM]
     if len(often) > 1:
         for k in sorted(often[:_PAIRS]):
-            yield _Object("geom", pairs[k].name, (k,), Spot(m, k, s, (pairs[k],)))
+            yield _Object(pairs[k].name, (k,), Spot(m, "geom", k, s, (pairs[k],)))
 
 
 def _at(row: Effect, o: _Object, cycles: float = np.nan) -> Iterator[Place]:
     """An effect at an object, if it can be there: a place for each of its shapes."""
-    site = row.sites.get(o.kind)
+    kind = o.spot.kind
+    site = row.sites.get(kind)
     if site is None or not site.offered(o.spot) or (o.is_all and not row.is_shared):
         return
     columns = tuple(_column(part, o) for part in site.parts)
     starts = tuple(
         tuple(cycles if np.isnan(x) else float(x) for x in start)
-        for start in site.starts(o.spot)
+        for start in site.starts_at(o.spot)
     )
-    what = (row.name, o.name, "model" if o.is_all else o.kind, columns)
+    what = (row.name, o.name, "model" if o.is_all else kind, columns)
     if not site.parts[-1].number.is_shape:
         yield Place(*what, starts)
         return
@@ -94,14 +93,14 @@ def _at(row: Effect, o: _Object, cycles: float = np.nan) -> Iterator[Place]:
 
 
 def _column(part: Part, o: _Object) -> Column:
-    _, _, entry = part.column.partition(".")
+    spot, (_, _, entry) = o.spot, part.column.partition(".")
     return Column(
         field_of(part.column),
         (*o.index, *([int(entry)] if entry else [])),
         part.name,
-        part.told_unit(o.spot),
-        part.neutral(o.spot),
-        *part.bounds(o.spot),
-        part.size(o.spot),
-        part.of(o.spot),
+        part.unit or part.number.unit(spot.m, spot.i),
+        part.neutral(spot),
+        *part.bounds(spot),
+        part.size * spot.sizes[part.scale],
+        spot.sizes[part.of],
     )

@@ -10,7 +10,7 @@ Rows stand in the order in which the numbers of a place become columns of a fit.
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import mujoco
@@ -59,109 +59,80 @@ class Spot:
 
     Attributes:
         m: the model.
-        i: id of the object; 0 for the whole model.
+        kind: what it is.
+        i: its id; 0 for the whole model.
         s: how large things are in the data.
         pairs: of geoms that may touch: the one that it is, or all of the model.
     """
 
     m: mujoco.MjModel
+    kind: str
     i: int
     s: Scales
     pairs: tuple[ContactPair, ...] = ()
 
     @cached_property
-    def dof(self) -> int:
-        """Of a joint."""
-        return int(self.m.jnt_dofadr[self.i])
+    def sizes(self) -> Mapping[str, float]:
+        """How large things are here, by name, SI units."""
+        of_kind = {"joint": _of_joint, "actuator": _of_actuator, "body": _of_body}
+        found = of_kind.get(self.kind, _of_contacts)(self)
+        return {"1": 1.0, "dt": self.s.dt, "longest": self.s.longest, **found}
 
-    @property
-    def is_hinge(self) -> bool:
-        """Whether a joint turns."""
-        return bool(self.m.jnt_type[self.i] == mujoco.mjtJoint.mjJNT_HINGE)
 
-    @property
-    def torque(self) -> float:
-        """At a joint [N or N m]."""
-        return float(self.s.torque[self.dof])
+def _of_joint(o: Spot) -> dict[str, float]:
+    m, s, d = o.m, o.s, int(o.m.jnt_dofadr[o.i])
+    is_hinge = m.jnt_type[o.i] == mujoco.mjtJoint.mjJNT_HINGE
+    torque, span = float(s.torque[d]), float(s.span[d])
+    speed, position = (max(float(x[d]), 1e-9) for x in (s.speed, s.position))
+    inertia, armature = float(s.inertia[d]), float(m.dof_armature[d])
+    return {
+        "torque": torque,
+        "speed": speed,
+        "position": position,
+        "inertia": inertia,
+        "torque per speed": torque / speed,
+        "torque per squared speed": torque / speed**2,
+        "torque per position": torque / position,
+        # Of the model.
+        "armature": armature,
+        "damping": float(m.dof_damping[d]),
+        "frictionloss": float(m.dof_frictionloss[d]),
+        # Most of the inertia that a drive may have.
+        "drive": armature if armature > 0 else 0.7 * inertia,
+        # What free play is a share of.
+        "reach": min(span, 1.0 if is_hinge else np.inf),
+        # Cycles per 2 pi of position: slower over the whole range, a ripple is a spring
+        # and a constant torque.
+        "slow cycles": (1.5 if is_hinge else 4.0) * 2 * np.pi / span,
+    }
 
-    @property
-    def speed(self) -> float:
-        """Of a joint [m/s or rad/s]."""
-        return max(float(self.s.speed[self.dof]), 1e-9)
 
-    @property
-    def position(self) -> float:
-        """Of a joint [m or rad]."""
-        return max(float(self.s.position[self.dof]), 1e-9)
+def _of_actuator(o: Spot) -> dict[str, float]:
+    command, force = (max(float(x[o.i]), 1e-9) for x in (o.s.command, o.s.force))
+    return {"command": command, "force": force, "peak": float(o.s.peak[o.i])}
 
-    @property
-    def inertia(self) -> float:
-        """About a joint [kg or kg m^2]."""
-        return float(self.s.inertia[self.dof])
 
-    @property
-    def play(self) -> float:
-        """Of a joint: a range that free play is a share of [m or rad]."""
-        return min(float(self.s.span[self.dof]), 1.0 if self.is_hinge else np.inf)
+def _of_body(o: Spot) -> dict[str, float]:
+    mass = float(o.m.body_mass[o.i])
+    radius = float(np.sqrt(o.m.body_inertia[o.i].max() / mass))
+    reach = float(np.linalg.norm(o.m.body_ipos[o.i]))
+    return {"mass": mass, "size": max(radius + reach, 1e-3)}
 
-    @property
-    def rotor(self) -> float:
-        """Of a joint: most inertia that its drive may have [kg or kg m^2]."""
-        own = float(self.m.dof_armature[self.dof])
-        return own if own > 0 else 0.7 * self.inertia
 
-    @property
-    def slow_cycles(self) -> float:
-        """Of a joint, per 2 pi of position: slower over the whole range, a ripple is a
-        spring and a constant torque."""
-        few = 1.5 if self.is_hinge else 4.0
-        return few * 2 * np.pi / float(self.s.span[self.dof])
-
-    @property
-    def command(self) -> float:
-        """Of an actuator."""
-        return max(float(self.s.command[self.i]), 1e-9)
-
-    @property
-    def force(self) -> float:
-        """Of an actuator [N or N m]."""
-        return max(float(self.s.force[self.i]), 1e-9)
-
-    @property
-    def peak(self) -> float:
-        """The largest force of an actuator [N or N m]."""
-        return float(self.s.peak[self.i])
-
-    @property
-    def mass(self) -> float:
-        """Of a body [kg]."""
-        return float(self.m.body_mass[self.i])
-
-    @property
-    def size(self) -> float:
-        """Of a body: its inertia's radius and how far its mass is from its frame
-        [m]."""
-        radius = float(np.sqrt(self.m.body_inertia[self.i].max() / self.mass))
-        reach = float(np.linalg.norm(self.m.body_ipos[self.i]))
-        return max(radius + reach, 1e-3)
-
-    @property
-    def friction(self) -> float:
-        """Sliding friction of contacts."""
-        return max(float(p.friction[0]) for p in self.pairs)
-
-    @property
-    def stiffness(self) -> float:
-        """Of contacts [1/s^2]."""
-        return float(np.mean([p.stiffness for p in self.pairs]))
-
-    @property
-    def damping(self) -> float:
-        """Of contacts [1/s]."""
-        return float(np.mean([p.damping for p in self.pairs]))
+def _of_contacts(o: Spot) -> dict[str, float]:
+    """What the model has."""
+    if not o.pairs:
+        return {}
+    return {
+        "friction": max(float(p.friction[0]) for p in o.pairs),
+        "stiffness": float(np.mean([p.stiffness for p in o.pairs])),
+        "damping": float(np.mean([p.damping for p in o.pairs])),
+    }
 
 
 Told = Mapping[str, tuple[float, float, str]]  # value, standard deviation, unit
+Starts = tuple[tuple[float, ...], ...]
+Limit = float | Callable[[Mapping[str, float]], float]
 
 
 @dataclass(frozen=True)
@@ -171,20 +142,22 @@ class Part:
     Attributes:
         column: the number (`easi_jax.model.effect_numbers.NUMBERS`).
         name: what people know it by; "" where they are not told of it.
-        bounds: of a fit: low, high.
+        scale: which of `Spot.sizes` the following are multiples of.
+        low, high: bounds of a fit; or functions of all sizes.
         size: a small but visible change, for finite differences.
-        without: its value in a model without the effect, where it is not the number's
-            neutral value.
-        of: what people are told is the value times this number of the model ...
+        without: its value in a model without the effect; None: its neutral value.
+        of: people are told the value times this one of the sizes ...
         unit: ... and in this unit, where it is not the number's own.
     """
 
     column: str
     name: str
-    bounds: Callable[[Spot], tuple[float, float]]
-    size: Callable[[Spot], float]
-    without: Callable[[Spot], float] | None = None
-    of: Callable[[Spot], float] = lambda o: 1.0
+    scale: str
+    low: Limit
+    high: Limit
+    size: float
+    without: float | None = None
+    of: str = "1"
     unit: str = ""
 
     @property
@@ -192,18 +165,20 @@ class Part:
         """The number's row."""
         return NUMBERS[self.column]
 
+    def bounds(self, o: Spot) -> tuple[float, float]:
+        """Low and high of a fit."""
+        sizes = o.sizes
+        low, high = (
+            x(sizes) if callable(x) else x * sizes[self.scale]
+            for x in (self.low, self.high)
+        )
+        return low, high
+
     def neutral(self, o: Spot) -> float:
         """Its value in a model without the effect."""
         if self.without is not None:
-            return self.without(o)
+            return self.without * o.sizes[self.scale]
         return min(self.number.neutral, NO_FORCE_LIMIT)
-
-    def told_unit(self, o: Spot) -> str:
-        """The unit that people are told."""
-        return self.unit or self.number.unit(o.m, o.i)
-
-
-Starts = tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -214,19 +189,31 @@ class Site:
         parts: its numbers. Where the last one says which kind it is of
             (`EffectNumber.is_shape`), each of its bounds is tried as an effect of its
             own; a fit does not move it.
-        starts: values of the parts that a fit starts from, in turn; several where the
-            predictions have no slope at the neutral values, or more than one valley.
+        starts: values of the parts, as multiples of their scales, that a fit starts
+            from, in turn; several where the predictions have no slope at the neutral
+            values, or more than one valley. NaN: from a grid.
+        more: further starts, as values, from the sizes.
         able: whether it can be there, beside what its numbers refuse.
     """
 
     parts: tuple[Part, ...]
-    starts: Callable[[Spot], Starts] = lambda o: ((0.0,),)
+    starts: Starts = ((0.0,),)
+    more: Callable[[Mapping[str, float]], Starts] = lambda sizes: ()
     able: Callable[[Spot], bool] = lambda o: True
 
     def offered(self, o: Spot) -> bool:
         """Whether the effect can be at a place."""
         numbers = (p.number for p in self.parts)
         return self.able(o) and all(n.refuse(o.m, o.i) is None for n in numbers)
+
+    def starts_at(self, o: Spot) -> Starts:
+        """Values of all parts but a shape that a fit starts from, in turn."""
+        scales = [o.sizes[p.scale] for p in self.parts]
+        scaled = (
+            tuple(x * scale for x, scale in zip(start, scales, strict=False))
+            for start in self.starts
+        )
+        return (*scaled, *self.more(o.sizes))
 
 
 @dataclass(frozen=True)
@@ -235,10 +222,10 @@ class Effect:
 
     Attributes:
         name: as the log format has it.
-        sites: where it can sit: joint, actuator, body, geom (a pair of them) or model
-            (the whole of it), and what it is there.
         sentence: what a roboticist would say; names of parameters, ``at``, ``kind``
             and ``pair`` in braces.
+        sites: where it can sit: joint, actuator, body, geom (a pair of them) or model
+            (the whole of it), and what it is there.
         is_rare: few machines have it; it is named only where it does clearly better
             than what most machines have.
         usual: values outside these are as unlikely as a rare effect.
@@ -254,8 +241,8 @@ class Effect:
     """
 
     name: str
-    sites: Mapping[str, Site]
     sentence: str
+    sites: Mapping[str, Site]
     is_rare: bool = False
     usual: tuple[float, float] = (-np.inf, np.inf)
     contains: str = ""
@@ -269,41 +256,6 @@ class Effect:
     def is_shift(self) -> bool:
         """Whether it is a shift in time."""
         return all(p.number.is_shift for s in self.sites.values() for p in s.parts)
-
-
-def _bounds(low: float, high: float) -> Callable[[Spot], tuple[float, float]]:
-    return lambda o: (low, high)
-
-
-def _size(size: float) -> Callable[[Spot], float]:
-    return lambda o: size
-
-
-def _torque(o: Spot) -> float:
-    return 0.03 * o.torque
-
-
-def _either_way(o: Spot) -> tuple[float, float]:
-    return -20 * o.torque, 20 * o.torque
-
-
-def _up(o: Spot) -> tuple[float, float]:
-    return 0.0, 20 * o.torque
-
-
-def _late(o: Spot) -> tuple[float, float]:
-    return 0.0, o.s.longest
-
-
-def _instant(o: Spot) -> float:
-    return 0.25 * o.s.dt
-
-
-def _delays(o: Spot) -> Starts:
-    return (0.5 * o.s.dt,), (2.0 * o.s.dt,), (0.3 * o.s.longest,)
-
-
-_SHAPE = {"bounds": _bounds(0.0, 1.0), "size": _size(0.1)}
 
 
 def _told_spring(got: Told) -> Told:
@@ -327,163 +279,140 @@ def _told_ripple(got: Told) -> Told:
     return {**got, "phase": (math.remainder(phase, 2 * math.pi), dp, unit)}
 
 
-def _force_starts(o: Spot) -> Starts:
-    # A limit that is seldom met shows at the largest forces alone.
-    seldom = [(x * o.peak,) for x in (0.8, 0.5) if o.peak > 3.0 * o.force]
-    return (*((x * o.force,) for x in (2.2, 1.5, 1.0, 0.6)), *seldom)
+def _has(what: str) -> Callable[[Mapping[str, float]], float]:
+    """The lower bound of what the model may have too much of: an effect of negative
+    strength."""
+    return lambda sizes: -sizes[what]
+
+
+def _longest(sizes: Mapping[str, float]) -> float:
+    return sizes["longest"]
+
+
+def _late(sizes: Mapping[str, float]) -> Starts:
+    return ((0.3 * sizes["longest"],),)
+
+
+def _seldom_met(sizes: Mapping[str, float]) -> Starts:
+    """A limit that is seldom met shows at the largest forces alone."""
+    force, peak = sizes["force"], sizes["peak"]
+    return tuple((x * peak,) for x in (0.8, 0.5) if peak > 3.0 * force)
 
 
 def _alone(
-    column: str,
-    name: str,
-    bounds: Callable[[Spot], tuple[float, float]],
-    size: Callable[[Spot], float],
-    starts: Callable[[Spot], Starts] = lambda o: ((0.0,),),
-    able: Callable[[Spot], bool] = lambda o: True,
+    column: str, name: str, scale: str, low: Limit, high: Limit, size: float
 ) -> Site:
-    """An effect that is one number."""
-    return Site((Part(column, name, bounds, size),), starts, able)
-
-
-def _contact_friction(column: str) -> Site:
-    slides = Part(
-        *(column, "friction", _bounds(0.05, 10.0), _size(0.05)),
-        of=lambda o: o.friction,
-    )
-    return Site((slides,), lambda o: ((0.6,), (1.6,)), lambda o: bool(o.pairs))
-
-
-def _contact_softness(field: str) -> Site:
-    parts = (
-        Part(
-            *(f"{field}.0", "stiffness", _bounds(1e-3, 50.0), _size(0.05)),
-            of=lambda o: o.stiffness,
-            unit="1/s^2",
-        ),
-        Part(
-            *(f"{field}.1", "damping", _bounds(1e-2, 50.0), _size(0.05)),
-            of=lambda o: o.damping,
-            unit="1/s",
-        ),
-    )
-    return Site(parts, lambda o: ((0.3, 0.5), (0.1, 0.3)), lambda o: bool(o.pairs))
+    return Site((Part(column, name, scale, low, high, size),))
 
 
 def _vector(
-    field: str,
-    names: str | tuple[str, ...],
-    high: Callable[[Spot], float],
-    size: Callable[[Spot], float],
+    field: str, names: str | tuple[str, ...], scale: str, high: float, size: float
 ) -> Site:
     parts = tuple(
-        Part(f"{field}.{i}", name, lambda o: (-high(o), high(o)), size)
+        Part(f"{field}.{i}", name, scale, -high, high, size)
         for i, name in enumerate(names)
     )
-    return Site(parts, lambda o: ((0.0,) * len(parts),))
+    return Site(parts, ((0.0,) * len(parts),))
+
+
+def _contact_friction(column: str) -> Site:
+    slides = Part(column, "friction", "1", 0.05, 10.0, 0.05, of="friction")
+    return Site((slides,), ((0.6,), (1.6,)), able=lambda o: bool(o.pairs))
+
+
+def _contact_softness(field: str) -> Site:
+    stiff = Part(f"{field}.0", *("stiffness", "1", 1e-3, 50.0, 0.05))
+    damped = Part(f"{field}.1", *("damping", "1", 1e-2, 50.0, 0.05))
+    parts = (
+        replace(stiff, of="stiffness", unit="1/s^2"),
+        replace(damped, of="damping", unit="1/s"),
+    )
+    return Site(parts, ((0.3, 0.5), (0.1, 0.3)), able=lambda o: bool(o.pairs))
 
 
 _ROWS = (
     Effect(
         "payload_mass",
+        'body "{at}" carries {mass} more',
         {
             "body": Site(
                 (
-                    Part(
-                        *("mass", "mass", lambda o: (-0.9 * o.mass, 20 * o.mass)),
-                        lambda o: 0.03 * o.mass,
-                    ),
-                    Part("spread", "", **_SHAPE),
+                    Part("mass", "mass", "mass", -0.9, 20, 0.03),
+                    Part("spread", "", "1", 0.0, 1.0, 0.1),
                 )
             )
         },
-        'body "{at}" carries {mass} more',
         refits=("body", "mass"),
         mjcf=effect_mjcf.BODY,
     ),
     Effect(
         "com_offset",
-        {"body": _vector("com", "xyz", lambda o: 2 * o.size, lambda o: 0.02 * o.size)},
         'the mass of body "{at}" sits elsewhere',
+        {"body": _vector("com", "xyz", "size", 2, 0.02)},
         is_rare=True,
         mjcf=effect_mjcf.BODY,
     ),
     Effect(
         "coulomb_friction",
+        'joint "{at}" has about {torque} of dry friction',
         {
-            # What the model has too much of is an effect of negative strength.
-            "joint": _alone(
-                "coulomb",
-                "torque",
-                lambda o: (-float(o.m.dof_frictionloss[o.dof]), 20 * o.torque),
-                _torque,
-                lambda o: ((0.0,), (0.1 * o.torque,)),
+            "joint": Site(
+                (Part("coulomb", "torque", "torque", _has("frictionloss"), 20, 0.03),),
+                ((0.0,), (0.1,)),
             )
         },
-        'joint "{at}" has about {torque} of dry friction',
         refits=("joint", "frictionloss"),
         mjcf=effect_mjcf.COULOMB,
     ),
     Effect(
         "viscous_damping",
+        'joint "{at}" has {damping} of viscous damping',
         {
             "joint": _alone(
-                "damping",
-                "damping",
-                lambda o: (-float(o.m.dof_damping[o.dof]), 20 * o.torque / o.speed),
-                lambda o: _torque(o) / o.speed,
+                *("damping", "damping", "torque per speed", _has("damping"), 20, 0.03)
             )
         },
-        'joint "{at}" has {damping} of viscous damping',
         refits=("joint", "damping"),
         mjcf=effect_mjcf.DAMPING,
     ),
     Effect(
         "quadratic_drag",
+        '{kind} "{at}" has a drag of {coefficient} on the squared speed',
         {
             "joint": _alone(
-                "drag",
-                "coefficient",
-                lambda o: (0.0, 20 * o.torque / o.speed**2),
-                lambda o: _torque(o) / o.speed**2,
+                *("drag", "coefficient", "torque per squared speed", 0.0, 20, 0.03)
             ),
-            # Enough to hold the body's weight at 1 m/s.
-            "body": _alone(
-                "resistance",
-                "coefficient",
-                lambda o: (0.0, 20.0 * o.mass),
-                lambda o: 0.003 * (20.0 * o.mass),
+            # More than enough to hold the body's weight at 1 m/s.
+            "body": Site(
+                (Part("resistance", "coefficient", "mass", 0.0, 20, 0.06),),
                 able=lambda o: o.m.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4,
             ),
         },
-        '{kind} "{at}" has a drag of {coefficient} on the squared speed',
         is_rare=True,
     ),
     Effect(
         "constant_force",
-        {
-            "joint": _alone("constant", "torque", _either_way, _torque),
-            "body": _vector(
-                "force", "xyz", lambda o: 200 * o.mass, lambda o: 0.1 * o.mass
-            ),
-        },
         'a constant force acts at {kind} "{at}"',
+        {
+            "joint": _alone("constant", "torque", "torque", -20, 20, 0.03),
+            "body": _vector("force", "xyz", "mass", 200, 0.1),
+        },
     ),
     Effect(
         "joint_stiffness",
+        'joint "{at}" is pulled by a spring of {stiffness}',
         {
             "joint": Site(
                 (
                     Part(
-                        *("stiffness", "stiffness"),
-                        lambda o: (0.0, 20 * (o.torque / o.position)),
-                        lambda o: 0.03 * (o.torque / o.position),
+                        *("stiffness", "stiffness", "torque per position"),
+                        *(0.0, 20, 0.03),
                     ),
-                    Part("spring", "rest", _either_way, _torque),
+                    Part("spring", "rest", "torque", -20, 20, 0.03),
                 ),
-                lambda o: ((0.0, 0.0),),
+                ((0.0, 0.0),),
             )
         },
-        'joint "{at}" is pulled by a spring of {stiffness}',
         is_rare=True,
         contains="constant_force",
         refits=("joint", "stiffness"),
@@ -492,114 +421,86 @@ _ROWS = (
     ),
     Effect(
         "stribeck_friction",
+        'joint "{at}" has dry friction of {static} at rest that falls to {kinetic} in '
+        "motion",
         {
             "joint": Site(
                 (
-                    Part("coulomb", "kinetic", _up, _torque),
-                    Part("static", "static", _up, _torque),
-                    Part(
-                        *("stribeck", "velocity"),
-                        lambda o: (0.005 * o.speed, 3 * o.speed),
-                        lambda o: 0.05 * o.speed,
-                    ),
+                    Part("coulomb", "kinetic", "torque", 0.0, 20, 0.03),
+                    Part("static", "static", "torque", 0.0, 20, 0.03),
+                    Part("stribeck", "velocity", "speed", 0.005, 3, 0.05),
                 ),
-                lambda o: tuple(
-                    (0.05 * o.torque, 0.05 * o.torque, share * o.speed)
-                    for share in (0.1, 0.4)
-                ),
+                ((0.05, 0.05, 0.1), (0.05, 0.05, 0.4)),
             )
         },
-        'joint "{at}" has dry friction of {static} at rest that falls to {kinetic} in '
-        "motion",
         is_rare=True,
         contains="coulomb_friction",
         told=_told_stribeck,
     ),
     Effect(
         "armature",
+        'joint "{at}" carries {armature} of inertia',
         {
             "joint": _alone(
-                "armature",
-                "armature",
-                lambda o: (-float(o.m.dof_armature[o.dof]), 20 * o.inertia),
-                lambda o: 0.03 * o.inertia,
+                *("armature", "armature", "inertia", _has("armature"), 20, 0.03)
             )
         },
-        'joint "{at}" carries {armature} of inertia',
         refits=("joint", "armature"),
         mjcf=effect_mjcf.ARMATURE,
     ),
     Effect(
         "sensor_bias",
-        {
-            "joint": _alone(
-                "bias",
-                "bias",
-                lambda o: (-1.5 * o.position, 1.5 * o.position),
-                lambda o: 0.01 * o.position,
-            )
-        },
         'the reading of joint "{at}" is off by {bias}',
+        {"joint": _alone("bias", "bias", "position", -1.5, 1.5, 0.01)},
     ),
     Effect(
         "sensor_delay",
-        {"joint": _alone("late", "delay", _late, _instant, _delays)},
         'the reading of "{at}" comes {delay} late',
+        {
+            "joint": Site(
+                (Part("late", "delay", "dt", 0.0, _longest, 0.25),),
+                ((0.5,), (2.0,)),
+                _late,
+            )
+        },
     ),
     Effect(
         "backlash",
+        'joint "{at}" has {width} of free play',
         {
             "joint": Site(
                 (
-                    Part(
-                        *("width", "width", lambda o: (0.0, 0.5 * o.play)),
-                        lambda o: 0.005 * o.play,
-                    ),
+                    Part("width", "width", "reach", 0.0, 0.5, 0.005),
                     # The drive's share of the inertia is fitted with it.
-                    Part(
-                        *("rotor", ""),
-                        lambda o: (0.1 * o.rotor, 0.98 * o.rotor),
-                        lambda o: 0.1 * o.rotor,
-                        without=lambda o: 0.6 * o.rotor,
-                    ),
+                    Part("rotor", "", "drive", 0.1, 0.98, 0.1, without=0.6),
                 ),
-                lambda o: tuple((w * o.play, 0.6 * o.rotor) for w in (0.01, 0.03, 0.1)),
+                ((0.01, 0.6), (0.03, 0.6), (0.1, 0.6)),
             )
         },
-        'joint "{at}" has {width} of free play',
         is_rare=True,
     ),
     Effect(
         "torque_ripple",
+        'joint "{at}" has a torque ripple of {amplitude}, {cycles_per_rev} cycles per '
+        "revolution",
         {
             "joint": Site(
                 (
-                    Part("ripple", "amplitude", _up, _torque),
-                    Part(
-                        *("cycles", "cycles_per_rev"),
-                        lambda o: (o.slow_cycles, 50 * o.slow_cycles),
-                        lambda o: 0.02 * o.slow_cycles,
-                    ),
-                    Part("phase", "phase", _bounds(-20.0, 20.0), _size(0.1)),
+                    Part("ripple", "amplitude", "torque", 0.0, 20, 0.03),
+                    Part("cycles", "cycles_per_rev", "slow cycles", 1.0, 50, 0.02),
+                    Part("phase", "phase", "1", -20.0, 20.0, 0.1),
                 ),
-                lambda o: tuple((_torque(o), np.nan, p) for p in (0.0, np.pi / 2)),
+                ((0.03, np.nan, 0.0), (0.03, np.nan, np.pi / 2)),
             )
         },
-        'joint "{at}" has a torque ripple of {amplitude}, {cycles_per_rev} cycles per '
-        "revolution",
         is_rare=True,
         is_sine=True,
         told=_told_ripple,
     ),
     Effect(
         "actuator_gain",
-        {
-            "actuator": _alone(
-                *("gain", "gain", _bounds(0.02, 10.0), _size(0.02)),
-                lambda o: ((1.0,),),
-            )
-        },
         'actuator "{at}" gives {gain} times what it is told',
+        {"actuator": Site((Part("gain", "gain", "1", 0.02, 10.0, 0.02),), ((1.0,),))},
         # A motor is rarely 2.5 times weaker than its data sheet, but may well carry a
         # load that nobody told of.
         usual=(0.4, 2.5),
@@ -608,75 +509,83 @@ _ROWS = (
     ),
     Effect(
         "actuator_delay",
-        {"actuator": _alone("delay", "delay", _late, _instant, _delays)},
         'commands arrive at actuator "{at}" {delay} late',
+        {
+            "actuator": Site(
+                (Part("delay", "delay", "dt", 0.0, _longest, 0.25),),
+                ((0.5,), (2.0,)),
+                _late,
+            )
+        },
         is_shared=True,
         mjcf=effect_mjcf.DELAY,
     ),
     Effect(
         "actuator_lag",
+        'actuator "{at}" responds with a time constant of {time_constant}',
         {
-            "actuator": _alone(
-                *("lag", "time_constant", _bounds(0.0, 0.5), _instant),
-                lambda o: ((o.s.dt,), (0.03,), (0.1,)),
+            "actuator": Site(
+                (Part("lag", "time_constant", "dt", 0.0, lambda sizes: 0.5, 0.25),),
+                ((1.0,),),
+                lambda sizes: ((0.03,), (0.1,)),
             )
         },
-        'actuator "{at}" responds with a time constant of {time_constant}',
         refits=("actuator", "time_constant"),
         is_shared=True,
         mjcf=effect_mjcf.LAG,
     ),
     Effect(
         "actuator_saturation",
+        'actuator "{at}" gives no more than {limit}',
         {
-            "actuator": _alone(
-                "limit",
-                "limit",
-                lambda o: (0.02 * o.force, max(4.0 * o.force, o.peak)),
-                lambda o: 0.02 * o.force,
-                _force_starts,
+            "actuator": Site(
+                (
+                    Part(
+                        *("limit", "limit", "force", 0.02),
+                        lambda sizes: max(4.0 * sizes["force"], sizes["peak"]),
+                        0.02,
+                    ),
+                ),
+                ((2.2,), (1.5,), (1.0,), (0.6,)),
+                _seldom_met,
             )
         },
-        'actuator "{at}" gives no more than {limit}',
         is_rare=True,
         refits=("actuator", "force_limit"),
         mjcf=effect_mjcf.LIMIT,
     ),
     Effect(
         "actuator_deadband",
+        'actuator "{at}" ignores commands below {width}',
         {
             "actuator": Site(
                 (
-                    Part(
-                        *("deadband", "width", lambda o: (0.0, 2 * o.command)),
-                        lambda o: 0.02 * o.command,
-                    ),
-                    Part("jump", "", **_SHAPE),
+                    Part("deadband", "width", "command", 0.0, 2, 0.02),
+                    Part("jump", "", "1", 0.0, 1.0, 0.1),
                 ),
-                lambda o: tuple((w * o.command,) for w in (0.08, 0.3, 0.7)),
+                ((0.08,), (0.3,), (0.7,)),
             )
         },
-        'actuator "{at}" ignores commands below {width}',
         is_rare=True,
     ),
     Effect(
         "gravity_tilt",
-        {"model": _vector("tilt", ("roll", "pitch"), _size(0.6), _size(0.01))},
         "the base is tilted (roll {roll}, pitch {pitch})",
+        {"model": _vector("tilt", ("roll", "pitch"), "1", 0.6, 0.01)},
         is_rare=True,
         usual=(-0.25, 0.25),
         mjcf=effect_mjcf.TILT,
     ),
     Effect(
         "contact_friction",
-        {"model": _contact_friction("friction"), "geom": _contact_friction("slip")},
         "contacts{pair} have a sliding friction of {friction}",
+        {"model": _contact_friction("friction"), "geom": _contact_friction("slip")},
         mjcf=effect_mjcf.FRICTION,
     ),
     Effect(
         "contact_softness",
-        {"model": _contact_softness("softness"), "geom": _contact_softness("give")},
         "contacts{pair} have a stiffness of {stiffness}",
+        {"model": _contact_softness("softness"), "geom": _contact_softness("give")},
         mjcf=effect_mjcf.SOFTNESS,
     ),
 )
