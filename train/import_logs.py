@@ -59,11 +59,8 @@ class Config:
 def run(config: Config) -> None:
     """Reads, checks, writes."""
     from easi_jax.errors import UserError
-    from easi_jax.io.importers import (
-        Selection,
-        import_recordings,
-        read_import_mapping,
-    )
+    from easi_jax.io.importers import Selection, import_recordings
+    from easi_jax.io.logs.mapping import read_mapping
     from train._gap_problem import read_model
 
     if not config.recordings:
@@ -74,7 +71,7 @@ def run(config: Config) -> None:
     if not (math.isfinite(config.command_slack) and config.command_slack >= 0):
         raise UserError(f"--command-slack is {config.command_slack:g}: 0 s or more")
     mj_model = read_model(config.model).mj_model
-    mapping = None if config.mapping is None else read_import_mapping(config.mapping)
+    mapping = None if config.mapping is None else read_mapping(config.mapping)
     done = import_recordings(
         config.recordings,
         mj_model,

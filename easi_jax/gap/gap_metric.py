@@ -9,7 +9,14 @@ import numpy as np
 from easi_jax.data.recording import Run
 from easi_jax.gap.whitening import noise_rows
 from easi_jax.gap.window_set import WindowSet
-from easi_jax.model.joint_space import dofs, is_hinge, joint_name, tangent_units, widths
+from easi_jax.model.joint_space import (
+    FREE_WIDTH,
+    dofs,
+    is_hinge,
+    joint_name,
+    tangent_units,
+    widths,
+)
 
 _VISIBLE = 5.0  # times the noise
 _ODD = 3.0  # times the error of other runs
@@ -67,7 +74,7 @@ def channels(
         if is_hinge(m, j) and not m.jnt_limited[j]:
             d = int(m.jnt_dofadr[j])
             unbounded[d] = np.ptp(everything[:, d]) > 2 * np.pi
-        elif widths(m, j) == (7, 6):
+        elif widths(m, j)[0] == FREE_WIDTH:
             unbounded[list(dofs(m, j)[:2])] = True
     scale = np.where(unbounded, change, spread)
     quiet = change < _VISIBLE * noise

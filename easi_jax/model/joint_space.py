@@ -17,8 +17,9 @@ import mujoco
 import numpy as np
 
 _Joint = mujoco.mjtJoint
-# Widths of a joint's positions and velocities.
-_WIDTHS = {_Joint.mjJNT_FREE: (7, 6), _Joint.mjJNT_BALL: (4, 3)}
+# Widths of a joint's positions, of which a free joint has the most, and velocities.
+FREE_WIDTH = 7
+_WIDTHS = {_Joint.mjJNT_FREE: (FREE_WIDTH, 6), _Joint.mjJNT_BALL: (4, 3)}
 _TANGENT_UNITS = {
     _Joint.mjJNT_FREE: ("m", "m", "m", "rad", "rad", "rad"),
     _Joint.mjJNT_BALL: ("rad", "rad", "rad"),
@@ -36,9 +37,17 @@ def _kind(m: Any, j: int) -> mujoco.mjtJoint:
     return _Joint(int(m.jnt_type[j]))
 
 
+def given_name(m: Any, j: int) -> str:
+    """A joint's name, for a free joint without one its body's, or ``""``."""
+    name = m.joint(j).name
+    if not name and _kind(m, j) == _Joint.mjJNT_FREE:
+        name = m.body(int(m.jnt_bodyid[j])).name
+    return name
+
+
 def joint_name(m: Any, j: int) -> str:
-    """A joint's name, or its number."""
-    return m.joint(j).name or f"joint{j}"
+    """A joint's name as in `given_name`, or its number."""
+    return given_name(m, j) or f"joint{j}"
 
 
 def widths(m: Any, j: int) -> tuple[int, int]:

@@ -114,6 +114,17 @@ def test_rosbag(tmp_path: Path, call: Any, kind: str) -> None:
     np.testing.assert_allclose(run.qvel, QVEL)
 
 
+def test_a_message_with_the_stamp_of_the_one_before_is_dropped(
+    tmp_path: Path, call: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ros = bag()
+    ros.joints(TIME[-1], NAMES, [0.0, 0.0])
+    (run,) = call(ros.write(tmp_path / "walk"), mapping=ARRAY).values()
+    check(run)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "repeats that of the row before: 1 (the first is row 31)" in said
+
+
 def test_joint_names_order_units_and_sensor(tmp_path: Path, call: Any) -> None:
     ros = Ros()
     names = ["cart_slide", "pole_hinge", "gripper"]
@@ -474,14 +485,14 @@ def test_non_finite_values(
         ("joints: {0: slider, 1: }", 'nothing gives "qpos.pole"'),
         ("joints: [slider, slider]", "both become qpos.slider; leave one out"),
         ("joint: [slider]", 'unknown key "joint"; did you mean "joints"?'),
-        ("joints: {a: slider}", 'joints name "a", which'),
+        ("joints: {a: slider}", 'joints name "a" is not in'),
         ("joints: 3", '"joints:" must hold'),
         ("joints: {0: [slider]}", 'joints of "0" is not a name'),
         ("columns: {dof_poss.0: qpos.slider}", 'did you mean "dof_pos.0"?'),
         (PACE + "columns: {dof_pos.0: qpos.slidr}", 'did you mean "qpos.slider"?'),
         (PACE + "scale: {qpos.pole: 0}", 'scale of "qpos.pole" is zero'),
         (PACE + "scale: {qpos.pole: x}", "'x', not a number"),
-        (PACE + "offset: {time: 1}", "time has no offset"),
+        (PACE + "quaternions: {pole: xyzw}", 'quaternions of "pole", which has none'),
         (
             PACE + "scale: {qpos.pola: 2}",
             'did you mean "qpos.pole"?',
@@ -565,10 +576,6 @@ def _command_width(ros: Ros) -> None:
     ros.array(0.3, [1.0, 2.0])
 
 
-def _same_time(ros: Ros) -> None:
-    ros.joints(TIME[-1], NAMES, [0.0, 0.0])
-
-
 def _not_a_number(ros: Ros) -> None:
     ros.joints(0.3, NAMES, [0.0, np.nan])
 
@@ -581,7 +588,6 @@ def _not_a_number(ros: Ros) -> None:
         (_names_twice, "message 31 of /joint_states names a joint twice"),
         (_other_joints, "is in messages that list different joints"),
         (_command_width, "has 2 values where the first has 1"),
-        (_same_time, "goes back or stands still from row 30"),
         (_not_a_number, "/joint_states.position.pole is nan in row 31"),
     ],
 )

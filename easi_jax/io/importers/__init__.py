@@ -5,15 +5,12 @@ finds the model's column of each channel, ``table`` brings them to common rows.
 """
 
 from easi_jax.io.importers.files import Imported, import_recordings
-from easi_jax.io.importers.mapping import ImportMapping, read_import_mapping
 from easi_jax.io.importers.streams import Recording, Selection, Stream
 
 __all__ = [
-    "ImportMapping",
     "Imported",
     "Recording",
     "Selection",
     "Stream",
     "import_recordings",
-    "read_import_mapping",
 ]

@@ -12,12 +12,12 @@ import mujoco
 from easi_jax.errors import UserError
 from easi_jax.io.files import os_reason
 from easi_jax.io.importers.lerobot import is_lerobot, read_lerobot
-from easi_jax.io.importers.mapping import ImportMapping
 from easi_jax.io.importers.minari import FILE, read_minari
 from easi_jax.io.importers.pace import read_pace
 from easi_jax.io.importers.ros import read_ros
 from easi_jax.io.importers.streams import Recording, Selection
 from easi_jax.io.importers.table import to_table
+from easi_jax.io.logs.mapping import LogMapping
 from easi_jax.io.logs.reader import read_logs
 from easi_jax.io.logs.tables import write_table
 
@@ -50,7 +50,7 @@ def import_recordings(
     mj_model: mujoco.MjModel,
     out: Path,
     *,
-    mapping: ImportMapping | None = None,
+    mapping: LogMapping | None = None,
     selection: Selection | None = None,
     slack: float = 0.0,
     allow_nan: bool = False,
@@ -76,7 +76,7 @@ def import_recordings(
     Raises:
         UserError: a recording that cannot be used, or a log that is there already.
     """
-    mapping, selection = mapping or ImportMapping(), selection or Selection()
+    mapping, selection = mapping or LogMapping(), selection or Selection()
     done: dict[Path, Imported] = {}
     with _staging(out) as staged:
         for path in paths:

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 import mujoco
 
 from easi_jax.errors import UserError, nearest
-from easi_jax.io.importers.mapping import ImportMapping
 from easi_jax.io.importers.streams import Recording, Stream, listed
 from easi_jax.io.logs.columns import LogColumns, log_columns
+from easi_jax.io.logs.mapping import LogMapping
+from easi_jax.model.joint_space import FREE_WIDTH, joint_name, widths
 
-_KINDS = {
-    mujoco.mjtJoint.mjJNT_FREE: "free",
-    mujoco.mjtJoint.mjJNT_BALL: "ball",
-}
+_KINDS = {FREE_WIDTH: "free", 4: "ball"}  # by their number of positions
 
 
 @dataclass(frozen=True)
@@ -26,7 +24,7 @@ class Use:
 
 
 def assign(
-    recording: Recording, mapping: ImportMapping, model: mujoco.MjModel
+    recording: Recording, mapping: LogMapping, model: mujoco.MjModel
 ) -> tuple[list[Use], list[str]]:
     """Finds every channel's column.
 
@@ -46,13 +44,13 @@ def assign(
 
 class _Assignment:
     def __init__(
-        self, recording: Recording, mapping: ImportMapping, model: mujoco.MjModel
+        self, recording: Recording, mapping: LogMapping, model: mujoco.MjModel
     ):
         self.recording = recording
         self.mapping = mapping
         self.model = model
         self.columns: LogColumns = log_columns(model)
-        self.joints = [model.joint(i).name for i in range(model.njnt)]
+        self.joints = [joint_name(model, i) for i in range(model.njnt)]
         self.actuators = [model.actuator(i).name for i in range(model.nu)]
 
     def result(self) -> tuple[list[Use], list[str]]:
@@ -70,6 +68,7 @@ class _Assignment:
                     column = self._column(stream, stream.names[index])
                 if column is None:
                     continue
+                column = self.mapping.component(column, self.columns.known)
                 if column in uses:
                     raise self._twice(column, uses[column], channel)
                 uses[column] = Use(column, stream, index)
@@ -115,10 +114,10 @@ class _Assignment:
                 f"{stream.source}{nearest(joint, self.joints)} (joints: in --mapping "
                 "gives it the model's name, or leaves it out)"
             )
-        kind = mujoco.mjtJoint(int(self.model.joint(joint).type[0]))
-        if kind in _KINDS:
+        kind = _KINDS.get(widths(self.model, self.joints.index(joint))[0])
+        if kind:
             raise UserError(
-                f'{self.recording.path}: joint "{joint}" is a {_KINDS[kind]} joint, '
+                f'{self.recording.path}: joint "{joint}" is a {kind} joint, '
                 f"which {stream.source}.{name} cannot hold; map its parts by columns: "
                 "in --mapping"
             )
@@ -169,13 +168,7 @@ class _Assignment:
             ("actuators", names),
             ("columns", channels),
         ):
-            for theirs in getattr(self.mapping, key):
-                if theirs not in known:
-                    raise UserError(
-                        f'{self.mapping.source}: {key} name "{theirs}", which '
-                        f"{self.recording.path} does not have"
-                        f"{nearest(theirs, known) or f' (it has {listed(known)})'}"
-                    )
+            self.mapping.check_names(key, known, self.recording.path)
 
     def _nameless(self, stream: Stream, key: str, known: list[str]) -> UserError:
         return UserError(

@@ -1,13 +1,17 @@
 """A recording's channels, at their own times, as rows of a log."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
 from easi_jax.errors import UserError
-from easi_jax.io.importers.mapping import ImportMapping
 from easi_jax.io.importers.names import Use, assign
 from easi_jax.io.importers.streams import Recording, Stream, listed
+from easi_jax.io.logs.checks import repeated_stamps
+from easi_jax.io.logs.mapping import LogMapping
+from easi_jax.model.joint_space import joint_name, turns_fully
 
 _HOLE_STEPS = 3.0
 # A command that comes this soon after nearly every row answers that row.
@@ -16,7 +20,7 @@ _SOON = 0.25
 
 def to_table(
     recording: Recording,
-    mapping: ImportMapping,
+    mapping: LogMapping,
     model: mujoco.MjModel,
     *,
     slack: float = 0.0,
@@ -34,15 +38,17 @@ def to_table(
             a position or command that is not finite (unless ``allow_nan``), or fewer
             than two rows.
     """
+    recording, notes = _without_repeats(recording)
     uses, unused = assign(recording, mapping, model)
     mapping.check_used({"time": None, **{use.column: None for use in uses}})
-    notes = [f"not used: {listed(unused)}"] if unused else []
+    notes += [f"not used: {listed(unused)}"] if unused else []
     times = _times(recording, mapping, uses)
     rows = next(use.stream for use in uses if use.column.startswith("qpos."))
     time = times[rows]
     table = {"time": time}
     known = np.ones(len(time), bool)
-    turning = _turning(model)
+    joints = range(model.njnt)
+    turning = {f"qpos.{joint_name(model, j)}" for j in joints if turns_fully(model, j)}
     for use in uses:
         values = mapping.apply(use.column, use.stream.values[:, use.index])
         kind = use.column.partition(".")[0]
@@ -76,8 +82,28 @@ def to_table(
     return {name: column[known] for name, column in table.items()}, notes
 
 
+def _without_repeats(recording: Recording) -> tuple[Recording, list[str]]:
+    """Without rows whose time stamp repeats that of the row before; of commands the
+    later message counts, so that both stay."""
+    streams, notes = [], []
+    for stream in recording.streams:
+        again = repeated_stamps(stream.time)
+        if len(again) and stream.role != "ctrl":
+            notes.append(
+                f"{stream.source}: rows dropped whose time stamp repeats that of the "
+                f"row before: {len(again)} (the first is row {again[0] + 1})"
+            )
+            stream = replace(
+                stream,
+                time=np.delete(stream.time, again),
+                values=np.delete(stream.values, again, axis=0),
+            )
+        streams.append(stream)
+    return replace(recording, streams=tuple(streams)), notes
+
+
 def _times(
-    recording: Recording, mapping: ImportMapping, uses: list[Use]
+    recording: Recording, mapping: LogMapping, uses: list[Use]
 ) -> dict[Stream, Float[np.ndarray, " N"]]:
     times: dict[Stream, np.ndarray] = {}
     for use in uses:
@@ -137,15 +163,6 @@ def _interpolated(
     there = (time >= at[0]) & (time <= at[-1])
     there &= step[after - 1] <= _HOLE_STEPS * np.median(step)
     return np.interp(time, at, values), there
-
-
-def _turning(model: mujoco.MjModel) -> set[str]:
-    """Positions that may jump by a whole turn: hinges without limits."""
-    return {
-        f"qpos.{model.joint(i).name}"
-        for i in range(model.njnt)
-        if model.jnt_type[i] == mujoco.mjtJoint.mjJNT_HINGE and not model.jnt_limited[i]
-    }
 
 
 def _early_rows(

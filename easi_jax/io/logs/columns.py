@@ -8,7 +8,8 @@ from pathlib import Path
 import mujoco
 
 from easi_jax.errors import UserError, nearest
-from easi_jax.model.joint_space import numbered, widths
+from easi_jax.io.logs.cure import cure
+from easi_jax.model.joint_space import FREE_WIDTH, given_name, numbered, widths
 
 _CHECKED = ("qpos.", "qvel.", "ctrl.")
 _LISTED = 5
@@ -23,6 +24,7 @@ class LogColumns:
         qvel: in the order of ``qvel``, ``nv`` names.
         ctrl: in the order of ``ctrl``, ``nu`` names.
         joints: each joint's velocity columns (all of them or none are given).
+        free: names of free joints.
         sensors: each named sensor's columns.
     """
 
@@ -31,6 +33,7 @@ class LogColumns:
     ctrl: tuple[str, ...]
     joints: tuple[tuple[str, ...], ...]
     sensors: Mapping[str, tuple[str, ...]]
+    free: tuple[str, ...] = ()
 
     @property
     def known(self) -> tuple[str, ...]:
@@ -47,18 +50,21 @@ def log_columns(model: mujoco.MjModel) -> LogColumns:
             one, or a model without joints.
     """
     qpos: list[str] = []
+    free: list[str] = []
     joints: list[tuple[str, ...]] = []
     for i in range(model.njnt):
-        joint = model.joint(i)
-        if not joint.name:
+        name = given_name(model, i)
+        if not name:
             body = model.body(int(model.jnt_bodyid[i])).name
             raise UserError(
-                f'the model\'s joint {i} (in body "{body}") has no name; '
-                "logs find joints by name"
+                f'the model\'s joint {i} (in body "{body}") has no name, by which logs '
+                'find joints; give it one in the model file: name="..."'
             )
         size, dofs = widths(model, i)
-        qpos += numbered(f"qpos.{joint.name}", size)
-        joints.append(numbered(f"qvel.{joint.name}", dofs))
+        if size == FREE_WIDTH:
+            free.append(name)
+        qpos += numbered(f"qpos.{name}", size)
+        joints.append(numbered(f"qvel.{name}", dofs))
     if not qpos:
         raise UserError("the model has no joint: there is nothing to log")
     ctrl: list[str] = []
@@ -82,6 +88,7 @@ def log_columns(model: mujoco.MjModel) -> LogColumns:
         ctrl=tuple(ctrl),
         joints=tuple(joints),
         sensors=sensors,
+        free=tuple(free),
     )
     for name, count in Counter(columns.known).items():
         if count > 1:
@@ -114,9 +121,24 @@ def check_columns(
         more = f" (also missing: {others}" if others else ""
         if more and len(missing) > _LISTED:
             more += f" and {len(missing) - _LISTED} more"
+        near = nearest(missing[0], strangers)
+        if near:
+            theirs = near.split('"')[1]
+            near += f" ({cure(f'columns: {{{theirs}: {missing[0]}}}')} renames it)"
+        elif strangers:
+            shown = " ".join(", ".join(strangers[:_LISTED]).split())
+            near = f" (it has {shown}; " + (
+                f"{cure(f'columns: {{THEIRS: {missing[0]}}}')} renames one)"
+            )
+        for name in columns.free:
+            if missing[0].startswith(f"qpos.{name}."):
+                near += (
+                    f"; if {name} was held during the recording, take its free joint "
+                    "out of the model"
+                )
         raise UserError(
             f"{path}: no column {first}, which the model needs"
-            f"{nearest(missing[0], strangers)}{more + ')' if more else ''}"
+            f"{near}{more + ')' if more else ''}"
         )
     ignored = [name for name in names if name not in columns.known]
     for name in ignored:

@@ -43,7 +43,9 @@ def read_logs(
     as does a hole longer than three control steps. The control step is the median
     of a recording's time differences; rows that are irregular in time are brought
     to it, commands held and positions interpolated. Quaternions are normalized and
-    made continuous in sign, wrapped positions of hinges without limits unrolled.
+    made continuous in sign; positions of hinges in whose range a full turn fits are
+    unrolled where they jump by a turn. A few rows that repeat the time stamp of the
+    row before are dropped.
 
     Args:
         paths: one or more files: ``.csv``, ``.npz`` or ``.parquet``.
@@ -67,7 +69,7 @@ def read_logs(
         if places.count(place) > 1:
             raise UserError(f"{path} is given more than once")
     columns = log_columns(mj_model)
-    names = LogMapping(source="") if mapping is None else read_mapping(mapping)
+    names = LogMapping() if mapping is None else read_mapping(mapping)
     stems = [path.stem for path in files]
     runs: list[Run] = []
     notes: list[str] = []
@@ -153,12 +155,18 @@ class _Reader:
         for text in table.notes:
             self.note(text)
         ignored = check_columns(self.path, table.columns, self.columns)
-        if ignored:
-            self.note(f"columns ignored: {', '.join(ignored)}")
+        index = [name for name in ignored if table.counts_rows(name)]
+        for name in index:
+            self.note(f'column "{name}" counts the rows (an index): ignored')
+        others = [name for name in ignored if name not in index]
+        if others:
+            self.note(f"columns ignored: {', '.join(others)}")
         raw = self._arrays(table)
         if len(raw.time) < 2:
             rows = "a single row" if len(raw.time) else "no rows"
             raise UserError(f"{self.path} has {rows}; a log needs at least two")
+        time, notes = log_checks.plausible_times(self.path, raw.time)
+        raw = raw._replace(time=time)
         log_checks.check_sizes(self.path, self.columns, raw.qpos, raw.qvel, raw.ctrl)
         good = np.isfinite(raw.time)
         good &= np.isfinite(raw.qpos).all(1) & np.isfinite(raw.ctrl).all(1)
@@ -168,12 +176,16 @@ class _Reader:
                 f"{np.sum(~good)} of {len(good)} rows dropped for a non-finite time, "
                 f"position or command (the first is row {first})"
             )
-        qpos, notes = log_checks.normalized(
+        qpos, more = log_checks.normalized(
             self.path, self.model, raw.qpos, raw.label, good
         )
         raw = raw._replace(qpos=qpos)
         for text in (
             *notes,
+            *more,
+            *log_checks.quaternion_orders(
+                self.path, self.model, raw.take(good), self.mapping.quaternions
+            ),
             *log_checks.ranges(self.model, qpos[good], raw.ctrl[good]),
         ):
             self.note(text)
@@ -254,9 +266,24 @@ class _Reader:
             return []
         with np.errstate(over="ignore"):
             gaps = np.diff(raw.time[timed])
+        again = log_checks.repeated_stamps(raw.time[timed])
+        if len(again):
+            self.note(
+                f"{name}: rows dropped whose time stamp repeats that of the row "
+                f"before: {len(again)} (the first is row {timed[again[0]] + 1})"
+            )
+            kept = np.isin(rows, timed[again], invert=True)
+            return self._recording(name, raw, rows[kept], good[kept])
         back = np.flatnonzero(gaps <= 0)
         if len(back):
             a, b = timed[back[0]], timed[back[0] + 1]
+            still = int(np.sum(gaps == 0))
+            if still == len(back):
+                raise UserError(
+                    f"{self.path}: {still} of {len(timed)} rows repeat the time stamp "
+                    f"of the row before (the first is row {b + 1}): the clock is "
+                    "coarser than the rows; log finer stamps"
+                )
             raise UserError(
                 f"{self.path}: time goes back or stands still from row {a + 1} "
                 f"({raw.time[a]:.9g} s) to row {b + 1} ({raw.time[b]:.9g} s); several "
@@ -298,6 +325,10 @@ class _Reader:
             rows = resampled(rows, dt, self.configuration)
             sent = mean_held(stamps, held, rows.time, dt)
         fitted = fitted_velocity(rows.qpos, dt, self.configuration)
+        for text in log_checks.units_of_motion(
+            self.model, rows.qpos, rows.qvel, rows.ctrl, fitted
+        ):
+            self.note(text)
         given = np.isfinite(rows.qvel)
         columns_given = given.any(0)
         lacking = int(np.sum(~given[:, columns_given].all(1)))

@@ -15,7 +15,10 @@ import pyarrow.parquet
 
 from easi_jax.errors import UserError
 from easi_jax.io.files import atomic_write, os_reason, regular_file
+from easi_jax.io.logs.cure import cure
 
+# The cells of a CSV, a 1-D array, or why the column cannot be used.
+Cells = list[str] | np.ndarray | str
 EXTENSIONS = (".csv", ".npz", ".parquet")
 _LARGEST = 4_000_000_000  # bytes
 
@@ -26,14 +29,15 @@ class Table:
 
     Attributes:
         path: the file.
-        columns: by name: cells of a CSV, a 1-D array, or (a ``str``) why the
-            column cannot be used.
+        columns: by name.
         notes: what looked odd.
+        decimal: decimal sign of cells.
     """
 
     path: Path
-    columns: Mapping[str, list[str] | np.ndarray | str]
+    columns: Mapping[str, Cells]
     notes: tuple[str, ...] = ()
+    decimal: str = "."
 
     def rows(self, name: str) -> int:
         """Number of rows of column ``name``."""
@@ -51,15 +55,27 @@ class Table:
         values = np.empty(len(column))
         for i, cell in enumerate(column):
             try:
-                values[i] = float(cell) if cell.strip() else np.nan
+                plain = cell.replace(self.decimal, ".")
+                values[i] = float(plain) if cell.strip() else np.nan
             except ValueError:
-                hint = '; use "." as decimal point' if "," in cell else ""
+                hint = ""
+                if _is_number(cell.replace(",", ".")):
+                    line = cure('decimal: ","')
+                    hint = f"; {line} reads decimal commas"
                 text = " ".join(cell.split())[:40]
                 raise UserError(
                     f'{self.path}: row {i + 1}, column "{name}" holds "{text}" '
                     f"instead of a number{hint}"
                 ) from None
         return values
+
+    def counts_rows(self, name: str) -> bool:
+        """Whether column ``name`` counts its rows by ones, as an index does."""
+        try:
+            values = self.numbers(name)
+        except UserError:
+            return False
+        return len(values) > 2 and bool(np.all(np.diff(values) == 1))
 
     def labels(self, name: str) -> np.ndarray:
         """Column ``name`` as text, ``(rows,)``; whole numbers without a point."""
@@ -177,10 +193,16 @@ def _read_csv(path: Path) -> tuple[dict[str, list[str]], tuple[str, ...]]:
     header = [" ".join(name.split()) for name in rows.pop(0)]
     if all(_is_number(name) for name in header):
         raise UserError(f"{path}: the first row must name the columns")
+    if _has_index(header, rows):
+        header = ["", *header]
+    # such as an index, or what follows a separator at the end of each line
+    header = [name or f"unnamed column {i + 1}" for i, name in enumerate(header)]
     _refuse_duplicates(path, header)
     for i, row in enumerate(rows):
         if len(row) != len(header):
             cut = "; is the file cut short?" if i + 1 == len(rows) else ""
+            if len(row) >= 2 * len(header):
+                cut = '; with decimal commas, separate columns by ";"'
             raise UserError(
                 f"{path}: row {i + 1} has {len(row)} cells "
                 f"where the header has {len(header)}{cut}"
@@ -271,6 +293,16 @@ def _delimiter(text: str) -> str:
             if other in header:
                 return other
     return ","
+
+
+def _has_index(header: list[str], rows: list[list[str]]) -> bool:
+    """Whether each row begins with its number, for which the header has no cell."""
+    if len(rows) < 2 or any(len(row) != len(header) + 1 for row in rows):
+        return False
+    first = [row[0] for row in rows]
+    if not all(_is_number(cell) for cell in first):
+        return False
+    return bool(np.all(np.diff([float(cell) for cell in first]) == 1))
 
 
 def _is_number(text: str) -> bool:

@@ -12,6 +12,7 @@ import pyarrow
 import pyarrow.parquet
 import pytest
 
+from easi_jax.data.cleaning import split_at_resets
 from easi_jax.data.recording import Run
 from easi_jax.errors import UserError
 from easi_jax.io.logs import tables as log_tables
@@ -336,14 +337,65 @@ def test_names_stay_apart(tmp_path, cart):
 
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
-@pytest.mark.parametrize("step", [0.0, -0.005])
-def test_time_going_back(tmp_path, cart, extension, step):
+def test_time_going_back(tmp_path, cart, extension):
     columns = cart_columns()
-    columns["time"][11] = columns["time"][10] + step
+    columns["time"][11] = columns["time"][10] - 0.005
     text = failure(save(tmp_path / f"a.{extension}", columns), cart)
     assert "row 11" in text
     assert "row 12" in text
     assert "goes back or stands still" in text
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_a_repeated_time_stamp_is_dropped(tmp_path, cart, extension):
+    columns = cart_columns()
+    for name, values in columns.items():
+        columns[name] = np.insert(values, 11, values[10])
+    log = read_logs(save(tmp_path / f"a.{extension}", columns), cart)
+    (run,) = log.runs
+    np.testing.assert_array_equal(run.qpos[:, 0], cart_columns()["qpos.slider"])
+    assert "1 (the first is row 12)" in said(log, "repeats that of the row before")
+
+
+def test_a_clock_coarser_than_the_rows_is_refused(tmp_path, cart):
+    columns = cart_columns()
+    columns["time"] = np.floor(columns["time"] / 0.04) * 0.04
+    text = failure(save(tmp_path / "a.csv", columns), cart)
+    assert "30 of 40 rows repeat the time stamp" in text
+    assert "row 2" in text
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit", "line"),
+    [
+        (1e3, "milliseconds", "scale: {time: 0.001}"),
+        (1e6, "microseconds", "scale: {time: 1e-06}"),
+        (1e9, "nanoseconds", "scale: {time: 1e-09}"),
+    ],
+)
+@pytest.mark.parametrize("start", [0.0, 1.7e9])
+def test_clocks_of_other_units(tmp_path, cart, factor, unit, line, start):
+    """From their own start or from 1970 on; the line that is told cures it."""
+    columns = cart_columns()
+    columns["time"] = np.round((columns["time"] + start) * factor)
+    path = save(tmp_path / "a.npz", columns)
+    text = failure(path, cart)
+    assert f"{unit}" in text and f"'{line}' in a mapping file" in text
+    (tmp_path / "map.yaml").write_text(line)
+    (run,) = read_logs(path, cart, mapping=tmp_path / "map.yaml").runs
+    assert run.dt == pytest.approx(0.01, rel=1e-4)
+    assert len(run) == ROWS
+
+
+def test_times_that_no_clock_shows(tmp_path, cart):
+    columns = cart_columns()
+    columns["time"][7] = 1e154
+    log = read_logs(save(tmp_path / "a.csv", columns), cart)
+    assert [len(run) for run in log.runs] == [7, 32]
+    assert "1 rows (the first is row 8, 1e+154 s)" in said(log, "no clock shows")
+    columns["time"] = columns["time"] + 1e154
+    assert 'column "time" holds 1e+154' in failure(save(tmp_path / "b.csv", columns),
+                                                   cart)  # fmt: skip
 
 
 @pytest.mark.parametrize("column", ["time", "qpos.pole", "ctrl.drive"])
@@ -580,7 +632,173 @@ def test_wrapped_hinge_is_unrolled_per_recording(tmp_path, flyer, cart):
     np.testing.assert_array_equal(run.qpos[:, 1], columns["qpos.pole"])
 
 
+TURN = """
+<mujoco><compiler angle="radian"/><option timestep="0.01"/><worldbody><body>
+<joint name="wrist" range="-6.28319 6.28319"/><geom size=".1"/></body></worldbody>
+<actuator><position name="drive" joint="wrist" kp="50"/></actuator></mujoco>
+"""
+
+
+@pytest.mark.parametrize(("start", "reach"), [(2.5, 3.4), (-6.0, 7.0)])
+def test_an_encoder_wraps_in_a_range_of_two_turns(tmp_path, start, reach):
+    """The run stays whole, and inside of the range that the joint has."""
+    model = mujoco.MjModel.from_xml_string(TURN)
+    time = 0.01 * np.arange(200)
+    true = start + 0.5 * reach * (1 - np.cos(2 * time))
+    columns = {"time": time, "qpos.wrist": (true + np.pi) % (2 * np.pi) - np.pi}
+    assert np.ptp(np.diff(columns["qpos.wrist"])) > 6
+    log = read_logs(save(tmp_path / "a.csv", columns | {"ctrl.drive": true}), model)
+    (run,) = log.runs
+    np.testing.assert_allclose(run.qpos[:, 0], true, atol=1e-9)
+    assert 'column "qpos.wrist"' in said(log, "whole turn")
+    assert split_at_resets([run], np.full(2, 1e-3)) == ([run], [])
+
+
+def test_quaternions_written_x_y_z_w(tmp_path, flyer):
+    """Velocities tell them; without any a half turn in every row is told."""
+    columns = flyer_columns()
+    speed = {f"qvel.base.{i}": np.zeros(ROWS) for i in range(6)}
+    speed["qvel.base.5"][:] = 2.0
+    right = save(tmp_path / "right.csv", columns | speed)
+    assert read_logs(right, flyer).runs[0].qpos[0, 3] == 1.0
+    swapped = {f"qpos.base.{3 + i}": columns[f"qpos.base.{j}"]
+               for i, j in enumerate((4, 5, 6, 3))}  # fmt: skip
+    line = "quaternions: {base: xyzw}"
+    path = save(tmp_path / "a.csv", columns | swapped | speed)
+    text = failure(path, flyer)
+    assert f"qpos.base.3 to .6 if these are written x y z w, not w x y z; '{line}'" in (
+        text
+    )
+    mapping = tmp_path / "map.yaml"
+    mapping.write_text(line)
+    run = read_logs(path, flyer, mapping=mapping).runs[0]
+    np.testing.assert_array_equal(run.qpos, read_logs(right, flyer).runs[0].qpos)
+
+    path = save(tmp_path / "b.csv", columns | swapped)
+    assert f"'{line}'" in said(read_logs(path, flyer), "w and x of the quaternion")
+    notes = read_logs(path, flyer, mapping=mapping).notes
+    assert not any("quaternion (" in note for note in notes)
+    mapping.write_text("quaternions: {base: wxyz}")
+    log = read_logs(path, flyer, mapping=mapping)
+    assert not any("quaternion (" in note for note in log.notes)
+    assert log.runs[0].qpos[0, 6] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("orders", "words"),
+    [
+        ("{base: zyxw}", "not one of wxyz, xyzw"),
+        ("{bas: xyzw}", 'did you mean "base"?'),
+        ("{wheel: xyzw}", "which has none in the log"),
+    ],
+)
+def test_wrong_orders(tmp_path, flyer, orders, words):
+    mapping = tmp_path / "map.yaml"
+    mapping.write_text(f"quaternions: {orders}")
+    path = save(tmp_path / "a.csv", flyer_columns())
+    assert words in failure(path, flyer, mapping=mapping)
+
+
+def test_a_free_joint_without_a_name_is_called_after_its_body(tmp_path):
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><option timestep=".01"/><worldbody><body name="trunk"><freejoint/>'
+        '<geom size=".1"/></body></worldbody></mujoco>'
+    )
+    names = [f"qpos.trunk.{i}" for i in range(7)]
+    columns = {name: np.full(ROWS, float(i == 3)) for i, name in enumerate(names)}
+    columns["time"] = 0.01 * np.arange(ROWS)
+    assert len(read_logs(save(tmp_path / "a.csv", columns), model).runs[0]) == ROWS
+    text = failure(save(tmp_path / "b.csv", {"time": columns["time"]}), model)
+    assert "if trunk was held during the recording, take its free joint out" in text
+
+
+def test_encoder_ticks_are_noticed(tmp_path, cart):
+    columns = cart_columns()
+    columns["qpos.pole"] = np.round(columns["qpos.pole"] * 4096 / (2 * np.pi))
+    path = save(tmp_path / "a.csv", columns)
+    note = said(read_logs(path, cart), "encoder ticks")
+    line = "scale: {qpos.pole: 0.00153398}"
+    assert f"'{line}' in a mapping file" in note
+    (tmp_path / "map.yaml").write_text(line)
+    log = read_logs(path, cart, mapping=tmp_path / "map.yaml")
+    assert not any("encoder ticks" in note for note in log.notes)
+    np.testing.assert_allclose(log.runs[0].qpos[:, 1], cart_columns()["qpos.pole"],
+                               atol=1e-3)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("column", "factor", "words", "line"),
+    [
+        ("qvel.wrist", np.degrees(1), "in degrees per second?", "0.0174533"),
+        ("qvel.wrist", 30 / np.pi, "in revolutions per minute?", "0.10472"),
+        ("ctrl.drive", np.degrees(1), "in degrees?", "0.0174533"),
+        ("qpos.wrist", np.degrees(1), "in degrees?", "0.0174533"),
+        ("qpos.wrist", 1.0, "", ""),
+    ],
+)
+def test_units_of_speeds_and_targets(tmp_path, column, factor, words, line):
+    model = mujoco.MjModel.from_xml_string(TURN)
+    time = 0.01 * np.arange(200)
+    columns = {
+        "time": time,
+        "qpos.wrist": 0.1 * np.sin(5 * time),
+        "qvel.wrist": 0.5 * np.cos(5 * time),
+        "ctrl.drive": 0.11 * np.sin(5 * time + 0.2),
+    }
+    columns[column] = columns[column] * factor
+    if column == "qpos.wrist":
+        columns["qvel.wrist"] = columns["qvel.wrist"] * factor
+    log = read_logs(save(tmp_path / "a.npz", columns), model)
+    notes = [note for note in log.notes if "mapping file" in note]
+    if not words:
+        assert notes == []
+        return
+    (note,) = notes
+    assert words in note and f"'scale: {{{column}: {line}}}'" in note
+
+
 # Files
+
+
+def test_decimal_commas(tmp_path, cart):
+    plain = save(tmp_path / "plain.csv", cart_columns())
+    text = plain.read_text()
+    path, mapping = tmp_path / "a.csv", tmp_path / "map.yaml"
+    path.write_text(text.replace(",", ";").replace(".", ",").replace("qpos,", "qpos.")
+                    .replace("ctrl,", "ctrl."))  # fmt: skip
+    refused = failure(path, cart)
+    assert 'row 1, column "time" holds "0,0"' in refused
+    line = 'decimal: ","'
+    assert f"'{line}' in a mapping file" in refused
+    mapping.write_text(line)
+    (run,) = read_logs(path, cart, mapping=mapping).runs
+    (expected,) = read_logs(plain, cart).runs
+    np.testing.assert_array_equal(run.qpos, expected.qpos)
+    mapping.write_text('decimal: "x"')
+    assert "decimal is 'x', not" in failure(path, cart, mapping=mapping)
+    lines = text.splitlines()
+    commas = [line.replace(".", ",") for line in lines[1:]]
+    path.write_text("\n".join([lines[0], *commas]))
+    assert 'separate columns by ";"' in failure(path, cart)
+
+
+@pytest.mark.parametrize("name", ["", "index", "Unnamed: 0"])
+def test_index_columns_are_told(tmp_path, cart, name):
+    columns = {name: np.arange(ROWS), **cart_columns()}
+    log = read_logs(save(tmp_path / "a.csv", columns), cart)
+    said(log, f'column "{name or "unnamed column 1"}" counts the rows')
+    assert len(log.runs[0]) == ROWS
+
+
+def test_an_index_that_the_header_lacks_and_a_separator_too_many(tmp_path, cart):
+    path = save(tmp_path / "a.csv", {"i": np.arange(ROWS), **cart_columns()})
+    path.write_text(path.read_text().removeprefix("i,"))
+    log = read_logs(path, cart)
+    said(log, 'column "unnamed column 1" counts the rows')
+    np.testing.assert_array_equal(log.runs[0].time, cart_columns()["time"])
+    path.write_text(path.read_text().replace("\n", ",\n").replace("time", ",time", 1))
+    log = read_logs(path, cart)
+    said(log, "columns ignored: unnamed column 6")
 
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
@@ -705,7 +923,7 @@ def test_text_and_encodings(tmp_path, cart):
     path.write_text(text.replace(",", ";"))
     assert len(read_logs(path, cart).runs[0]) == ROWS
     path.write_text(text.replace(",", ";").replace("0.01;", "0,01;"))
-    assert "decimal point" in failure(path, cart)
+    assert "'decimal: \",\"' in a mapping file" in failure(path, cart)
     path.write_text(text.replace("0.03,", "start,"))
     assert 'row 4, column "time" holds "start"' in failure(path, cart)
     path.write_text(text.replace("0.03,", '"two\nlines",'))
@@ -791,6 +1009,26 @@ def test_bad_mappings(tmp_path, cart, old, new, words):
     assert old in MAPPING
     path.write_text(MAPPING.replace(old, new, 1))
     assert words in failure(foreign(tmp_path), cart, mapping=path)
+
+
+def test_joints_actuators_and_patterns(tmp_path, cart):
+    """One schema with the imports: joints by name, patterns, and what is left out."""
+    names = {"time": "time", "qpos.slider": "qpos.x", "qpos.pole": "qpos.y",
+             "ctrl.drive": "ctrl.u"}  # fmt: skip
+    columns = {names[k]: v for k, v in cart_columns().items()}
+    columns |= {"qpos.gripper": np.zeros(ROWS), "qvel.y": np.ones(ROWS)}
+    path = save(tmp_path / "a.csv", columns)
+    mapping = tmp_path / "map.yaml"
+    mapping.write_text(
+        "joints: {x: slider, y: pole, gripper: }\nactuators: {u: drive}\n"
+        'scale: {"qpos.*": 2.0}\n'
+    )
+    (run,) = read_logs(path, cart, mapping=mapping).runs
+    np.testing.assert_array_equal(run.qpos[:, 1], 2 * columns["qpos.y"])
+    np.testing.assert_array_equal(run.qvel[:, 1], 1.0)
+    np.testing.assert_array_equal(run.ctrl[:, 0], columns["ctrl.u"])
+    mapping.write_text("joints: {x: slider, yy: pole}")
+    assert 'joints name "yy" is not in' in failure(path, cart, mapping=mapping)
 
 
 def test_mapping_files_that_are_none(tmp_path, cart):
