@@ -171,7 +171,7 @@ def _reading_line(e: NamedEffect) -> str:
     joint = at.removeprefix("qvel.")
     place = f'sensor "{at}"' if joint == at else f'measured velocity of "{joint}"'
     start = f"{place[0].upper()}{place[1:]}"
-    if e.effect == "sensor_bias":
+    if not CATALOG[e.effect].is_shift:
         bias = parameters_text(e.values, ", ")
         return f"{start} is off by a constant ({bias}); no prediction uses it."
     late = f"{1000 * e.columns['late']:.0f} ms"

@@ -48,7 +48,6 @@ TO_COME = {"drive_stiffness", "drive_damping", "actuator_strength"}
 # Literals with the name of an effect outside the catalog, and why.
 ELSEWHERE = {
     "easi_jax/gap/sensor_faults.py": "finds these two where no simulation shows them",
-    "train/_gap_results.py": "what is said of a sensor's reading",
 }
 # An effect and a number of the model have this name.
 NUMBER_OF_MODELS = "armature"
