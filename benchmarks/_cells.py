@@ -16,14 +16,18 @@ from typing import Any
 from train._command import say
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Share:
-    """Which cells a process runs, and where their lines go."""
+    """Which cells a process runs, and where their lines go; configs add to it."""
 
-    shard: str
-    only: str
-    list: bool
+    shard: str = "1/1"
+    """Which part of the cells this process runs."""
+    only: str = ""
+    """One cell, by its name as --list shows it."""
+    list: bool = False
+    """Show the cells, and which are done, without running any."""
     out: Path
+    """Where a line for each cell is added."""
 
 
 def run_cells(

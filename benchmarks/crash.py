@@ -61,30 +61,23 @@ class Cell:
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Share):
     """Kills commands at random moments, and lets them go on."""
 
     kills: int = 20
     """Of each command."""
     seed: int = 0
     """Of the moments."""
-    shard: str = "1/1"
-    """Which part of the cells this process runs."""
-    only: str = ""
-    """One cell, by its name as --list shows it."""
-    list: bool = False
-    """Show the cells, and which are done, without running any."""
-    out: Path = RESULTS / "crash.jsonl"
+    out: Path = dataclasses.field(default=RESULTS / "crash.jsonl", kw_only=True)
     """Where a line for each cell is added."""
 
 
 def run(config: Config) -> None:
     """Runs the cells, with one job of each command that is left alone."""
     cells = [Cell(c, k) for c in COMMANDS for k in range(config.kills)]
-    share = Share(config.shard, config.only, config.list, config.out)
     with tempfile.TemporaryDirectory() as folder:
         jobs = Jobs(Path(folder), config.seed)
-        run_cells(cells, share, jobs.solve, told)
+        run_cells(cells, config, jobs.solve, told)
 
 
 def told(row: dict[str, Any]) -> str:

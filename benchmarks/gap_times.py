@@ -38,26 +38,19 @@ class Cell:
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Share):
     """Times train.gap on machines of one joint to six."""
 
     seed: int = 30_000
     """Of the cases."""
-    shard: str = "1/1"
-    """Which part of the cases this process runs."""
-    only: str = ""
-    """One case, by its name as --list shows it."""
-    list: bool = False
-    """Show the cases, and which are done, without running any."""
-    out: Path = RESULTS / "gap_times.jsonl"
+    out: Path = dataclasses.field(default=RESULTS / "gap_times.jsonl", kw_only=True)
     """Where a line for each case is added."""
 
 
 def run(config: Config) -> None:
     """Runs the command in processes and compilation caches of their own."""
     cells = [Cell(m, e, config.seed) for m in GOALS for e in EFFECTS]
-    share = Share(config.shard, config.only, config.list, config.out)
-    run_cells(cells, share, solve, lambda row: f"{row['seconds']:.0f} s")
+    run_cells(cells, config, solve, lambda row: f"{row['seconds']:.0f} s")
 
 
 def solve(cell: Cell) -> dict[str, Any]:

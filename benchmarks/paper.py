@@ -45,7 +45,7 @@ STARTS = (None, (0.05, 1.0), (1.0, 2.0))
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Share):
     """Runs the cells of one of the paper's tables or figures."""
 
     experiment: Annotated[str, tyro.conf.Positional]
@@ -60,15 +60,9 @@ class Config:
     """Methods; those of the experiment where not given."""
     env_steps: int | None = None
     """Control steps of each training; the robot's preset where not given."""
-    shard: str = "1/1"
-    """Which part of the cells this process runs."""
-    only: str = ""
-    """One cell, by its name as --list shows it."""
-    list: bool = False
-    """Show the cells, and which are done, without running any."""
     folder: Path = Path("results/paper")
     """Where UDR trainings are kept."""
-    out: Path = RESULTS
+    out: Path = dataclasses.field(default=RESULTS, kw_only=True)
     """Where a line for each cell is added."""
 
 
@@ -88,8 +82,7 @@ def run(config: Config) -> None:
         result = f"return {row['return']:.1f}" if "return" in row else "identified"
         return f"{result}, {row.get('seconds', row.get('identify_s', 0)):.0f} s"
 
-    share = Share(config.shard, config.only, config.list, config.out)
-    run_cells(cells(config), share, result, told)
+    run_cells(cells(config), config, result, told)
 
 
 def cells(config: Config) -> list[Cell]:

@@ -37,7 +37,7 @@ RESULTS = Path(__file__).parent / "results" / "rivals.jsonl"
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(Share):
     """Compares methods of identification at equal data."""
 
     robots: tuple[str, ...] = ROBOTS
@@ -53,13 +53,7 @@ class Config:
     """Recorded trajectories of 200 control steps."""
     budget: int | None = None
     """Control steps that each method may simulate; not given: 40 million, on go2 6."""
-    shard: str = "1/1"
-    """Which part of the cells this process runs."""
-    only: str = ""
-    """One cell, by its name as --list shows it."""
-    list: bool = False
-    """Show the cells, and which are done, without running any."""
-    out: Path = RESULTS
+    out: Path = dataclasses.field(default=RESULTS, kw_only=True)
     """Where a line for each cell is added."""
 
 
@@ -75,8 +69,7 @@ def run(config: Config) -> None:
             f"{'inside' if row['covered'] else 'outside'}, {row['seconds']:.0f} s"
         )
 
-    share = Share(config.shard, config.only, config.list, config.out)
-    run_cells(cells(config), share, solve, told)
+    run_cells(cells(config), config, solve, told)
 
 
 def cells(config: Config) -> list[Cell]:

@@ -30,7 +30,7 @@ def run(out: Path, keys: str) -> list[str]:
         ran.append(cell.key)
         return {"value": 2}
 
-    share = Share("1/1", "", False, out)
+    share = Share(out=out)
     run_cells([One(k) for k in keys], share, solve, lambda row: "done")
     return ran
 

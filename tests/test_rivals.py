@@ -83,7 +83,7 @@ def test_a_cell_is_run_once_and_shared(tmp_path: Path) -> None:
             ran.append(c.key)
             return {"value": len(ran)}
 
-        share = Share(shard, only, False, out)
+        share = Share(shard=shard, only=only, out=out)
         run_cells([One(k) for k in "abcd"], share, solve, lambda row: "done")
 
     go("2/2")
