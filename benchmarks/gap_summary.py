@@ -1,11 +1,13 @@
 """Pages of results on the gap workflow."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
+from itertools import product
 from pathlib import Path
 from statistics import median
+from typing import Any
 
-from benchmarks._cells import read_rows
 from benchmarks._common import markdown_table, short
+from benchmarks._page import Section, each_of, load, met, table
 from benchmarks.gap_real import MACHINES
 from benchmarks.gap_score import (
     GOALS,
@@ -18,7 +20,6 @@ from benchmarks.gap_score import (
     judged,
     parameter_errors,
     ratios,
-    read_cases,
     shares,
     wilson,
 )
@@ -31,31 +32,52 @@ EMPS_GOAL = 8e-4  # m, over 0.5 s of the pulses
 
 def generated(folder: Path) -> list[str]:
     """Cases with a hidden effect."""
-    rows = read_cases(folder / "gap_cases.jsonl")
-    if not rows:
-        return ["## Hidden effects", "Not run: `python -m benchmarks.gap`."]
-    out = [
-        "## Hidden effects",
-        f"{len(rows)} generated cases (`python -m benchmarks.gap`), commits "
-        f"{', '.join(sorted({short(r['commit']) for r in rows}))}.",
+    return [part for s in _GENERATED for part in s(folder)]
+
+
+def _cases(rows: list[Any]) -> list[str]:
+    commits = ", ".join(sorted({short(r["commit"]) for r in rows}))
+    strict = {
+        k: sum(r["right"] for r in rows if r["kind"] == k) for k in ("single", "pair")
+    }
+    pairs = judged(rows)
+    bins = [(f"{c:.2f}", f"{s:.2f}", n) for c, s, n in calibration(pairs)]
+    return [
+        f"{len(rows)} generated cases (`python -m benchmarks.gap`), commits {commits}.",
+        markdown_table(
+            ("what", "cases", "95 % (Wilson)", "goal", ""),
+            [*_goals(rows), *_sizes(rows)],
+        ),
+        f"Right names and pairs that are named themselves: {strict['single']} and "
+        f"{strict['pair']}; the others are listed as names that the held-out data "
+        "do not tell from the one named.",
+        markdown_table(("confidence stated", "share right", "names"), bins),
+        f"Brier score {brier(pairs):.3f} over {len(pairs)} names.",
+        "![Calibration of the stated confidence](gap_calibration.svg)",
+        "![What each true effect was named](gap_confusion.svg)",
+        "The counts are in `gap_confusion.json`.",
     ]
-    lines = []
+
+
+def _goals(rows: list[Any]) -> Iterator[tuple[str, ...]]:
+    """Shares of cases against their goals."""
     for name, (hits, count) in shares(rows).items():
         goal, way = GOALS[name]
+        most = f"{way} {goal:.0%}"
         if not count:
-            lines.append((name, "not run", "", f"{way} {goal:.0%}", ""))
+            yield name, "not run", "", most
             continue
-        low, high = wilson(hits, count)
-        met = hits / count >= goal if way == "at least" else hits / count <= goal
-        lines.append(
-            (
-                name,
-                f"{hits} of {count}",
-                f"{low:.0%} to {high:.0%}",
-                f"{way} {goal:.0%}",
-                "met" if met else "missed",
-            )
-        )
+        reached = hits / count >= goal if way == "at least" else hits / count <= goal
+        yield *_share(name, hits, count), most, "met" if reached else "missed"
+
+
+def _share(name: str, hits: int, count: int) -> tuple[str, str, str]:
+    low, high = wilson(hits, count)
+    return name, f"{hits} of {count}", f"{low:.0%} to {high:.0%}"
+
+
+def _sizes(rows: list[Any]) -> Iterator[tuple[str, ...]]:
+    """Medians of what is measured in a case against their goals."""
     for name, values, goal, shown in (
         ("error of a parameter, median", parameter_errors(rows), PARAMETER_GOAL, "%"),
         ("gap after in floors, one effect, median", ratios(rows), RATIO_GOAL, ""),
@@ -64,78 +86,36 @@ def generated(folder: Path) -> list[str]:
             middle = median(values)
             told = f"{100 * middle:.1f} %" if shown else f"{middle:.2f}"
             most = f"at most {100 * goal:.0f} %" if shown else f"at most {goal:g}"
-            lines.append(
-                (
-                    f"{name} of {len(values)}",
-                    told,
-                    "",
-                    most,
-                    "met" if middle <= goal else "missed",
-                )
-            )
-    out.append(markdown_table(("what", "cases", "95 % (Wilson)", "goal", ""), lines))
-    strict = {
-        k: sum(r["right"] for r in rows if r["kind"] == k) for k in ("single", "pair")
-    }
-    out.append(
-        f"Right names and pairs that are named themselves: {strict['single']} and "
-        f"{strict['pair']}; the others are listed as names that the held-out data "
-        "do not tell from the one named."
-    )
-    pairs = judged(rows)
-    bins = [(f"{c:.2f}", f"{s:.2f}", n) for c, s, n in calibration(pairs)]
-    out.append(
-        markdown_table(("confidence stated", "share right", "names"), list(bins))
-    )
-    out.append(f"Brier score {brier(pairs):.3f} over {len(pairs)} names.")
-    out += [
-        "![Calibration of the stated confidence](gap_calibration.svg)",
-        "![What each true effect was named](gap_confusion.svg)",
-        "The counts are in `gap_confusion.json`.",
-    ]
-    return out + contacts(folder) + coarse(folder)
+            reached = "met" if middle <= goal else "missed"
+            yield f"{name} of {len(values)}", told, "", most, reached
 
 
-def contacts(folder: Path) -> list[str]:
+def _contacts(rows: list[Any]) -> list[str]:
     """Cases whose hidden effect is one of contacts, on a machine that hops along."""
-    rows = read_cases(folder / "gap_contacts.jsonl")
-    if not rows:
-        return []
-    lines = [
-        (
-            r["mechanism"],
-            ", ".join(r["truth"]),
-            _sure(r["named"], r["confidence"]),
-            *(f"{r['gap'][k] / r['gap']['floor']:.2f}" for k in ("refit", "after")),
-        )
-        for r in rows
-    ]
+    columns = {
+        "machine": "{mechanism}",
+        "hidden": lambda r: ", ".join(r["truth"]),
+        "named (confidence)": lambda r: _sure(r["named"], r["confidence"]),
+        "gap in floors": lambda r: f"{r['gap']['refit'] / r['gap']['floor']:.2f}",
+        "after": lambda r: f"{r['gap']['after'] / r['gap']['floor']:.2f}",
+    }
     return [
         "Contacts are drawn seldom, and only legs have them; these are drawn on "
         "purpose (`python -m benchmarks.gap --effect contact_friction --mechanism "
         "hopper --out benchmarks/results/gap_contacts.jsonl`, and so on):",
-        markdown_table(
-            ("machine", "hidden", "named (confidence)", "gap in floors", "after"), lines
-        ),
+        table(rows, columns),
     ]
 
 
-def _sure(names: Sequence[str], confidence: Sequence[float]) -> str:
+def _sure(names: Iterable[str], confidence: Iterable[float]) -> str:
     """Names with the confidence stated in each."""
     told = (f"{n} ({c:.2f})" for n, c in zip(names, confidence, strict=True))
     return ", ".join(told) or "none"
 
 
-def coarse(folder: Path) -> list[str]:
+def _coarse(rows: list[Any]) -> list[str]:
     """Cases whose model is off by its own timestep."""
-    rows = read_cases(folder / "gap_coarse.jsonl")
-    if not rows:
-        return []
-    lines = []
-    for name, (hits, count) in shares(rows).items():
-        if count:
-            low, high = wilson(hits, count)
-            lines.append((name, f"{hits} of {count}", f"{low:.0%} to {high:.0%}"))
+    lines = [_share(name, *of) for name, of in shares(rows).items() if of[1]]
     return [
         "Models whose own physics step and start velocities make a gap of 1.3 to 4 "
         "floors where nothing is missing (`python -m benchmarks.gap --coarse --cheap "
@@ -144,12 +124,19 @@ def coarse(folder: Path) -> list[str]:
     ]
 
 
+_GENERATED = (
+    Section("## Hidden effects", "gap_cases.jsonl", "gap", _cases),
+    Section("", "gap_contacts.jsonl", "gap", _contacts),
+    Section("", "gap_coarse.jsonl", "gap", _coarse),
+)
+
+
 def figures(folder: Path) -> dict[str, str]:
     """Texts of the pictures and counts, by file name; none without cases."""
     from benchmarks.gap_figures import calibration_curve, confusion_matrix
     from easi_jax.io.files import to_json
 
-    rows = read_cases(folder / "gap_cases.jsonl")
+    rows = load(folder, "gap_cases.jsonl")
     if not rows:
         return {}
     counts, pairs = confusion(rows), judged(rows)
@@ -164,21 +151,18 @@ def figures(folder: Path) -> dict[str, str]:
 
 def loop(folder: Path) -> list[str]:
     """Returns in a target with a hidden effect, before and after it is found."""
-    from easi_jax.io.files import read_json
-
     out = ["## The loop closed: a hidden effect in the target"]
     for robot, effects in HIDDEN.items():
         lines, methods = [], []
         for effect in effects:
-            path = folder / f"loop_{robot}_{effect}.json"
-            if not path.is_file():
+            r = load(folder, f"loop_{robot}_{effect}.json")
+            if r is None:
                 how = "" if robot == "cartpole" else f" --robot {robot}"
                 out.append(
                     f"{robot}, {effect}: not run (`python -m benchmarks.loop{how} "
                     f"--effect {effect}`)."
                 )
                 continue
-            r = read_json(path)
             methods = list(r["returns"])
             named = ", ".join(f"{e['effect']}@{e['at']}" for e in r["found"]["effects"])
             each = [[*v.values()] for v in r["returns"].values()]
@@ -193,86 +177,71 @@ def loop(folder: Path) -> list[str]:
 
 
 def _mean_and_all(values: list[float]) -> str:
-    each = ", ".join(f"{x:.1f}" for x in values)
-    return f"{sum(values) / len(values):.1f} ({each})"
+    return f"{sum(values) / len(values):.1f} ({each_of(values, 1)})"
 
 
-def times(folder: Path) -> list[str]:
+def _times(rows: list[Any]) -> list[str]:
     """Seconds of the whole command."""
-    out, rows = ["## Time of train.gap"], read_rows(folder / "gap_times.jsonl")
-    if not rows:
-        return [*out, "Not run: `python -m benchmarks.gap_times`."]
     done = {(r["mechanism"], r["effect"]): r for r in rows}
     lines: list[tuple[object, ...]] = []
-    for mechanism, goal in TIME_GOALS.items():
-        for effect in EFFECTS:
-            c = done.get((mechanism, effect))
-            if c is None:
-                lines.append((mechanism, effect, "not run"))
-                continue
-            met = "met" if c["seconds"] <= goal else "**missed**"
-            named = ", ".join(c["named"]) or "none"
-            told = (f"{c['seconds']:.0f}", f"{goal}, {met}")
-            lines.append((mechanism, ", ".join(c["truth"]), named, *told))
+    for mechanism, effect in product(TIME_GOALS, EFFECTS):
+        c, goal = done.get((mechanism, effect)), TIME_GOALS[mechanism]
+        if c is None:
+            lines.append((mechanism, effect, "not run"))
+            continue
+        told = (f"{c['seconds']:.0f}", f"{goal}, {met(c['seconds'] <= goal)}")
+        named = ", ".join(c["named"]) or "none"
+        lines.append((mechanism, ", ".join(c["truth"]), named, *told))
     cores = ", ".join(sorted({str(r["cores"]) for r in rows}))
     return [
-        *out,
         f"`python -m benchmarks.gap_times`: from a first start, nothing cached, on "
         f"{cores} cores.",
         markdown_table(("machine", "hidden", "named", "s", "goal [s]"), lines),
     ]
 
 
-def real(folder: Path) -> list[str]:
+def _real(found: dict[str, Any]) -> list[str]:
     """Recordings of real machines."""
-    from easi_jax.io.files import read_json
-
-    out = ["## Effects in real recordings"]
-    lines: list[tuple[object, ...]] = []
-    for name in MACHINES:
-        path = folder / f"gap_real_{name}.json"
-        if not path.is_file():
-            continue
-        r = read_json(path)
-        named = _sure(
+    by_name = {name.removeprefix("gap_real_"): r for name, r in found.items()}
+    rows = [{"name": n, **by_name[n]} for n in MACHINES if n in by_name]
+    columns = {
+        "recordings": "{name}",
+        "named (confidence)": lambda r: _sure(
             [f"{e['effect']}@{e['at']}" for e in r["effects"]],
             [e["confidence"] for e in r["effects"]],
-        )
-        alike = {n for e in r["effects"] for n in e["indistinguishable"]}
-        missing = [
-            k.replace("|", " or ")
-            + (" (listed as alike)" if is_among(k, alike) else "")
-            for k, ok in r["found"].items()
-            if not ok
-        ]
-        gap = r["gap"]
-        joints = "; ".join(
-            f"{j} {v['before']:.2g} to {v['after']:.2g} {v['unit']}"
-            for j, v in r["gap_si"].items()
-        )
-        lines.append(
-            (
-                name,
-                named,
-                ", ".join(missing) or "none",
-                ", ".join(r["wrongly_named"]) or "none",
-                f"{gap['before']:.3g}, {gap['refit']:.3g}, {gap['after']:.3g}",
-                f"{gap['floor']:.2g}",
-                f"{joints} in {r['config']['horizon']:g} s",
-                f"{r['seconds']:.0f}",
+        ),
+        "expected but not named": _unnamed,
+        "never to be named": lambda r: ", ".join(r["wrongly_named"]) or "none",
+        "gap given, refitted, after": (
+            "{gap[before]:.3g}, {gap[refit]:.3g}, {gap[after]:.3g}"
+        ),
+        "floor": "{gap[floor]:.2g}",
+        "error held out, given to repaired": lambda r: (
+            "; ".join(
+                f"{j} {v['before']:.2g} to {v['after']:.2g} {v['unit']}"
+                for j, v in r["gap_si"].items()
             )
-        )
-    if not lines:
-        return [*out, "Not run: `python -m benchmarks.gap_real`."]
-    head = (
-        *("recordings", "named (confidence)", "expected but not named"),
-        *("never to be named", "gap given, refitted, after", "floor"),
-        *("error held out, given to repaired", "s"),
-    )
-    out += ["`python -m benchmarks.gap_real`.", markdown_table(head, lines)]
-    path = folder / "gap_real_emps.json"
-    if path.is_file():
-        (axis,) = read_json(path)["gap_si"].values()
-        met = "met" if axis["after"] <= EMPS_GOAL else "**missed**"
-        out.append(f"emps: {1000 * axis['after']:.2f} mm (goal 0.8 mm: {met}).")
+            + f" in {r['config']['horizon']:g} s"
+        ),
+        "s": "{seconds:.0f}",
+    }
+    out = ["`python -m benchmarks.gap_real`.", table(rows, columns)]
+    if "emps" in by_name:
+        (axis,) = by_name["emps"]["gap_si"].values()
+        verdict = met(axis["after"] <= EMPS_GOAL)
+        out.append(f"emps: {1000 * axis['after']:.2f} mm (goal 0.8 mm: {verdict}).")
     return out
+
+
+def _unnamed(r: Any) -> str:
+    alike = {n for e in r["effects"] for n in e["indistinguishable"]}
+    missing = [
+        k.replace("|", " or ") + (" (listed as alike)" if is_among(k, alike) else "")
+        for k, ok in r["found"].items()
+        if not ok
+    ]
+    return ", ".join(missing) or "none"
+
+
+times = Section("## Time of train.gap", "gap_times.jsonl", "gap_times", _times)
+real = Section(*("## Effects in real recordings", "gap_real_*.json", "gap_real", _real))
