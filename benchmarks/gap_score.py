@@ -1,9 +1,7 @@
 """How often train.gap is right, counted over the cases of ``benchmarks.gap``."""
 
-import json
 from collections.abc import Mapping, Sequence
 from math import hypot, sqrt
-from pathlib import Path
 from typing import Any
 
 GOALS = {
@@ -18,13 +16,6 @@ RATIO_GOAL = 1.2  # median gap after, in floors
 _VECTORS = (("x", "y", "z"), ("roll", "pitch"))
 _SURE = 0.8
 _BINS = 5
-
-
-def read_cases(path: Path) -> list[dict[str, Any]]:
-    """One row a case; none where the file is missing."""
-    if not path.is_file():
-        return []
-    return [json.loads(line) for line in path.read_text().splitlines()]
 
 
 def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:

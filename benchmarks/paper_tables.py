@@ -13,6 +13,7 @@ from typing import Any
 from benchmarks import paper_matrix
 from benchmarks._cells import read_rows
 from benchmarks._common import markdown_table
+from benchmarks._page import each_of, met, not_run, table
 from benchmarks.paper import CHANGED, MUST, ON_HARDWARE, SEARCHES, STARTS
 from benchmarks.paper_cells import METHODS, WARM
 from benchmarks.paper_runtime import WAYS
@@ -85,7 +86,7 @@ def sections(folder: Path) -> list[str]:
     rows = whole(read_rows(folder / "paper.jsonl"))
     out = ["## The paper's tables and figures"]
     if not rows:
-        return [*out, "Not run: `python -m benchmarks.paper table1`."]
+        return [*out, not_run("paper table1")]
     out += paper_matrix.section(rows)
     for part in (
         *(_table1, _table2, _table3, _table4, _table5),
@@ -154,7 +155,7 @@ def told(values: Sequence[float], digits: int = 1) -> str:
     """Mean and standard deviation over seeds, and every seed."""
     if not values:
         return _NOT_RUN
-    each = ", ".join(f"{v:.{digits}f}" for v in values)
+    each = each_of(values, digits)
     if len(values) == 1:
         return each
     return f"{mean(values):.{digits}f} ± {stdev(values):.{digits}f} ({each})"
@@ -189,7 +190,7 @@ def _table1(rows: Sequence[Row]) -> list[str]:
                 cells.append(stated.get(theirs, ""))
             lines.append((method, *cells))
         if not any(by_target.values()):
-            out.append(f"Not run: `python -m benchmarks.paper table1 --robot {robot}`.")
+            out.append(not_run(f"paper table1 --robot {robot}"))
             continue
         name = CHANGED[robot]
         head = (
@@ -233,7 +234,7 @@ def _other_recipe(robot: str, rows: Sequence[Row]) -> list[str]:
 def _judged(method: str, share: str) -> str:
     if method != OURS or not share:
         return share
-    return f"{share}, met" if float(share) >= GOAL else f"{share}, **missed**"
+    return f"{share}, {met(float(share) >= GOAL)}"
 
 
 def _first(
@@ -290,24 +291,26 @@ def _table2(rows: Sequence[Row]) -> list[str]:
     out = ["### Table 2: balancing in a twin"]
     mine = _in_twin(rows, "cartpole")
     if not mine:
-        return [*out, "Not run: `python -m benchmarks.paper table2`."]
-    lines = [
-        (
-            method,
-            *(told([r[key] for r in found], 2) for key in ("angle_error", "speed")),
-            told([r["return"] for r in found]),
-            f"{sum(r['fallen'] for r in found)} of {EPISODES * len(found)}",
-        )
-        for method, found in mine.items()
-    ]
-    head = ("method", "pole angle [0.01 rad]", "cart speed [0.1 m/s]", "return", "fell")
+        return [*out, not_run("paper table2")]
+    columns = {
+        "method": lambda m: m[0],
+        "pole angle [0.01 rad]": lambda m: _of(m[1], lambda r: r["angle_error"], 2),
+        "cart speed [0.1 m/s]": lambda m: _of(m[1], lambda r: r["speed"], 2),
+        "return": lambda m: _of(m[1], lambda r: r["return"], 1),
+        "fell": lambda m: f"{sum(r['fallen'] for r in m[1])} of {EPISODES * len(m[1])}",
+    }
     return [
         *out,
         f"{_NO_HARDWARE} cart-pole; 50 logged episodes. Mean sizes until a fall; mean "
         "± standard deviation (every seed). Published, on hardware: pole 2.65 ± 0.19 "
         "and cart 1.63 ± 0.03 for UDR, 1.67 ± 0.16 and 1.21 ± 0.08 for EASI.",
-        markdown_table(head, lines),
+        table(mine.items(), columns),
     ]
+
+
+def _of(rows: Sequence[Row], value: Callable[[Row], Any], digits: int) -> str:
+    """A value over seeds, without those that have none."""
+    return told([v for v in map(value, rows) if v is not None], digits)
 
 
 def _in_twin(rows: Sequence[Row], robot: str) -> dict[str, list[Row]]:
@@ -322,39 +325,33 @@ def _fig7(rows: Sequence[Row]) -> list[str]:
     out = ["### Fig. 7: walking in a twin"]
     mine = _in_twin(rows, "go2")
     if not mine:
-        return [*out, "Not run: `python -m benchmarks.paper fig7`."]
+        return [*out, not_run("paper fig7")]
 
-    def some(found: Sequence[Row], of: Callable[[Row], Any], digits: int) -> str:
-        values = [of(r) for r in found]
-        return told([v for v in values if v is not None], digits)
-
-    def upright(found: Sequence[Row]) -> str:
+    def speed(found: Sequence[Row]) -> str:
         speeds = [v for r in found for v in r["speed"]]
         left = sum(v is not None for v in speeds)
-        return f", at {left} of {len(speeds)} commands" if left < len(speeds) else ""
+        at = f", at {left} of {len(speeds)} commands" if left < len(speeds) else ""
+        return _of(found, lambda r: r["tracking_error"], 3) + at
 
-    lines = [
-        (
-            method,
-            some(found, lambda r: r["spectrum"]["distance_db"], 2),
-            some(found, lambda r: r["tracking_error"], 3) + upright(found),
-            some(found, lambda r: r["return"], 1),
-            f"{sum(map(sum, (r['fallen'] for r in found)))} of "
-            f"{len(found) * len(COMMANDS) * TRACKED[0]}",
-        )
-        for method, found in mine.items()
-    ]
-    head = (
-        *("method", "joint motion, simulated from logged [dB]"),
-        *("speed from command [m/s]", "return", "fell"),
-    )
+    columns = {
+        "method": lambda m: m[0],
+        "joint motion, simulated from logged [dB]": lambda m: _of(
+            m[1], lambda r: r["spectrum"]["distance_db"], 2
+        ),
+        "speed from command [m/s]": lambda m: speed(m[1]),
+        "return": lambda m: _of(m[1], lambda r: r["return"], 1),
+        "fell": lambda m: (
+            f"{sum(sum(r['fallen']) for r in m[1])} of "
+            f"{len(m[1]) * len(COMMANDS) * TRACKED[0]}"
+        ),
+    }
     return [
         *out,
         f"{_NO_HARDWARE} Go2; one log of 40 s at 1.4 m/s. The UDR policy's joint "
         "motion in the simulation as given (UDR) or as identified (EASI), against that "
         "in the twin, RMS over 0.25 to 10 Hz; speeds are of each method's own policy, "
         "at commands at which it does not fall.",
-        markdown_table(head, lines),
+        table(mine.items(), columns),
     ]
 
 
@@ -396,7 +393,7 @@ def _table3(rows: Sequence[Row]) -> list[str]:
             if robot in _BY_COUNT:
                 lines.append((f"{robot}, published", *_BY_COUNT[robot]))
         else:
-            out.append(f"Not run: `python -m benchmarks.paper table3 --robot {robot}`.")
+            out.append(not_run(f"paper table3 --robot {robot}"))
     if lines:
         head = ("target", "UDR", "1", "50", "100", "200")
         out.append(markdown_table(head, lines))
@@ -471,21 +468,16 @@ def _swept(
             ratio = max(middle.values()) / min(middle.values())
             verdict = f"{ratio:.1f}"
             if method != SEARCHES[0]:
-                verdict += ", met" if ratio <= FLAT else ", **missed**"
+                verdict += f", {met(ratio <= FLAT)}"
             cells = "; ".join(
                 f"{v:g}: {_middle(by_value[v])}" for v in sorted(by_value)
             )
             start = f"{median(begun[method]):.3f}" if begun[method] else ""
             lines.append((robot, method, start, cells, verdict))
     if not lines:
-        return [*out, f"Not run: `python -m benchmarks.paper {command}`."]
-    head = (
-        "robot",
-        "search",
-        "start",
-        "median error (every seed)",
-        f"worst/best (goal {FLAT:g})",
-    )
+        return [*out, not_run(f"paper {command}")]
+    goal = f"worst/best (goal {FLAT:g})"
+    head = ("robot", "search", "start", "median error (every seed)", goal)
     return [
         *out,
         f"{_ERROR} `start`: of the middle of where the search starts.",
@@ -501,7 +493,7 @@ def _fig4(rows: Sequence[Row]) -> list[str]:
         mine = [r for r in rows if _traced(r) and r["robot"] == robot]
         lines += [(robot, *line) for line in _by_start(mine)]
     if not lines:
-        return [*out, "Not run: `python -m benchmarks.paper fig4`."]
+        return [*out, not_run("paper fig4")]
     return [
         *out,
         f"{_ERROR} Median (every seed), and after it of the middle of where the search "
@@ -518,7 +510,7 @@ def _appendix_a(rows: Sequence[Row]) -> list[str]:
     out = ["### Appendix A: error of Go2's 25 parameters, by where the search starts"]
     lines = _by_start([r for r in rows if r["options"]])
     if not lines:
-        return [*out, "Not run: `python -m benchmarks.paper appendix_a`."]
+        return [*out, not_run("paper appendix_a")]
     return [
         *out,
         "As Fig. 4; the target has one leg's thigh drive at half its stiffness.",
@@ -544,7 +536,7 @@ def _traced(row: Row) -> bool:
 
 def _middle(errors: Sequence[float]) -> str:
     """Median, and every seed."""
-    return f"{median(errors):.3f} ({', '.join(f'{e:.3f}' for e in errors)})"
+    return f"{median(errors):.3f} ({each_of(errors, 3)})"
 
 
 def _from_start(rows: Sequence[Row]) -> str:
@@ -559,47 +551,41 @@ def _from_start(rows: Sequence[Row]) -> str:
 def _fig6(rows: Sequence[Row]) -> list[str]:
     if any(_drawn_fig6([r for r in rows if r["robot"] == x]) for x in CHANGED):
         return []
-    return ["Not run: `python -m benchmarks.paper fig6`."]
+    return [not_run("paper fig6")]
 
 
 def _runtime(rows: Sequence[Row]) -> list[str]:
     out = ["### Run time: one program beside separate programs"]
-    lines = [
-        (
-            f"{r['robot']}, seed {r['seed']}",
-            r["method"],
-            f"{r['seconds']:.0f}",
-            f"{r['compile_s']:.0f}",
-            r["programs"],
-            f"{r['transfers']} ({r['bytes'] / 1e6:.1f} MB)",
-            f"{r['return']:.1f}",
-        )
-        for r in rows
-        if r["method"] in WAYS
-    ]
-    if not lines:
-        return [*out, "Not run: `python -m benchmarks.paper runtime`."]
-    head = (
-        *("chain", "as", "seconds in all", "of them compiling"),
-        *("programs compiled", "transfers to the host", "return"),
-    )
+    timed = [r for r in rows if r["method"] in WAYS]
+    if not timed:
+        return [*out, not_run("paper runtime")]
+    columns = {
+        "chain": "{robot}, seed {seed}",
+        "as": "{method}",
+        "seconds in all": "{seconds:.0f}",
+        "of them compiling": "{compile_s:.0f}",
+        "programs compiled": "{programs}",
+        "transfers to the host": lambda r: (
+            f"{r['transfers']} ({r['bytes'] / 1e6:.1f} MB)"
+        ),
+        "return": "{return:.1f}",
+    }
     both: dict[tuple[str, int], dict[str, Row]] = defaultdict(dict)
-    for r in rows:
-        if r["method"] in WAYS:
-            both[r["robot"], r["seed"]][r["method"]] = r
+    for r in timed:
+        both[r["robot"], r["seed"]][r["method"]] = r
     pairs = [[b[w] for w in WAYS] for b in both.values() if len(b) == len(WAYS)]
-    told = []
+    paired = []
     if pairs:
         times, moved = (
             median(one[k] / other[k] for one, other in pairs)
             for k in ("seconds", "bytes")
         )
-        told.append(
+        paired.append(
             f"In one program it takes {times:.2f} times as long and moves "
             f"{moved:.2g} times the bytes (medians of {len(pairs)} seeds). The "
             "programs compiled beside it are small ones, which prepare and report."
         )
-    return [*out, markdown_table(head, lines), *told]
+    return [*out, table(timed, columns), *paired]
 
 
 def _drawn_fig4(rows: Sequence[Row]) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 from benchmarks._cells import read_rows
 from benchmarks._common import commits_of, markdown_table
+from benchmarks._page import not_run
 from benchmarks.rival_cells import AFTER_GAP, METHODS, ROBOTS, SETTINGS, Cell
 
 OURS = METHODS[0]
@@ -22,7 +23,7 @@ def section(folder: Path) -> list[str]:
     rows = read_rows(folder / "rivals.jsonl")
     out = ["## Identification beside rivals and today's tools"]
     if not rows:
-        return [*out, "Not run: `python -m benchmarks.rivals`."]
+        return [*out, not_run("rivals")]
     out.append(
         f"`python -m benchmarks.rivals`, commits {commits_of(rows)}: equal data and "
         "budget (simulated control steps, a derivative as one), each seed a machine of "
@@ -50,7 +51,7 @@ def section(folder: Path) -> list[str]:
     for robot in ROBOTS:
         mine = [r for r in rows if r["robot"] == robot]
         if not mine:
-            out.append(f"Not run: `python -m benchmarks.rivals --robots {robot}`.")
+            out.append(not_run(f"rivals --robots {robot}"))
             continue
         out += [f"### {robot}", _errors(mine), *_verdicts(mine), *_costs(mine)]
     return out

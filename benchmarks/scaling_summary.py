@@ -12,6 +12,7 @@ from scipy.optimize import nnls
 
 from benchmarks._cells import read_rows
 from benchmarks._common import commits_of, markdown_table
+from benchmarks._page import not_run
 from easi_jax.io.report.figure_style import (
     SERIES,
     dash,
@@ -36,7 +37,7 @@ def growth(folder: Path) -> list[str]:
     out = ["## How cost grows"]
     rows = read_rows(folder / "scaling.jsonl")
     if not rows:
-        return [*out, "Not run: `python -m benchmarks.scaling`."]
+        return [*out, not_run("scaling")]
     out.append(
         f"`python -m benchmarks.scaling`, commits {commits_of(rows)}: seconds once "
         "compiled, the least of three; control steps simulated a second in brackets."
