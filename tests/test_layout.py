@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     *("errors", "progress", "version", "devices", "model", "data", "simulation", "io"),
     *("rl", "search", "estimation", "gap", "excite", "export", "baselines"),
-    *("pipeline", "easi_jax", "envs", "train", "benchmarks", "scripts"),
+    *("pipeline", "api", "easi_jax", "envs", "train", "benchmarks", "scripts"),
 )
 
 # Files outside `io` that touch the disk or start a process, and why.

@@ -41,7 +41,7 @@ def run(config: Any) -> None:
         )
         states = _search(folder, config, search, problem, seeds)
         errors = started(lambda: ready_errors(problem, search.space))
-        estimates, outliers = finish()(states)
+        estimates, outliers = finish()(states.result_mean, states.result_cov)
         for seed, found in zip(seeds, estimates, strict=True):
             one = jax.tree.map(lambda x: x[None], found.distribution)
             found_check([seed], search.space.names, one)

@@ -87,8 +87,7 @@ def _policy_files(config: Config, chosen: tuple[str, ...]) -> dict[str, str | by
     import jax
 
     from easi_jax.errors import UserError
-    from easi_jax.export.policy import interface_of, to_onnx, to_stablehlo
-    from easi_jax.io.files import to_json
+    from easi_jax.export.policy import FORMS, interface_of, policy_files
     from train._robots import load_policies
 
     found = load_policies(config.run_folder, config.method, config.env)
@@ -98,16 +97,10 @@ def _policy_files(config: Config, chosen: tuple[str, ...]) -> dict[str, str | by
         raise UserError(f"--seed {config.seed}: the run has {known}")
     at = 0 if config.seed is None else seeds.index(config.seed)
     policy = jax.tree.map(lambda x: x[at], found["policies"])
-    interface, mapped = interface_of(env), getattr(env, "action_map", None)
-    told = {**dataclasses.asdict(interface), "method": found["method"]}
-    files: dict[str, str | bytes] = {
-        "policy.json": to_json({**told, "seed": seeds[at]})
-    }
-    if "onnx" in chosen:
-        files["policy.onnx"] = to_onnx(policy, interface, mapped)
-    if "stablehlo" in chosen:
-        program, text = to_stablehlo(policy, interface, mapped)
-        files |= {"policy.stablehlo": program, "policy.mlir": text}
+    mapped = getattr(env, "action_map", None)
+    forms = tuple(form for form in chosen if form in FORMS)
+    told = {"method": found["method"], "seed": seeds[at]}
+    files = policy_files(policy, interface_of(env), mapped, forms, **told)
     if mapped is None:
         say(f"note: {env.name} has no action_map: the policy's output is its action")
     return files

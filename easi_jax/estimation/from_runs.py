@@ -23,7 +23,7 @@ from easi_jax.estimation.prediction_error import (
 from easi_jax.estimation.problem import Problem
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.search.config import SearchConfig
-from easi_jax.search.easi import Search, SearchData, SearchState
+from easi_jax.search.easi import Search, SearchData
 from easi_jax.simulation import open_loop
 
 Tell = Callable[[str], None]
@@ -59,7 +59,7 @@ def ready_finish(
     refined: bool = True,
     restarts: int = 0,
     tell: Tell = lambda _: None,
-) -> Callable[[SearchState], tuple[list[Estimate], list[str]]]:
+) -> Callable[[jax.Array, jax.Array], tuple[list[Estimate], list[str]]]:
     """Compiles the finish.
 
     Args:
@@ -70,8 +70,8 @@ def ready_finish(
         tell: takes a line on how far it is.
 
     Returns:
-        Takes the search's states, leading axis a seed, and returns an `Estimate` a
-        seed, and notes on pieces that fit badly.
+        Takes means ``(S, n)`` and covariances ``(S, n, n)`` of searches, unit
+        coordinates, and returns an `Estimate` each, and notes on pieces that fit badly.
     """
     simulator, space = problem.simulator, search.space
     steps = max(problem.steps, round(_FINISH / simulator.dt))
@@ -152,9 +152,8 @@ def ready_finish(
             tell(f"on all of the logs: pass {k + 1} of {_ENDINGS}")
         return found.replace(search_mean=mean, search_cov=cov), weight
 
-    def estimates(states: Any) -> tuple[list[Any], list[str]]:
-        both = zip(states.result_mean, states.result_cov, strict=True)
-        results = [passes(mean, cov) for mean, cov in both]
+    def estimates(means: Any, covs: Any) -> tuple[list[Any], list[str]]:
+        results = [passes(*both) for both in zip(means, covs, strict=True)]
         odd = np.flatnonzero(np.asarray(results[0][1]) < 0.5)
         notes = []
         if odd.size:

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from easi_jax.errors import UserError
+from easi_jax.errors import UserError, nearest
+from easi_jax.io.files import to_json
 from easi_jax.rl.networks import PolicyParams, act
 from easi_jax.simulation.action_map import ActionMap
 
@@ -153,3 +154,34 @@ def to_stablehlo(
         jax.ShapeDtypeStruct(shape, jnp.float32)
     )
     return bytes(exported.serialize()), str(exported.mlir_module())
+
+
+FORMS = ("onnx", "stablehlo")
+
+
+def policy_files(
+    policy: PolicyParams,
+    interface: Interface,
+    action_map: ActionMap | None,
+    forms: Sequence[str] = FORMS,
+    **told: Any,
+) -> dict[str, str | bytes]:
+    """Files of a policy by name: ``policy.json`` (the interface, and what is ``told``
+    besides), and those of ``forms``.
+
+    Raises:
+        UserError: an unknown form; a package is missing.
+    """
+    for form in forms:
+        if form not in FORMS:
+            known = ", ".join(FORMS)
+            raise UserError(f'no form "{form}" (known: {known}){nearest(form, FORMS)}')
+    files: dict[str, str | bytes] = {
+        "policy.json": to_json({**asdict(interface), **told})
+    }
+    if "onnx" in forms:
+        files["policy.onnx"] = to_onnx(policy, interface, action_map)
+    if "stablehlo" in forms:
+        program, text = to_stablehlo(policy, interface, action_map)
+        files |= {"policy.stablehlo": program, "policy.mlir": text}
+    return files

@@ -1,0 +1,530 @@
+"""What stands behind the names of `easi_jax`: files in, results as plain values out.
+
+The commands of ``train`` do the same with folders, checkpoints and reports.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from easi_jax.data.measured import measured_runs
+from easi_jax.data.recording import Log
+from easi_jax.devices.runtime import fast_loops, quick_compile
+from easi_jax.errors import UserError
+from easi_jax.estimation.from_runs import (
+    ready_errors,
+    ready_finish,
+    replayed,
+    search_data,
+)
+from easi_jax.estimation.identifiability import identifiability
+from easi_jax.estimation.problem import HORIZON, Problem, checked_horizon, problem_of
+from easi_jax.export.mjcf import identified_model
+from easi_jax.export.policy import Interface, interface_of, policy_files
+from easi_jax.gap.analysis import Analysis
+from easi_jax.gap.excitation_coverage import coverage_notes
+from easi_jax.gap.result import Outcome
+from easi_jax.io.files import atomic_write
+from easi_jax.io.logs.reader import read_logs
+from easi_jax.io.models.mjcf import read_mjcf
+from easi_jax.io.models.parameter_file import read_parameter_file
+from easi_jax.model import distribution
+from easi_jax.model.checks import checked_array
+from easi_jax.model.distribution import Distribution
+from easi_jax.model.parameter_proposal import own_space
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.pipeline.stages import seed_keys
+from easi_jax.rl.networks import PolicyParams, act
+from easi_jax.rl.presets import training_preset
+from easi_jax.rl.seeds import train_seeds
+from easi_jax.rl.trainer import make_trainer
+from easi_jax.search.config import preset
+from easi_jax.search.easi import Search
+from easi_jax.simulation.simulator import Simulator
+
+PathLike = str | os.PathLike[str]
+Tell = Callable[[str], None]
+
+
+def _silent(_: str) -> None:
+    """Takes a line and shows nothing."""
+
+
+def read_model(path: PathLike, allow: Sequence[PathLike] = ()) -> mujoco.MjModel:
+    """Reads a MuJoCo model (MJCF or URDF) that something moves in.
+
+    Args:
+        path: of the file.
+        allow: files or folders outside of its folder that it may read (meshes,
+            textures, includes).
+
+    Raises:
+        UserError: no such file, no valid model, or one without a joint.
+    """
+    model = read_mjcf(Path(path), tuple(Path(p) for p in allow))
+    if model.nv == 0:
+        raise UserError(f"{path}: the model has no joint, so nothing can be identified")
+    return model
+
+
+def read_parameters(path: PathLike, model: mujoco.MjModel) -> ParameterSpace:
+    """Reads a parameter file (YAML): what may vary in ``model``, and in which range.
+
+    Raises:
+        UserError: as `easi_jax.io.models.parameter_file.read_parameter_file`.
+    """
+    return read_parameter_file(path, model)
+
+
+def read_log(
+    paths: PathLike | Sequence[PathLike],
+    model: mujoco.MjModel,
+    mapping: PathLike | None = None,
+) -> Log:
+    """Reads measured logs (CSV, NPZ, Parquet) of the machine that ``model`` describes.
+
+    Args:
+        paths: one file or several.
+        model: names of joints, actuators and sensors.
+        mapping: mapping file (YAML) for logs with foreign column names.
+
+    Returns:
+        ``runs``, SI units, and ``notes`` on all that a user should know of them.
+
+    Raises:
+        UserError: a file that cannot be used.
+    """
+    return read_logs(paths, model, mapping)
+
+
+@dataclass(frozen=True, eq=False)
+class Searched:
+    """What a search found.
+
+    Attributes:
+        space: the parameters; ``space.to_si`` takes unit coordinates to SI units.
+        mean: unit coordinates, ``(n,)``.
+        cov: unit coordinates, ``(n, n)``.
+        history: mean after each generation, SI units, ``(generations, n)``.
+        non_finite: simulations that were no longer finite, of all generations.
+        notes: on the data, one line each.
+    """
+
+    space: ParameterSpace
+    mean: np.ndarray
+    cov: np.ndarray
+    history: np.ndarray
+    non_finite: int
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Estimated:
+    """Parameters as the logs determine them.
+
+    Attributes:
+        names, units: of the parameters, ``n`` each.
+        mean, std: SI units, ``(n,)``; where ``determined`` is False, hardly more than
+            where the search started.
+        determined: whether the data fix a parameter by itself, ``(n,)`` bool.
+        joints: names of the degrees of freedom, ``nv``.
+        before, after, floor: RMS error of open-loop predictions over ``horizon`` on
+            held-out data [m, rad], ``(nv,)``: of the model as given, of the estimate,
+            and what a perfect model would have.
+        horizon: of the predictions [s].
+        held_out: which data these are.
+        notes: on data and fit, one line each.
+        space: the parameters, ``distribution`` in its unit coordinates.
+        distribution: that policies are trained under.
+        simulator: the machine.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    mean: np.ndarray
+    std: np.ndarray
+    determined: np.ndarray
+    joints: tuple[str, ...]
+    before: np.ndarray
+    after: np.ndarray
+    floor: np.ndarray
+    horizon: float
+    held_out: str
+    notes: tuple[str, ...]
+    space: ParameterSpace
+    distribution: Distribution
+    simulator: Simulator
+
+    def __str__(self) -> str:
+        """A line for each parameter, and one for each joint's held-out error."""
+        width = max(map(len, (*self.names, *self.joints)))
+        lines = [
+            f"{name:{width}}  {mean:.4g} ± {std:.2g} {unit}".rstrip()
+            + ("" if known else "  (not determined)")
+            for name, mean, std, unit, known in zip(
+                *(self.names, self.mean, self.std, self.units, self.determined),
+                strict=True,
+            )
+        ]
+        lines += [
+            f"{name:{width}}  error over {self.horizon:.3g} s: {old:.3g} as given, "
+            f"{new:.3g} identified, {floor:.3g} noise floor"
+            for name, old, new, floor in zip(
+                self.joints, self.before, self.after, self.floor, strict=True
+            )
+        ]
+        return "\n".join(lines)
+
+
+def search_parameters(
+    model: mujoco.MjModel,
+    parameters: ParameterSpace,
+    log: Log,
+    *,
+    held_out: Log | None = None,
+    generations: int | None = None,
+    population: int | None = None,
+    settings: str = "default",
+    noise: Sequence[float] = (),
+    horizon: float | None = None,
+    seed: int = 0,
+) -> Searched:
+    """EASI: the distribution of parameters under which simulation looks like the logs.
+
+    Args:
+        model: of the machine.
+        parameters: what may vary in it.
+        log: measured motion.
+        held_out: kept out of the search; None: part of ``log`` is.
+        generations, population: of the search; those of ``settings`` where None.
+        settings: ``default``, or ``paper`` (the reference's recipe but for its
+            controller, which logs come without).
+        noise: standard deviations of positions, then velocities, ``(2 nv,)`` [m, rad,
+            m/s, rad/s]; estimated from the logs where empty.
+        horizon: longest piece of a log that is simulated [s]; 0.2 where None.
+        seed: of the random numbers.
+
+    Raises:
+        UserError: what is wrong with the data or the options; no simulation of a
+            generation stayed finite.
+    """
+    problem = _problem(model, parameters, log, held_out, noise, horizon)
+    return _searched(problem, generations, population, settings, seed)[1]
+
+
+def estimate_parameters(
+    model: mujoco.MjModel,
+    parameters: ParameterSpace,
+    log: Log,
+    *,
+    held_out: Log | None = None,
+    start: Searched | None = None,
+    generations: int | None = None,
+    population: int | None = None,
+    settings: str = "default",
+    noise: Sequence[float] = (),
+    horizon: float | None = None,
+    restarts: int = 0,
+    seed: int = 0,
+    tell: Tell = _silent,
+) -> Estimated:
+    """Parameters and their uncertainty, by least squares from the end of a search.
+
+    Args:
+        model: of the machine.
+        parameters: what may vary in it.
+        log: measured motion.
+        held_out: kept out of the fit, to test it on; None: part of ``log`` is.
+        start: of `search_parameters`; None: it is called first, with ``generations``,
+            ``population``, ``settings`` and ``seed``.
+        noise, horizon: as in `search_parameters`.
+        restarts: more starts of the fit, drawn from the search's spread; the best fit
+            counts.
+        tell: takes a line on how far it is.
+
+    Raises:
+        UserError: as `search_parameters`; ``start`` is of other parameters.
+    """
+    problem = _problem(model, parameters, log, held_out, noise, horizon)
+    if start is None:
+        search, start = _searched(problem, generations, population, settings, seed)
+    else:
+        search = _search(problem, 1, population, settings)
+    if start.space.names != search.space.names:
+        raise UserError(
+            f"start is of {', '.join(start.space.names)}, parameters are "
+            f"{', '.join(search.space.names)}: search with the same parameters"
+        )
+    estimates, notes = ready_finish(problem, search, True, restarts, tell)(
+        jnp.asarray(start.mean)[None], jnp.asarray(start.cov)[None]
+    )
+    (found,) = estimates
+    space, unit = search.space, found.distribution.mean
+    root = np.asarray(found.distribution.factor, float)
+    std = np.sqrt((root**2).sum(1))
+    if not (np.isfinite(unit).all() and np.isfinite(root).all()):
+        raise UserError("the fit is not finite: try another seed, or fewer parameters")
+    low, mean, high = (np.asarray(space.to_si(unit + k * std)) for k in (-1, 0, 1))
+    errors = ready_errors(problem, space)
+    before, _, _ = errors(jnp.asarray(space.nominal, jnp.result_type(float)))
+    after, _, floor = errors(space.to_si(unit))
+    simulator = problem.simulator
+    positions = simulator.state_names[: simulator.mj_model.nv]
+    return Estimated(
+        names=space.names,
+        units=space.units,
+        mean=mean,
+        std=0.5 * (high - low),
+        determined=identifiability(space, np.asarray(found.hessian)).determined,
+        joints=tuple(n.removeprefix("qpos.") for n in positions),
+        before=np.asarray(before),
+        after=np.asarray(after),
+        floor=np.asarray(floor),
+        horizon=problem.horizon,
+        held_out=problem.held_name,
+        notes=(*problem.notes, *notes),
+        space=space,
+        distribution=found.distribution,
+        simulator=simulator,
+    )
+
+
+def find_effects(
+    model: mujoco.MjModel,
+    log: Log,
+    *,
+    parameters: ParameterSpace | None = None,
+    held_out: Log | None = None,
+    horizon: float = HORIZON,
+    tell: Tell = _silent,
+) -> Outcome:
+    """Which physical effects the model lacks, and where, judged on held-out data.
+
+    Args:
+        model: of the machine.
+        log: measured motion.
+        parameters: what may be refitted in the model; None: damping, friction and
+            stiffness that it states, each within a factor of 5.
+        held_out: kept out of every fit; None: part of ``log`` is.
+        horizon: of the predictions that are compared [s].
+        tell: takes a line on how far it is.
+
+    Returns:
+        ``verdict``, the effects ``found`` with their values and confidence, and the gap
+        ``before``, after a ``refit`` of the parameters and ``after`` all of it.
+
+    Raises:
+        UserError: data too short, too still, or that the model does not cover.
+    """
+    runs = measured_runs(model, log, held_out, checked_horizon(horizon))
+    analysis = Analysis(
+        model,
+        own_space(model) if parameters is None else parameters,
+        runs.fit,
+        runs.held,
+        runs.noise,
+        horizon,
+        tell=tell,
+    )
+    outcome = analysis.run()
+    coverage = coverage_notes(model, runs.fit, runs.held)
+    outcome.notes = [*runs.notes, *coverage, *outcome.notes]
+    return outcome
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """A trained policy.
+
+    Attributes:
+        interface: names of what it reads and writes.
+        params: a pytree of arrays, without a leading axis.
+        action_map: from actions to commands; None where the environment names none.
+        returns: of the evaluations during training, in the environment's own units,
+            ``(evaluations,)``.
+    """
+
+    interface: Interface
+    params: PolicyParams
+    action_map: Any
+    returns: np.ndarray
+
+    def __call__(self, obs: Any) -> np.ndarray:
+        """The action in [-1, 1], ``(..., action_size)``, for ``obs (..., obs_size)``.
+
+        Raises:
+            UserError: ``obs`` of another size, or not finite.
+        """
+        size, names = len(self.interface.observation), self.interface.observation
+        lead = np.shape(obs)[:-1]
+        given = checked_array("obs", obs, (*lead, size), ", ".join(names))
+        return np.asarray(act(self.params, jnp.asarray(given), deterministic=True))
+
+
+def train_policy(
+    env: Any,
+    estimated: Estimated | None = None,
+    *,
+    algorithm: str | None = None,
+    env_steps: int | None = None,
+    seed: int = 0,
+) -> Policy:
+    """Trains a policy under randomized physics, as one compiled program.
+
+    Args:
+        env: a built-in robot (``envs.make``) or an environment of your own
+            (``envs.load``).
+        estimated: its distribution is drawn from, a sample an episode; parameters that
+            it lacks keep their nominal values. None: uniform over the environment's
+            own ranges.
+        algorithm: ``sac`` or ``ppo``; the environment's own where None.
+        env_steps: control steps of training; those of the preset where None.
+        seed: of the random numbers.
+
+    Raises:
+        UserError: no such algorithm; ``estimated`` has parameters that ``env`` lacks;
+            the training did not stay finite.
+    """
+    config = training_preset(env, algorithm)
+    if env_steps is not None:
+        config = replace(config, env_steps=env_steps)
+    if estimated is None:
+        space, dist = env.space, distribution.uniform(env.space, *env.space.initial)
+    else:
+        space, dist = estimated.space, estimated.distribution
+    unknown = [n for n in space.names if n not in env.space.names]
+    if unknown:
+        raise UserError(
+            f"{env.name} has no parameter {', '.join(unknown)} (it has "
+            f"{', '.join(env.space.names)})"
+        )
+    given = np.array([env.space.names.index(n) for n in space.names])
+    nominal = jnp.asarray(env.space.nominal, jnp.result_type(float))
+
+    def drawn(dist: Distribution, key: jax.Array) -> jax.Array:
+        return nominal.at[given].set(distribution.draw(space, dist, key))
+
+    trainer = make_trainer(env, config, env.model, drawn)
+    middle = distribution.point(space, space.nominal)
+    keys = seed_keys([seed])
+    train = jax.jit(lambda keys: train_seeds(trainer, keys, dist, middle))
+    states, info = train(keys)
+    policy = jax.tree.map(lambda x: x[0], jax.vmap(trainer.policy)(states))
+    if not all(np.isfinite(x).all() for x in jax.tree.leaves(policy)):
+        raise UserError("the training did not stay finite: try another seed")
+    returns = np.asarray(info["eval_return"])[0]
+    return Policy(
+        interface_of(env),
+        jax.device_get(policy),
+        getattr(env, "action_map", None),
+        returns[np.isfinite(returns)],
+    )
+
+
+def export_policy(
+    policy: Policy, folder: PathLike, to: Sequence[str] = ("onnx", "stablehlo")
+) -> list[Path]:
+    """Writes a policy for programs that have not this package.
+
+    Args:
+        policy: of `train_policy`.
+        folder: made where it is missing.
+        to: ``onnx`` (needs the extra ``export``), ``stablehlo``.
+
+    Returns:
+        The files: ``policy.json`` (what it reads and writes), ``policy.onnx``,
+        ``policy.stablehlo`` and ``policy.mlir``.
+
+    Raises:
+        UserError: an unknown form, a missing package, a folder that cannot be written.
+    """
+    files = policy_files(policy.params, policy.interface, policy.action_map, to)
+    return _written(folder, files)
+
+
+def export_model(
+    estimated: Estimated, source: PathLike, folder: PathLike
+) -> list[Path]:
+    """Writes ``model.xml``, the model with the estimated values, and its assets.
+
+    Args:
+        estimated: of `estimate_parameters`.
+        source: the file that the model was read from.
+        folder: made where it is missing.
+
+    Raises:
+        UserError: ``source`` is of another model; a folder that cannot be written.
+    """
+    model = identified_model(Path(source), estimated.simulator, estimated.mean)
+    assets = {name: place.read_bytes() for name, place in model.assets.items()}
+    return _written(folder, {**assets, "model.xml": model.xml})
+
+
+def _written(folder: PathLike, files: dict[str, Any]) -> list[Path]:
+    places = [Path(folder) / name for name in files]
+    for place, content in zip(places, files.values(), strict=True):
+        atomic_write(place, content)
+    return places
+
+
+def _problem(
+    model: mujoco.MjModel,
+    parameters: ParameterSpace,
+    log: Log,
+    held_out: Log | None,
+    noise: Sequence[float],
+    horizon: float | None,
+) -> Problem:
+    runs = measured_runs(model, log, held_out, checked_horizon(horizon))
+    return problem_of(
+        "the model", model, parameters, runs, noise=noise, horizon=horizon
+    )
+
+
+def _search(
+    problem: Problem, generations: int | None, population: int | None, settings: str
+) -> Search:
+    given = {"generations": generations, "population": population}
+    chosen = preset(settings, **{k: v for k, v in given.items() if v is not None})
+    return Search(problem.simulator, replayed(problem, chosen))
+
+
+def _searched(
+    problem: Problem,
+    generations: int | None,
+    population: int | None,
+    settings: str,
+    seed: int,
+) -> tuple[Search, Searched]:
+    search = _search(problem, generations, population, settings)
+    data = search_data(problem)
+
+    def whole(key: jax.Array) -> Any:
+        state = search.init(key, data)
+        state, info = search.run(state, data, search.config.generations)
+        return state.result_mean, state.result_cov, info
+
+    run = jax.jit(whole, compiler_options=fast_loops() | quick_compile())
+    mean, cov, info = jax.device_get(run(seed_keys([seed])[0]))
+    lost = info.non_finite >= search.config.population
+    if lost.any():
+        raise UserError(
+            f"generation {int(np.argmax(lost)) + 1}: all "
+            f"{search.config.population} simulations became non-finite (narrow initial "
+            "or bounds, or lower the model's timestep)"
+        )
+    return search, Searched(
+        search.space,
+        mean,
+        cov,
+        np.asarray(search.space.to_si(info.mean)),
+        int(info.non_finite.sum()),
+        tuple(problem.notes),
+    )
