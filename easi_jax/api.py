@@ -33,7 +33,7 @@ from easi_jax.gap.excitation_coverage import coverage_notes
 from easi_jax.gap.result import Outcome
 from easi_jax.io.files import atomic_write
 from easi_jax.io.logs.reader import read_logs
-from easi_jax.io.models.mjcf import read_mjcf
+from easi_jax.io.models.mjcf import read_machine
 from easi_jax.io.models.parameter_file import read_parameter_file
 from easi_jax.model import distribution
 from easi_jax.model.checks import checked_array
@@ -68,10 +68,7 @@ def read_model(path: PathLike, allow: Sequence[PathLike] = ()) -> mujoco.MjModel
     Raises:
         UserError: no such file, no valid model, or one without a joint.
     """
-    model = read_mjcf(Path(path), tuple(Path(p) for p in allow))
-    if model.nv == 0:
-        raise UserError(f"{path}: the model has no joint, so nothing can be identified")
-    return model
+    return read_machine(Path(path), tuple(Path(p) for p in allow))
 
 
 def read_parameters(path: PathLike, model: mujoco.MjModel) -> ParameterSpace:
@@ -463,8 +460,7 @@ def export_model(
         UserError: ``source`` is of another model; a folder that cannot be written.
     """
     model = identified_model(Path(source), estimated.simulator, estimated.mean)
-    assets = {name: place.read_bytes() for name, place in model.assets.items()}
-    return _written(folder, {**assets, "model.xml": model.xml})
+    return _written(folder, model.files())
 
 
 def _written(folder: PathLike, files: dict[str, Any]) -> list[Path]:

@@ -95,12 +95,8 @@ def load_model(path: Path, allowed: tuple[Path, ...] = ()) -> Any:
     it may read.
 
     Raises:
-        UserError: as `read_mjcf`; or nothing in it moves.
+        UserError: as `easi_jax.io.models.mjcf.read_machine`.
     """
-    from easi_jax.errors import UserError
-    from easi_jax.io.models.mjcf import read_mjcf
+    from easi_jax.io.models.mjcf import read_machine
 
-    model = read_mjcf(path, allowed)
-    if model.nv == 0:
-        raise UserError(f"{path}: the model has no joint, so nothing can be identified")
-    return model
+    return read_machine(path, allowed)

@@ -146,8 +146,7 @@ def _model_files(
     model = identified_model(source, simulator, theta, entries)
     if model.left:
         say(f"note: not in model.xml: {', '.join(model.left)}")
-    assets = {name: place.read_bytes() for name, place in model.assets.items()}
-    return {**assets, "model.xml": model.xml}
+    return model.files()
 
 
 def _machine_of(

@@ -9,7 +9,7 @@ import numpy as np
 from easi_jax.data.cleaning import split_at_resets, to_common_step, without_odd_ends
 from easi_jax.data.holdout import split_held_out
 from easi_jax.data.noise import pooled_noise
-from easi_jax.data.recording import Log, Run
+from easi_jax.data.recording import Log, Run, check_run
 
 _FEW_ROWS = 30  # of a run say little of its noise
 
@@ -49,8 +49,10 @@ def measured_runs(
             what is held out of one run.
 
     Raises:
-        UserError: too few rows to hold some out.
+        UserError: runs that do not fit the model; too few rows to hold some out.
     """
+    for run in (*log.runs, *(held_out.runs if held_out else ())):
+        check_run(run, mj_model)
     notes = [*log.notes, *(held_out.notes if held_out else ())]
     # Before interpolation, which would smooth the noise.
     noise = pooled_noise(log.runs)

@@ -4,8 +4,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import mujoco
 import numpy as np
 
+from easi_jax.errors import UserError
+from easi_jax.model.checks import checked_array
 from easi_jax.model.joint_space import Configuration
 
 # A logger's clock is no better than this, and half the physics step for a control
@@ -66,6 +69,20 @@ class Log:
 
     runs: tuple[Run, ...]
     notes: tuple[str, ...]
+
+
+def check_run(run: Run, mj_model: mujoco.MjModel) -> None:
+    """Checks a run that may have been made by hand.
+
+    Raises:
+        UserError: an array whose shape is not that of ``mj_model`` and of the other
+            rows, or that is not finite; a control step that is not above 0.
+    """
+    sizes = {"time": (), "qpos": (mj_model.nq,), "qvel": (mj_model.nv,)}
+    for name, size in {**sizes, "ctrl": (mj_model.nu,)}.items():
+        checked_array(f"{run.name}: {name}", getattr(run, name), (len(run), *size))
+    if not (math.isfinite(run.dt) and run.dt > 0):
+        raise UserError(f"{run.name}: control step is {run.dt} s: give one above 0")
 
 
 def physics_steps(control_step: float, timestep: float) -> int:

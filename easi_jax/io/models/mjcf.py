@@ -238,3 +238,15 @@ def _character(reference: re.Match[str]) -> str:
         return _ENTITIES.get(name, reference[0])
     code = int(sixteen, 16) if sixteen else int(ten)
     return chr(code) if code <= 0x10FFFF else reference[0]
+
+
+def read_machine(path: Path, allowed: Sequence[Path] = ()) -> mujoco.MjModel:
+    """`read_mjcf` of something that moves.
+
+    Raises:
+        UserError: as `read_mjcf`; or the model has no joint.
+    """
+    model = read_mjcf(path, allowed)
+    if model.nv == 0:
+        raise UserError(f"{path}: the model has no joint, so nothing can be identified")
+    return model

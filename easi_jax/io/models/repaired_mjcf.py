@@ -55,6 +55,11 @@ class Repaired:
     assets: dict[str, Path]
     left: list[str]
 
+    def files(self) -> dict[str, str | bytes]:
+        """Contents by name: the assets, then ``model.xml``."""
+        assets = {name: place.read_bytes() for name, place in self.assets.items()}
+        return {**assets, "model.xml": self.xml}
+
 
 def repaired_model(
     path: Path, entries: Sequence[EffectEntry], meant: mujoco.MjModel | None = None
