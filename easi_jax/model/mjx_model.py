@@ -1,6 +1,7 @@
 """An MJX model whose physical parameters are an argument."""
 
-from collections.abc import Callable, Iterable, Mapping
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from easi_jax.errors import UserError
 from easi_jax.model import effects as physical
 from easi_jax.model.addresses import Writer, open_gates, resolve
 from easi_jax.model.effects import Effects
+from easi_jax.model.mjx_data import make_data, without_idle_cone
 from easi_jax.model.quantities import length_of, long_axis, unit_inertia
 from easi_jax.model.set_const import set_const
 from easi_jax.model.torque_speed import TorqueSpeed
@@ -58,30 +60,97 @@ class Model:
         def replace(self, **changes: Any) -> "Model": ...
 
 
-def _unsupported(m: mujoco.MjModel) -> str | None:
-    """What MJX would ignore without a word."""
+def _unsupported(m: mujoco.MjModel) -> tuple[str, str] | None:
+    """What MJX would ignore without a word, and what to do."""
     fluid = m.opt.density > 0 or m.opt.viscosity > 0
     actuator_extra = (m.actuator_damping, m.actuator_armature, m.actuator_dampingpoly)
     poly = (m.jnt_stiffnesspoly, m.dof_dampingpoly)
     poly += (m.tendon_stiffnesspoly, m.tendon_dampingpoly)
+    motors = m.actuator_dyntype == mujoco.mjtDyn.mjDYN_DCMOTOR
     checks = (
-        (m.nhistory > 0, "actuator or sensor delay (delay, nsample)"),
-        (m.nplugin > 0, "plugins"),
-        (any(np.any(x) for x in actuator_extra), "actuator damping or armature"),
-        (any(np.any(x) for x in poly), "polynomial stiffness or damping"),
-        (np.any(m.actuator_actearly), 'actearly="true"'),
-        (m.opt.noslip_iterations > 0, "noslip_iterations"),
-        (bool(m.flg_surfacevel), "surface velocity"),
-        (fluid and np.any(m.geom_fluid[:, 0] > 0), 'fluidshape="ellipsoid"'),
-        (np.any(m.geom_gap) or np.any(m.pair_gap), "contact gap"),
+        (
+            m.nhistory > 0,
+            "actuator or sensor delay (delay, nsample)",
+            "take it out; a delay can be found and fixed as an effect "
+            "(effect.delay.ACTUATOR)",
+        ),
+        (m.nplugin > 0, "plugins", "take them out"),
+        (np.any(motors), "dcmotor actuators", "write them as <motor> or <position>"),
+        (
+            any(np.any(x) for x in actuator_extra),
+            "actuator damping or armature",
+            "give both to the joint",
+        ),
+        (
+            any(np.any(x) for x in poly),
+            "polynomial stiffness or damping",
+            "keep the first number only",
+        ),
+        (np.any(m.actuator_actearly), 'actearly="true"', "take it out"),
+        (m.opt.noslip_iterations > 0, "noslip_iterations", "set it to 0"),
+        (bool(m.flg_surfacevel), "surface velocity", "take it out"),
+        (
+            fluid and np.any(m.geom_fluid[:, 0] > 0),
+            'fluidshape="ellipsoid"',
+            'set fluidshape="none"',
+        ),
+        (
+            np.any(m.geom_gap) or np.any(m.pair_gap),
+            "contact gap",
+            "set it to 0 and take it off the margin",
+        ),
     )
-    return next((what for found, what in checks if found), None)
+    return next(((what, do) for found, what, do in checks if found), None)
+
+
+# Words in what MJX says, and what to do then; the first that fits counts.
+_CURES = (
+    ("mjINT_", 'set integrator="implicitfast" or "Euler"'),
+    ("fluid", 'set integrator="Euler"'),
+    ("mjSOL_", 'set solver="Newton"'),
+    ("margin/gap", "set the margin of these geoms to 0"),
+    (
+        "collisions",
+        "give these geoms another shape, or exclude their contact (contype and "
+        "conaffinity, or <exclude>)",
+    ),
+    ("sensor", "take these sensors out"),
+    ("mjSENS", "take these sensors out"),
+    ("mjENBL_", "take this flag out of <option>"),
+    ("mjEQ_", "take these constraints out"),
+    ("mjTRN_", "write these actuators with joint= or tendon="),
+    ("mjDYN_", "write these actuators as <motor>, <position> or <velocity>"),
+    ("mjGAIN_", "write these actuators as <motor>, <position> or <velocity>"),
+    ("mjBIAS_", "write these actuators as <motor>, <position> or <velocity>"),
+)
+
+
+@contextlib.contextmanager
+def refusals(*kinds: type[Exception]) -> Iterator[None]:
+    """Turns what MJX says of a model into a line for its owner.
+
+    Args:
+        kinds: exceptions by which MJX refuses.
+
+    Raises:
+        UserError: one of them was raised: what MJX lacks, and what to do.
+    """
+    try:
+        yield
+    except kinds as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        cures = (do for word, do in _CURES if word.lower() in reason.lower())
+        do = next(cures, "state it another way or take it out")
+        raise UserError(
+            f"MJX cannot simulate this model ({reason}): {do} in the model file"
+        ) from error
 
 
 def put_model(
     mj_model: mujoco.MjModel,
     addresses_per_parameter: Iterable[Iterable[str]] = (),
     fixed: Mapping[str, float] | None = None,
+    sensors: bool = True,
 ) -> Model:
     """Puts a MuJoCo model on the device, ready to have parameters written into it.
 
@@ -89,6 +158,8 @@ def put_model(
         mj_model: nominal model; it is not changed.
         addresses_per_parameter: for each parameter its addresses.
         fixed: values by address that stay, effects among them.
+        sensors: whether ``sensordata`` is computed; without, sensors that MJX lacks
+            do no harm.
 
     Raises:
         UserError: an address that does not fit the model; or the model uses what MJX
@@ -96,21 +167,22 @@ def put_model(
     """
     per_parameter = tuple(tuple(a) for a in addresses_per_parameter)
     ignored = _unsupported(mj_model)
-    if ignored is None and np.any(
-        mj_model.actuator_dyntype == mujoco.mjtDyn.mjDYN_DCMOTOR
-    ):
-        ignored = "dcmotor actuators"
     if ignored is not None:
-        raise UserError(f"the model uses {ignored}, which MJX does not simulate")
+        what, do = ignored
+        raise UserError(
+            f"the model uses {what}, which MJX does not simulate: {do} in the model "
+            "file"
+        )
     fixed = dict(fixed or {})
     every = (*per_parameter, *((a,) for a in fixed))
     writers = resolve(mj_model, every)
     opened = open_gates(mj_model, [a for p in every for a in p])
-    try:
-        put = mjx.put_model(opened, own_device(), impl="jax")
-    except NotImplementedError as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"MJX cannot simulate this model: {reason}") from error
+    if not sensors:
+        opened.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
+        opened.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK  # known to MJX
+    with refusals(Exception):
+        put = mjx.put_model(without_idle_cone(opened), own_device(), impl="jax")
+        make_data(put)
     if any(w.row.moves_center for w in writers):
         put = full_structure(put)
     n = len(per_parameter)

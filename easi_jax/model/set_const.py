@@ -14,7 +14,7 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import smooth, support
 
-from easi_jax.devices.mesh import own_device
+from easi_jax.model.mjx_data import make_data
 
 _ELIMINATE_UP_TO = 24
 
@@ -72,7 +72,7 @@ def set_const(m: mjx.Model) -> mjx.Model:
     m = m.replace(body_subtreemass=subtree @ mass)
     if m.nv == 0:
         return m
-    d = mjx.make_data(m, own_device()).replace(qpos=m.qpos0)
+    d = make_data(m).replace(qpos=m.qpos0)
     d = smooth.com_pos(m, smooth.kinematics(m, d))
     d = smooth.tendon(m, d)
     d = smooth.transmission(m, smooth.tendon_armature(m, smooth.crb(m, d)))

@@ -70,7 +70,7 @@ class Simulator:
         self.fixed = dict(fixed or {})
         self.wide = mj_model.nv > WRITTEN_OUT
         self.by_differences = mj_model.nv > _FORWARD_MODE
-        self.base = self._put().replace(
+        self.base = self._put(sense is not None).replace(
             sense=sense,
             sense_size=sense_size,
             torque_speed=torque_speed,
@@ -101,10 +101,10 @@ class Simulator:
         ]
         return max([0.0, *fixed, *free])
 
-    def _put(self) -> Model:
+    def _put(self, sensors: bool) -> Model:
         # Eagerly, also where a machine is made while something is traced.
         with jax.ensure_compile_time_eval():
-            model = put_model(self.mj_model, self.space.addresses, self.fixed)
+            model = put_model(self.mj_model, self.space.addresses, self.fixed, sensors)
             step = jnp.asarray(self.dt / self.substeps, model.mjx.opt.timestep.dtype)
             return model.replace(mjx=model.mjx.tree_replace({"opt.timestep": step}))
 

@@ -9,6 +9,7 @@ known condition, gathers at known indices, repeated subexpressions), what is lef
 elementwise code over the batch. Same values up to rounding.
 """
 
+import math
 import operator
 from collections import OrderedDict
 from collections.abc import Callable
@@ -360,9 +361,10 @@ class _Replay:
     def _reduced(self, p: dict[str, Any], x: Entries, name: str) -> Any:
         axes = p["axes"]
         keep = [i for i in range(x.ndim) if i not in axes]
-        y = x.transpose([*keep, *axes]).reshape(*(x.shape[i] for i in keep), -1)
-        if not y.shape[-1]:
+        count = math.prod(x.shape[i] for i in axes)
+        if not count:
             return NotImplemented
+        y = x.transpose([*keep, *axes]).reshape(*(x.shape[i] for i in keep), count)
         out = np.empty(y.shape[:-1], object)
         for i in np.ndindex(out.shape):
             out[i] = self._sum(list(y[i]), name)

@@ -331,13 +331,24 @@ LENGTH_FIELDS = (
     ("old", "new", "message"),
     [
         ('joint="cart" kp', 'delay="0.01" nsample="5" joint="cart" kp', "delay"),
-        ('integrator="Euler"', 'integrator="implicit"', "mjINT_IMPLICIT"),
-        ('iterations="60"', 'iterations="60" solver="PGS"', "mjSOL_PGS"),
+        ('integrator="Euler"', 'integrator="implicit"', "mjINT_IMPLICIT.*implicitfast"),
+        ('iterations="60"', 'iterations="60" solver="PGS"', "mjSOL_PGS.*Newton"),
         ('<joint name="pole"', '<joint name="pole" damping="1 2"', "polynomial"),
         ('timestep="0.002"', 'timestep="0.002" noslip_iterations="3"', "noslip"),
         ('<velocity name="wheel"', '<velocity name="wheel" armature="1"', "armature"),
         ('type="plane"', 'type="plane" gap="0.01"', "gap"),
         ('dyntype="filterexact"', 'dyntype="filterexact" actearly="true"', "actearly"),
+        (
+            "<velocity",
+            '<dcmotor joint="cart" motorconst="0.1" resistance="1"/><velocity',
+            "dcmotor.*<motor>",
+        ),
+        ("<velocity", '<adhesion body="pole" ctrlrange="0 1"/><velocity', "joint="),
+        (
+            "</mujoco>",
+            "<sensor><e_kinetic/></sensor></mujoco>",
+            "mjSENS_E_KINETIC.*take these sensors out",
+        ),
     ],
 )
 def test_refuses_what_mjx_lacks(old: str, new: str, message: str) -> None:
@@ -347,3 +358,4 @@ def test_refuses_what_mjx_lacks(old: str, new: str, message: str) -> None:
     with pytest.raises(UserError, match=message) as error:
         put_model(m)
     assert "\n" not in str(error.value)
+    assert str(error.value).endswith("in the model file")
