@@ -138,10 +138,11 @@ def error_places(o: Outcome, m: mujoco.MjModel) -> tuple[ErrorPlace, ...]:
 
 
 def error_map(o: Outcome, m: mujoco.MjModel) -> ErrorMap | None:
-    """Errors of joints under conditions; None where no hinge or slide is compared."""
+    """Errors of joints under conditions; None where no hinge or slide is compared, or
+    no condition holds in enough windows."""
     c = o.channels
     joints, names, before = condition_errors(o.before.errors, o.before.conditions, m, c)
-    if not joints:
+    if not joints or not names:
         return None
     *_, after = condition_errors(o.after.errors, o.after.conditions, m, c)
     dofs = np.array([d for _, d in scalar_dofs(m).values()])

@@ -67,7 +67,7 @@ def test_numbers_are_those_that_people_write() -> None:
     page = render(gap_report(result()))
     assert "With it the 0.2 s prediction error falls" in page
     assert "RMS over windows of 0.2 s" in page and "0.200009" not in page
-    assert "torque 0.1 ± 0.01 rad" in page and "50 %" in page
+    assert "torque 0.100 ± 0.010 rad" in page and "50 %" in page
 
 
 def test_a_result_with_nothing_in_it_has_a_report() -> None:

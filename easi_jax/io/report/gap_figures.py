@@ -19,7 +19,7 @@ from easi_jax.io.report.figure_style import (
     tell,
     with_unit,
 )
-from easi_jax.io.report.numbers import number
+from easi_jax.io.report.numbers import compact
 
 _DASHES: Any = {"color": VERMILION, "lw": 1.3, "ls": (0, (4, 2))}
 
@@ -87,7 +87,14 @@ def gap_steps(
     labels = [f"{t} (rises)" if k in rising else t for k, t in enumerate(labels)]
     axis.plot([low, high], [y[-1], y[-1]], color=INK, lw=2)
     axis.axvline(floor, **DASHED)
-    axis.text(floor, len(labels) - 0.45, " noise floor", color=INK, va="bottom")
+    axis.annotate(
+        "noise floor",
+        (floor, len(labels) - 0.45),
+        xytext=(4, 0),
+        textcoords="offset points",
+        color=INK,
+        va="bottom",
+    )
     axis.set_yticks(y, labels)
     axis.set_xlabel("gap on held-out data (share of the motion)")
     axis.set_ylim(-0.6, len(labels) - 0.1)
@@ -111,7 +118,7 @@ def residual_maps(
     """
     figure, axes = grid(2, 2, 0.42 * len(joints) + 1.9)
     maps = [np.maximum(x / floor[:, None], 1e-3) for x in (before, after)]
-    most = max(float(np.nanmax(maps[0])), 2.0)
+    most = max(float(np.max(maps[0], initial=2.0, where=np.isfinite(maps[0]))), 2.0)
     for axis, shown, title in zip(
         axes, maps, ("model as given", "repaired"), strict=True
     ):
@@ -120,9 +127,10 @@ def residual_maps(
         )
         dark = np.log10(shown) > 0.6 * np.log10(most)
         labels = {
-            (i, j): (number(float(shown[i, j]), 2), bool(dark[i, j]))
+            (i, j): (compact(shown[i, j]), bool(dark[i, j]))
             for i, j in np.argwhere(np.isfinite(shown)).tolist()
         }
-        labelled_map(axis, labels, joints, conditions)
+        # The rows of the second map are those of the first.
+        labelled_map(axis, labels, joints if axis is axes[0] else (), conditions)
         axis.set_title(title)
     return svg(figure)

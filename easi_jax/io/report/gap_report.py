@@ -6,7 +6,7 @@ from typing import Any
 
 from easi_jax.io.report.gap_figures import gap_steps, residual_maps, traces
 from easi_jax.io.report.html import Picture, Report, Table
-from easi_jax.io.report.numbers import measured, number
+from easi_jax.io.report.numbers import measured, number, quantity, with_unit
 from easi_jax.model.effect_catalog import CATALOG
 from easi_jax.model.results import (
     ErrorMap,
@@ -150,7 +150,7 @@ def _most_of_it(r: GapResult) -> str:
     if not r.where:
         return ""
     w = r.where[0]
-    return f'; {100 * w.share:.0f} % of it sits at "{w.at}", {w.when}'
+    return f'; {100 * w.share:.0f}\u00a0% of it sits at "{w.at}", {w.when}'
 
 
 def sentence(e: NamedEffect) -> str:
@@ -207,7 +207,7 @@ def retrained_line(r: Retrained) -> str:
 def parameters_text(values: Values, between: str) -> str:
     """Parameters of an effect with deviation and unit."""
     return between.join(
-        f"{k} {number(v)} ± {measured(s, u, 2)}" for k, (v, s, u) in values.items()
+        f"{k} {with_unit(quantity(v, s), u)}" for k, (v, s, u) in values.items()
     )
 
 

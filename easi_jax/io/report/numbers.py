@@ -28,9 +28,30 @@ def number(value: float, digits: int = _DIGITS) -> str:
     return f"{value / 10.0**power:.{digits}g}·{_power(power)}"
 
 
+def compact(value: float) -> str:
+    """A number for a small cell, at most four characters: ``0.7``, ``240``, ``1.2k``.
+
+    ``""`` for what is not a number, ``>1T`` from 10¹² on.
+    """
+    if math.isnan(value):
+        return ""
+    size = abs(value)
+    if size >= 999.5e9:
+        return ">1T" if value > 0 else "<-1T"
+    for unit, scale in (("", 1.0), ("k", 1e3), ("M", 1e6), ("G", 1e9)):
+        if size < 999.5 * scale:
+            digits = 1 if size < 9.95 * scale else 0
+            return f"{value / scale:.{digits}f}{unit}"
+    raise AssertionError(value)
+
+
 def measured(value: float, unit: str, digits: int = _DIGITS) -> str:
     """A number with its unit: ``0.2 s``; ``1`` and ``""`` stand for no unit."""
-    text = number(value, digits)
+    return with_unit(number(value, digits), unit)
+
+
+def with_unit(text: str, unit: str) -> str:
+    """``text`` and its unit; ``1`` and ``""`` stand for none."""
     return text if unit in ("", "1") else f"{text} {unit}"
 
 

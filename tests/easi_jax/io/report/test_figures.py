@@ -137,7 +137,7 @@ def _map_font(columns: int) -> float:
     values = np.linspace(1.0, 777.0, 3 * columns).reshape(3, columns)
     svg = gap_figures.residual_maps(["a", "b", "c"], names, values, values, np.ones(3))
     shown = re.findall(r"<text[^>]*font-size: ([\d.]+)px[^>]*>([\d.]+)</text>", svg)
-    sizes = [size for size, text in shown if text in ("1", "777")]
+    sizes = [size for size, text in shown if text in ("1.0", "777")]
     assert len(sizes) == 4
     return float(sizes[0])
 

@@ -2,7 +2,14 @@ import math
 
 import pytest
 
-from easi_jax.io.report.numbers import cell, measured, number, quantity
+from easi_jax.io.report.numbers import (
+    cell,
+    compact,
+    measured,
+    number,
+    quantity,
+    with_unit,
+)
 
 
 @pytest.mark.parametrize(
@@ -48,6 +55,7 @@ def test_cell(value, text):
         (measured(0.0123456, "N m", 3), "0.0123 N m"),
         (measured(1.0, "1"), "1"),
         (measured(math.nan, "rad"), "not a number rad"),
+        (with_unit("0.20 ± 0.01", "1"), "0.20 ± 0.01"),
         (number(9999.6, 3), "10000"),
         (number(0.0012345, 3), "0.00123"),
         (number(-1234567.0, 3), "-1.23·10⁶"),
@@ -55,3 +63,24 @@ def test_cell(value, text):
 )
 def test_as_people_write_it(text, said):
     assert text == said
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (0.001, "0.0"),
+        (0.66, "0.7"),
+        (9.96, "10"),
+        (-240.4, "-240"),
+        (1234.0, "1.2k"),
+        (999.6, "1.0k"),
+        (99_960.0, "100k"),
+        (4.2e9, "4.2G"),
+        (1e30, ">1T"),
+        (math.inf, ">1T"),
+        (-math.inf, "<-1T"),
+        (math.nan, ""),
+    ],
+)
+def test_in_a_small_cell(value, said):
+    assert compact(value) == said and len(said) <= 4
