@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import mujoco
@@ -96,6 +97,37 @@ def test_the_site_has_every_page_and_module() -> None:
         path = ROOT / module.replace(".", "/")
         found = path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
         assert found, module
+
+
+def test_public_ci_runs_the_commands_of_the_readme() -> None:
+    """Both make targets, on the Pythons that pyproject.toml names first and last."""
+    flow = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())
+    job = flow["jobs"]["commands"]
+    targets = re.findall(r"^    make (\w+)", (ROOT / "README.md").read_text(), re.M)
+    assert job["strategy"]["matrix"]["command"] == targets == ["demo", "test"]
+    assert {step["run"] for step in job["steps"] if "run" in step} == {
+        "make ${{ matrix.command }}"
+    }
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    named = [
+        c.rpartition(" ")[2] for c in project["classifiers"] if " :: Python :: " in c
+    ]
+    assert job["strategy"]["matrix"]["python"] == named
+    assert project["requires-python"] == f">={named[0]}"
+
+
+def test_hooks_are_installed_by_make() -> None:
+    """Every hook is a program of the environment that ``make install-dev`` makes."""
+    config = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())
+    hooks = [hook for repo in config["repos"] for hook in repo["hooks"]]
+    assert {"ruff-check", "ruff-format", "pyright"} <= {hook["id"] for hook in hooks}
+    dev = (ROOT / "pyproject.toml").read_text()
+    for hook in hooks:
+        program, *arguments = hook["entry"].split()
+        folder, _, name = program.rpartition("/")
+        assert folder == ".venv/bin" and (name == "python" or f'"{name}' in dev)
+        for path in (a for a in arguments if a.endswith(".py")):
+            assert (ROOT / path).is_file(), path
 
 
 def test_equations_become_mathml() -> None:
@@ -190,9 +222,6 @@ def simulator(folder: Path) -> None:
     names = "joints: {pole_hinge: pole}\nactuators: [cart]\n"
     (folder / "names.yaml").write_text(names)
     (folder / "hidden.yaml").write_text(HIDDEN)
-    (folder / "my_env.py").write_text(
-        "from envs.cartpole import Cartpole\n\n\ndef make():\n    return Cartpole()\n"
-    )
 
 
 def shop(folder: Path) -> None:
