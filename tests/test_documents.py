@@ -17,6 +17,7 @@ import yaml
 from scripts.docs_site import equations
 from tests.documented import ROOT, commands, parsed
 from tests.recordings import Ros
+from tests.test_layout import LEVELS
 
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 DOCUMENTS = [
@@ -97,6 +98,22 @@ def test_the_site_has_every_page_and_module() -> None:
         path = ROOT / module.replace(".", "/")
         found = path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
         assert found, module
+
+
+def test_the_layout_of_the_readme_is_that_of_the_tree() -> None:
+    """Every package and module of the library, in the order of their levels."""
+    layout = section((ROOT / "README.md").read_text(), "Layout")
+    told = re.findall(r"`easi_jax/(\w+)(?:\.py)?`", layout)
+    there = {
+        p.stem
+        for p in (ROOT / "easi_jax").glob("[a-z]*")
+        if p.suffix == ".py" or (p / "__init__.py").is_file()
+    }
+    assert set(told) == there - {"version"}
+    levels = [name for name in LEVELS if name in told]
+    assert [name for name in told if name in levels] == levels
+    for top in ("envs", "train", "benchmarks", "scripts", "tests"):
+        assert f"`{top}`" in layout
 
 
 def test_public_ci_runs_the_commands_of_the_readme() -> None:
