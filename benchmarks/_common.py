@@ -62,6 +62,19 @@ def command_of(module: str, config: Any) -> str:
     return " ".join(words)
 
 
+def show_returns(title: str, returns: Mapping[str, Mapping[str, float]]) -> None:
+    """Prints the return in the target of each method, its mean and every seed."""
+    from train._command import show_table
+
+    seeds = next(iter(returns.values()))
+    rows = [
+        (m, *(f"{x:.1f}" for x in (sum(v.values()) / len(v), *v.values())))
+        for m, v in returns.items()
+    ]
+    head = ("method", "mean", *(f"seed {s}" for s in seeds))
+    show_table(f"{title}: return in the target", head, rows)
+
+
 def wander(env: Any) -> Callable[[Any, Any], Any]:
     """A controller that draws its actions, ``act(obs, key) -> action``."""
     import jax

@@ -22,7 +22,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from train._command import main, say, show_table
+from train._command import main, say
 
 # Of the target alone: on Cartpole the largest that an Oracle still balances with.
 HIDDEN = {
@@ -70,9 +70,7 @@ class Config:
 
 def run(config: Config) -> None:
     """Runs the chain with and without the gap workflow."""
-    import numpy as np
-
-    from benchmarks._common import command_of, write_result
+    from benchmarks._common import command_of, show_returns, write_result
     from easi_jax.errors import UserError, nearest
     from easi_jax.io.files import atomic_write
 
@@ -103,15 +101,16 @@ def run(config: Config) -> None:
         found={k: told[k] for k in ("verdict", "effects", "refitted", "gap")},
         returns=returns,
     )
-    show_table(
-        f"{config.robot}, hidden {config.effect}: return in the target",
-        ("method", "mean", *(f"seed {s}" for s in config.seeds)),
-        [
-            (m, f"{np.mean([*v.values()]):.1f}", *(f"{x:.1f}" for x in v.values()))
-            for m, v in returns.items()
-        ],
-    )
+    show_returns(f"{config.robot}, hidden {config.effect}", returns)
     say(f"written: {path}")
+
+
+def _once(module: Any, out: Path, told: str, **options: Any) -> Path:
+    """The run folder of a command that was not run there before."""
+    if not (out / "results.json").exists():
+        say(f"== {told}")
+        module.run(module.Config(out=out, overwrite=True, **options))
+    return out
 
 
 def _searched(
@@ -122,34 +121,14 @@ def _searched(
     from train import easi, udr
 
     def train(name: str, effects: Path | None) -> Path:
-        out = folder / f"udr_{name}"
-        if not (out / "results.json").exists():
-            say(f"== UDR {name} the effect")
-            udr.run(
-                udr.Config(
-                    out=out,
-                    seeds=config.seeds,
-                    effects=effects,
-                    target_effects=hidden,
-                    overwrite=True,
-                )
-            )
-        return out
+        out, told = folder / f"udr_{name}", f"UDR {name} the effect"
+        given = {"effects": effects, "target_effects": hidden}
+        return _once(udr, out, told, seeds=config.seeds, **given)
 
     def identify(name: str) -> Path:
-        out = folder / f"easi_{name}"
-        if not (out / "results.json").exists():
-            say(f"== EASI {name} the effect")
-            easi.run(
-                easi.Config(
-                    udr=folder / f"udr_{name}",
-                    out=out,
-                    target_effects=hidden,
-                    oracle=name == "without",
-                    overwrite=True,
-                )
-            )
-        return out
+        out, told = folder / f"easi_{name}", f"EASI {name} the effect"
+        given = {"udr": folder / f"udr_{name}", "target_effects": hidden}
+        return _once(easi, out, told, oracle=name == "without", **given)
 
     first = train("without", None)
     found, told = _asked(config.robot, first, hidden, folder)
@@ -178,23 +157,16 @@ def _trained(
     steps = None if start is None else STEPS[config.robot]
 
     def train(method: str, name: str, effects: Path | None, fixed: bool) -> Path:
-        out = folder / f"udr_{name}"
-        if not (out / "results.json").exists():
-            say(f"== {method}")
-            udr.run(
-                udr.Config(
-                    robot=config.robot,
-                    out=out,
-                    seeds=config.seeds,
-                    effects=effects,
-                    target_effects=hidden,
-                    fixed=fixed,
-                    start_from=start,
-                    env_steps=steps,
-                    overwrite=True,
-                )
-            )
-        return out
+        return _once(
+            *(udr, folder / f"udr_{name}", method),
+            robot=config.robot,
+            seeds=config.seeds,
+            effects=effects,
+            target_effects=hidden,
+            fixed=fixed,
+            start_from=start,
+            env_steps=steps,
+        )
 
     runs = {"UDR": train("UDR", "without", None, False)}
     found, told = _asked(config.robot, start or runs["UDR"], hidden, folder)

@@ -79,44 +79,27 @@ def run(config: Config) -> None:
     if config.way not in WAYS:
         raise UserError(f'--way "{config.way}": {WAYS}{nearest(config.way, WAYS)}')
     cost = _Cost()
-    chain = _whole if config.way == WAYS[0] else _separate
-    results = chain(config)
+    results = _chain(config)
     returns = read_json(results / "results.json")["returns"]["EASI"]
     (value,) = returns.values()
     atomic_write(config.out / "cost.json", to_json({**cost.told(), "return": value}))
 
 
-def _whole(config: Config) -> Path:
-    from train import pipeline
+def _chain(config: Config) -> Path:
+    """The folder of the results."""
+    from train import easi, pipeline, udr
 
-    out = config.out / "pipeline"
-    pipeline.run(
-        pipeline.Config(
-            robot=config.robot,
-            out=out,
-            target=(config.target,),
-            seeds=(config.seed,),
-            env_steps=config.env_steps,
-        )
+    target, out = (config.target,), config.out
+    given: dict[str, Any] = {"robot": config.robot, "target": target}
+    given |= {"seeds": (config.seed,), "env_steps": config.env_steps}
+    if config.way == WAYS[0]:
+        pipeline.run(pipeline.Config(out=out / "pipeline", **given))
+        return out / "pipeline"
+    udr.run(udr.Config(out=out / "udr", **given))
+    easi.run(
+        easi.Config(udr=out / "udr", out=out / "easi", target=target, oracle=False)
     )
-    return out
-
-
-def _separate(config: Config) -> Path:
-    from train import easi, udr
-
-    first, second = config.out / "udr", config.out / "easi"
-    udr.run(
-        udr.Config(
-            robot=config.robot,
-            out=first,
-            target=(config.target,),
-            seeds=(config.seed,),
-            env_steps=config.env_steps,
-        )
-    )
-    easi.run(easi.Config(udr=first, out=second, target=(config.target,), oracle=False))
-    return second
+    return out / "easi"
 
 
 class _Cost:

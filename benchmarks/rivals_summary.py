@@ -9,7 +9,7 @@ from typing import Any
 
 from benchmarks._cells import read_rows
 from benchmarks._common import commits_of, markdown_table
-from benchmarks._page import not_run
+from benchmarks._page import not_run, table
 from benchmarks.rival_cells import AFTER_GAP, METHODS, ROBOTS, SETTINGS, Cell
 
 OURS = METHODS[0]
@@ -154,25 +154,25 @@ def verdict(method: str, error: float, own: float) -> str:
 
 
 def _costs(rows: Sequence[Row]) -> list[str]:
-    lines = []
-    for method in METHODS:
-        mine = [r for r in rows if r["method"] == method]
-        if not mine:
-            continue
-        real = max(r["measured"] for r in mine)
+    def seconds(mine: Sequence[Row]) -> str:
         # Rows made before methods were waited for have none.
-        seconds = [r["seconds"] for r in mine if r["seconds"] is not None]
-        lines.append(
-            (
-                method,
-                f"{median(seconds):.0f}" if seconds else "not measured",
-                f"{median(r['simulated'] for r in mine) / 1e6:.2f}",
-                f"{real:,}" if real else "none",
-            )
-        )
-    head = ("method", "seconds, one core", "million steps simulated")
-    table = markdown_table((*head, "further steps of the real machine"), lines)
-    return [table, *_beyond(rows)]
+        known = [r["seconds"] for r in mine if r["seconds"] is not None]
+        return f"{median(known):.0f}" if known else "not measured"
+
+    columns = {
+        "method": lambda mine: mine[0]["method"],
+        "seconds, one core": seconds,
+        "million steps simulated": lambda mine: (
+            f"{median(r['simulated'] for r in mine) / 1e6:.2f}"
+        ),
+        "further steps of the real machine": lambda mine: (
+            f"{max(r['measured'] for r in mine):,}"
+            if any(r["measured"] for r in mine)
+            else "none"
+        ),
+    }
+    by_method = ([r for r in rows if r["method"] == m] for m in METHODS)
+    return [table(filter(None, by_method), columns), *_beyond(rows)]
 
 
 def _beyond(rows: Sequence[Row]) -> list[str]:

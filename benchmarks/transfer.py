@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 from benchmarks._common import RESULTS
-from train._command import main, say, show_table
+from train._command import main, say
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +51,7 @@ def run(config: Config) -> None:
     import jax.numpy as jnp
     import numpy as np
 
-    from benchmarks._common import command_of, write_result
+    from benchmarks._common import command_of, show_returns, write_result
     from easi_jax.devices.runtime import fast_loops
     from easi_jax.pipeline.stages import (
         Pipeline,
@@ -138,6 +138,10 @@ def run(config: Config) -> None:
             m: np.asarray(returns(p, target, keys["evaluate"])).mean(1)
             for m, p in methods.items()
         }
+        by_method = {
+            m: dict(zip(map(str, config.seeds), v.tolist(), strict=True))
+            for m, v in scores.items()
+        }
         gap = scores["Oracle"] - scores["UDR"]
         won = scores["EASI"] - scores["UDR"]
         error = gap.std(ddof=1) / np.sqrt(count) if count > 1 else float("nan")
@@ -158,10 +162,7 @@ def run(config: Config) -> None:
             robot=config.robot,
             changed=changed,
             target=dict(zip(env.space.names, theta.tolist(), strict=True)),
-            returns={
-                m: dict(zip(map(str, config.seeds), v.tolist(), strict=True))
-                for m, v in scores.items()
-            },
+            returns=by_method,
             changed_found=np.asarray(
                 jax.vmap(pipe.space.to_si)(result.distribution.mean)
             )[:, env.space.names.index(changed)].tolist(),
@@ -175,15 +176,8 @@ def run(config: Config) -> None:
             goal_applies=bool(gap.mean() > 2 * error),
             seconds=time.monotonic() - begin,
         )
-        show_table(
-            f"{changed} x {factor:g}: return in the target; EASI closes {share:.2f} of "
-            "the gap",
-            ("method", "mean", *(f"seed {s}" for s in config.seeds)),
-            [
-                (m, f"{v.mean():.1f}", *(f"{x:.1f}" for x in v))
-                for m, v in scores.items()
-            ],
-        )
+        title = f"{changed} x {factor:g}; EASI closes {share:.2f} of the gap"
+        show_returns(title, by_method)
         say(f"written: {path}")
 
 
