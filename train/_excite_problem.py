@@ -23,7 +23,7 @@ class ExciteProblem:
         noise: of positions, ``(nv,)``.
         scales: of --data; None without.
         pairs: effects that are to be told apart; empty: all.
-        strengths: of those, by key, then field and index.
+        strengths: of those, by key, then by column of an effects file.
         notes: what the user should know.
     """
 
@@ -35,7 +35,7 @@ class ExciteProblem:
     noise: Any
     scales: Any
     pairs: list[tuple[str, str]]
-    strengths: dict[str, dict[tuple[str, tuple[int, ...]], float]]
+    strengths: Mapping[str, Mapping[str, float]]
     notes: list[str]
 
 
@@ -108,7 +108,7 @@ def read_excite_problem(config: Any) -> ExciteProblem:
         )
     rows = round(config.duration / dt) + 1
     bench, more = make_bench(m, limits, dt, rows, config.play)
-    pairs, strengths = _from_gap(config, m, notes)
+    pairs, strengths = _from_gap(config, notes)
     return ExciteProblem(
         model.name,
         m,
@@ -213,12 +213,10 @@ def _from_data(config: Any, m: Any, notes: list[str]) -> tuple[Any, Any, Any]:
     return runs[0].dt, noise, scales_of(m, runs)
 
 
-def _from_gap(config: Any, m: Any, notes: list[str]) -> tuple[list[Any], Any]:
+def _from_gap(config: Any, notes: list[str]) -> tuple[list[Any], Any]:
     """What a result of train.gap leaves open, with the strengths that it found."""
     if config.gap is None:
         return [], {}
-    from easi_jax.errors import UserError
-    from easi_jax.gap.table import object_id
     from easi_jax.io.models.effects_file import read_effects
     from easi_jax.io.runs.schemas import GAP, read_checked
 
@@ -233,17 +231,6 @@ def _from_gap(config: Any, m: Any, notes: list[str]) -> tuple[list[Any], Any]:
         return [], {}
     pairs += [(b, a) for a, b in pairs]
     beside = path.parent / "effects.yaml"
-    strengths: dict[str, dict[tuple[str, tuple[int, ...]], float]] = {}
-    for e in read_effects(beside)[0] if beside.exists() else []:
-        index: tuple[int, ...] = ()
-        if e.kind in ("joint", "actuator", "body"):
-            i = object_id(m, e.kind, e.at)
-            index = (int(m.jnt_dofadr[i]) if e.kind == "joint" else i,)
-        values = {}
-        for column, value in e.columns.items():
-            field, _, part = column.partition(".")
-            if part and not (part.isascii() and part.isdecimal() and len(part) < 4):
-                raise UserError(f'{beside}: "{column}" does not end in a number')
-            values[(field, (*index, int(part)) if part else index)] = value
-        strengths[f"{e.effect}@{e.at}"] = values
+    found = read_effects(beside)[0] if beside.exists() else []
+    strengths = {f"{e.effect}@{e.at}": e.columns for e in found}
     return list(dict.fromkeys(pairs)), strengths

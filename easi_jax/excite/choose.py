@@ -105,7 +105,7 @@ def choose(
     horizon: float,
     names: Sequence[str] = (),
     pairs: Sequence[tuple[str, str]] = (),
-    strengths: Mapping[str, Mapping[tuple[str, tuple[int, ...]], float]] | None = None,
+    strengths: Mapping[str, Mapping[str, float]] | None = None,
     scales: Scales | None = None,
     tell: Tell = lambda _: None,
 ) -> Choice:
@@ -119,7 +119,7 @@ def choose(
         horizon: length of the predictions that the gap workflow makes [s].
         names: effects that count; all where empty.
         pairs: ``(effect@at, effect@at)`` that are to be told apart; all where empty.
-        strengths: of effects by key, then by field and index of a column; by default
+        strengths: of effects by key, then by a column's name; by default
             a few percent of what moves the machine.
         scales: how large motion is; by default that of all tests together.
 
@@ -210,7 +210,7 @@ def _only(found: Sequence[Place], keys: set[str]) -> list[Place]:
 def _truths(
     predictor: ev.Predictor,
     found: Sequence[Place],
-    strengths: Mapping[str, Mapping[tuple[str, tuple[int, ...]], float]],
+    strengths: Mapping[str, Mapping[str, float]],
 ) -> dict[str, np.ndarray]:
     """Whole vectors with an effect at a known strength."""
     out = {}
@@ -221,6 +221,6 @@ def _truths(
         x = predictor.neutral.copy()
         index = predictor.layout.where(place) + predictor.own
         for i, c in zip(index, place.columns, strict=True):
-            x[i] = values.get((c.field, c.index), x[i])
+            x[i] = values.get(c.name, x[i])
         out[place.key] = x
     return out

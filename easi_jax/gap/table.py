@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
-from easi_jax.errors import UserError
 from easi_jax.model import addresses as language
 from easi_jax.model.effect_catalog import CATALOG, Effect
 from easi_jax.model.effect_numbers import VECTORS
@@ -103,25 +102,6 @@ def name_of(m: mujoco.MjModel, kind: str, i: int) -> str:
     return str(obj(i).name)
 
 
-_OBJECTS = {
-    "joint": mujoco.mjtObj.mjOBJ_JOINT,
-    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
-    "body": mujoco.mjtObj.mjOBJ_BODY,
-}
-
-
-def object_id(m: mujoco.MjModel, kind: str, name: str) -> int:
-    """Id of a named joint, actuator or body.
-
-    Raises:
-        UserError: the model has none of that name.
-    """
-    i = mujoco.mj_name2id(m, _OBJECTS[kind], name)
-    if i < 0:
-        raise UserError(f'the model has no {kind} "{name}"')
-    return i
-
-
 def covered(place: Place, space: ParameterSpace, m: mujoco.MjModel) -> bool:
     """Whether the refit of the model's own parameters does what an effect does."""
     own = [a for p in space.parameters for a in p.addresses]
@@ -131,7 +111,6 @@ def covered(place: Place, space: ParameterSpace, m: mujoco.MjModel) -> bool:
 def does(place: Place, address: str, m: mujoco.MjModel) -> bool:
     """Whether an address of the model's own parameters is what an effect changes."""
     return any(
-        place.row.refits == (kind, quantity)
-        and (not place.at or object_id(m, kind, place.at) == i)
+        place.row.refits == (kind, quantity) and place.at in ("", name_of(m, kind, i))
         for kind, quantity, i in language.places(m, address)
     )

@@ -300,6 +300,14 @@ def fields_that_act(where: Acts) -> tuple[str, ...]:
 _READINGS = fields_that_act("readings")
 
 
+def is_column(name: str) -> bool:
+    """Whether an effects file may have a number of this name. A sensor of several
+    numbers has one for each: ``bias.2``."""
+    field, _, entry = name.partition(".")
+    of_sensor = field in _READINGS and entry.isascii() and entry.isdecimal()
+    return name in NUMBERS or of_sensor
+
+
 @dataclass(frozen=True)
 class EffectEntry:
     """One effect.

@@ -21,7 +21,7 @@ from easi_jax.errors import UserError, nearest
 from easi_jax.io.files import atomic_write, to_plain
 from easi_jax.io.strict_yaml import read_yaml
 from easi_jax.model.effect_catalog import EFFECTS
-from easi_jax.model.effect_numbers import NUMBERS, field_of
+from easi_jax.model.effect_numbers import NUMBERS, is_column
 from easi_jax.model.found_effects import EffectEntry, FoundEffects
 
 _KEYS = ("effect", "at", "kind", "columns", "parameters", "std")
@@ -118,12 +118,11 @@ def _entry(path: str, i: int, item: Any) -> EffectEntry:
     columns = item.get("columns")
     if not isinstance(columns, dict) or not columns:
         raise UserError(f"{path}, {where} ({name}): columns: holds its numbers")
-    known = {field_of(name) for name in NUMBERS}
     for key in columns:
-        if field_of(str(key)) not in known:
+        if not is_column(str(key)):
             raise UserError(
                 f'{path}, {where} ({name}): unknown column "{key}"'
-                f"{nearest(str(key), known)}"
+                f"{nearest(str(key), NUMBERS)}"
             )
     std = item.get("std") or {}
     if not isinstance(std, dict):
