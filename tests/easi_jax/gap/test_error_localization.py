@@ -203,4 +203,7 @@ def test_a_machine_without_actuators_has_no_commands_that_jump(
     assert list(found.general) == ["late in the recordings", "in contact"]
     told = where(errors(found.general["in contact"], 0), found, bare, channels())
     assert told[0].at == "lift" and "in contact" in told[0].when
-    assert condition_errors(errors(np.zeros(len(windows)), 0), found, bare, channels())
+    wrong = errors(found.general["in contact"], 0)
+    joints, names, table = condition_errors(wrong, found, bare, channels())
+    assert joints == ["lift", "turn"] and not any("jumps" in name for name in names)
+    assert table[0, names.index("in contact")] > table[0, names.index("throughout")] > 0

@@ -24,6 +24,9 @@ from tests.tiny_robot.env import Tiny
 
 ENVS, STEPS, LIMIT = 4, 6, 5
 DISCOUNT = 0.95
+# Brax's hints of its own functions and classes do not fit each other.
+NORMALIZE: Any = running_statistics.normalize
+PARAMS: Any = ppo_losses.PPONetworkParams
 
 
 @pytest.fixture(scope="module")
@@ -36,12 +39,12 @@ def unroll() -> Any:
     net = ppo_networks.make_ppo_networks(
         env.observation_size,
         env.action_size,
-        preprocess_observations_fn=running_statistics.normalize,
+        preprocess_observations_fn=NORMALIZE,
         policy_hidden_layer_sizes=(8,),
         value_hidden_layer_sizes=(8,),
     )
     keys = jax.random.split(jax.random.PRNGKey(0), 4)
-    params: Any = ppo_losses.PPONetworkParams(
+    params = PARAMS(
         policy=net.policy_network.init(keys[0]), value=net.value_network.init(keys[1])
     )
     statistics = running_statistics.init_state(
@@ -127,7 +130,7 @@ def test_a_step_of_sac_lowers_the_critics_loss(unroll: Any) -> None:
     net = sac_networks.make_sac_networks(
         2,
         1,
-        preprocess_observations_fn=running_statistics.normalize,
+        preprocess_observations_fn=NORMALIZE,
         hidden_layer_sizes=(8,),
     )
     keys = jax.random.split(jax.random.PRNGKey(2), 3)
