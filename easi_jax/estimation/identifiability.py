@@ -228,8 +228,9 @@ def relative(
     bound = move @ (ident.covariance * outer) @ move.T
     alone = (ident.null**2).sum(1) > _ALONE
     unseen = np.linalg.norm(move @ np.where(alone[:, None], 0.0, ident.null), axis=1)
-    known = (np.sqrt(np.maximum(np.diag(bound), 0.0)) < _WEAK) & (unseen < LEAK)
-    known &= ~alone
+    # Found so closely, and not only to be found so by data of this kind.
+    widest = np.sqrt(np.maximum(np.diag(bound), np.diag(spread)))
+    known = (widest < _WEAK) & (unseen < LEAK) & ~alone
     known[chosen] = False
     return Relative(
         taken={names[i]: float(space.nominal[i]) for i in chosen},

@@ -44,7 +44,11 @@ def easi_report(
             f"In the target the EASI policy returns {medians['EASI']:.1f}, the {first} "
             f"policy it started from {medians[first]:.1f}"
             + (f", the Oracle {oracle:.1f}" if oracle is not None else "")
-            + f" (medians of {len(seeds)} seed{'s' if len(seeds) > 1 else ''})."
+            + (
+                f" (medians of {len(seeds)} seeds)."
+                if len(seeds) > 1
+                else " (one seed)."
+            )
         ],
         parameters=rows,
         undetermined=unseen_notes(space, result),

@@ -232,8 +232,9 @@ def flatten(tree: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
 
 def _parameter_cells(row: ParameterRow) -> dict[str, Any]:
     error = ""
-    if row.truth is not None and row.truth != 0:
-        error = f"{100 * (row.mean / row.truth - 1):+.1f} %"
+    if row.truth is not None and row.truth != 0 and row.flag != "taken":
+        off = round(100 * (row.mean / row.truth - 1), 1)
+        error = f"{off + 0.0:+.1f} %"  # no -0.0
     flag = row.flag
     note = ""
     if flag == "at bound" and row.bounds is not None:

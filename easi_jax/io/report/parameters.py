@@ -80,8 +80,8 @@ def unseen_notes(space: ParameterSpace, result: SeedResult) -> list[str]:
     ]
     return [
         *notes,
-        f"so the table takes {' and '.join(taken)} from the model: what is known given "
-        "them is right where they are, and moves with them where they are not",
+        f"hence the table takes {' and '.join(taken)} from the model: what is known "
+        "given them is right where they are, and moves with them where they are not",
     ]
 
 

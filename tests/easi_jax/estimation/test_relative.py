@@ -94,6 +94,13 @@ def test_a_direction_without_a_mass_stays_open() -> None:
     assert _found(0.2 * drive, [drive]).relative is None
 
 
+def test_what_the_search_left_wide_is_not_called_known() -> None:
+    info = _information([_common()], 0.01)
+    mean = np.asarray(SPACE.to_unit(SPACE.nominal), float)
+    wide = seed_result(SPACE, mean, np.eye(SPACE.size) / 12, info).relative
+    assert wide is not None and not any(wide.determined)
+
+
 def test_a_weak_direction_is_not_called_known() -> None:
     found = _found(np.zeros(SPACE.size), [_common()], std=0.6)
     assert found.relative is None and "determined" not in found.flags
