@@ -298,3 +298,21 @@ def test_leftovers_of_a_killed_process_are_cleaned(tmp_path, states):
     (tmp_path / ".writing-1" / "state").mkdir(parents=True)
     checkpoints.save(tmp_path, 3, states[0], config_hash="a")
     assert [p.name for p in tmp_path.iterdir()] == ["step_000000000003"]
+
+
+@pytest.mark.fault("killed (signal 9), then resumed")
+def test_killed_between_two_renames(tmp_path, states, target):
+    """A step that is written again lies aside for a moment."""
+    checkpoints.save(tmp_path, 3, states[1], config_hash="a")
+    (tmp_path / "step_000000000003").rename(tmp_path / ".old-000000000003")
+    (tmp_path / ".writing-1").mkdir()
+    assert checkpoints.steps(tmp_path) == [3]
+    found = checkpoints.restore(tmp_path, target)
+    assert found is not None and found.step == 3
+    _assert_same(found.state, states[1])
+    checkpoints.save(tmp_path, 4, states[2], config_hash="a")
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        *("step_000000000003", "step_000000000004"),
+    ]
+    checkpoints.save(tmp_path, 3, states[0], config_hash="a")
+    assert checkpoints.steps(tmp_path) == [3, 4]
