@@ -24,7 +24,8 @@ def errors_and_floor(
     first would be for a perfect model, ``(nv,)`` each.
 
     For the floor noise ``(2 nv,)`` is drawn for starts and targets and pushed through
-    the model.
+    the model. A piece whose prediction is not finite counts as an error of the largest
+    motion in a piece that is held out, and in the floor as the noise alone.
     """
     nv = simulator.mj_model.nv
     k_start, k_end = jax.random.split(key)
@@ -46,11 +47,19 @@ def errors_and_floor(
     shift = open_loop.prediction_residuals(simulator, sharp, noisy)[..., :nv]
     shift = shift + noise[:nv] * jax.random.normal(k_end, shift.shape)
     first, second = error[: held.count], error[held.count : held.count + fit.count]
-    return _rms_of_steps(first), _rms_of_steps(second), _rms_of_steps(shift)
+    largest = jnp.abs(open_loop.motion(simulator, held)[..., :nv]).max((0, 1))
+    return (
+        rms_of_steps(first, largest),
+        rms_of_steps(second, largest),
+        rms_of_steps(shift, noise[:nv]),
+    )
 
 
-def _rms_of_steps(error: jax.Array) -> jax.Array:
-    return jnp.sqrt(jnp.mean(error**2, axis=(0, 1)))
+def rms_of_steps(error: jax.Array, instead: jax.Array) -> jax.Array:
+    """RMS ``(n,)`` of errors ``(M, H, n)``; a piece that is not finite counts as an
+    error of ``instead (n,)`` in each of its steps."""
+    known = jnp.isfinite(error).all((1, 2), keepdims=True)
+    return jnp.sqrt(jnp.mean(jnp.where(known, error, instead) ** 2, axis=(0, 1)))
 
 
 def misfit_of(error: jax.Array, noise: jax.Array, weight: jax.Array) -> jax.Array:

@@ -3,11 +3,13 @@
 from types import SimpleNamespace
 from typing import Any
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from easi_jax.errors import UserError
+from easi_jax.estimation.prediction_error import rms_of_steps
 from easi_jax.excite.propose import Proposal, quick_tests
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.analysis import Analysis
@@ -114,6 +116,17 @@ def test_a_model_that_blows_up_is_told_in_one_line(
     monkeypatch.setattr(Analysis, "start_noise", np.zeros(2 * NV))
     with pytest.raises(UserError, match="not finite: the model blows up"):
         made.whiten(np.zeros(1))
+
+
+def test_an_identified_models_error_stays_a_number() -> None:
+    error = rms_of_steps(jnp.asarray(blown(3, 5)[0]), jnp.asarray(LARGEST))
+    np.testing.assert_allclose(error, LARGEST * np.sqrt(2 / W), rtol=0.01)
+    whole = some()[0]
+    np.testing.assert_allclose(
+        rms_of_steps(jnp.asarray(whole), jnp.asarray(LARGEST)),
+        np.sqrt((whole**2).mean((0, 1))),
+        rtol=1e-5,
+    )
 
 
 def test_no_test_is_proposed_to_a_machine_without_actuators() -> None:
