@@ -6,9 +6,11 @@ note of the report, and all else stays.
 
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TypeVar
 
 from easi_jax.errors import UserError
+from easi_jax.io.report.html import Report
 from easi_jax.io.runs.folder import RunFolder
 from train import _interrupt
 from train._command import say
@@ -53,6 +55,14 @@ class Extras:
                 f"program, not of your data; {FAILURES} in the folder has the details)"
             )
         return otherwise
+
+    def drawn(self, report: Report) -> Report:
+        """``report`` with its pictures drawn; of those that fail there are notes."""
+        pictures = []
+        for p in report.pictures:
+            text = self.attempt(f'the picture "{p.title}"', lambda p=p: p.text, "")
+            pictures += [replace(p, svg=text)] if text else []
+        return replace(report, pictures=pictures, notes=[*report.notes, *self.notes])
 
     def _note(self, text: str) -> None:
         said = " ".join(text.split())

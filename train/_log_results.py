@@ -1,6 +1,7 @@
 """What an identification from logs leaves in its folder."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -73,7 +74,7 @@ def write(
         seeds,
         results,
         errors,
-        history_figure(folder, space, seeds[best], None, generations),
+        partial(history_figure, folder, space, seeds[best], None, generations),
         lost_simulations(folder),
         problem.noise.tolist(),
         problem.simulator.state_names,

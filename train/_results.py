@@ -92,13 +92,20 @@ def lost_simulations(folder: "RunFolder") -> int:
 
 
 def write_pages(folder: "RunFolder", report: "Report") -> None:
-    """Writes a report, and its figures as files of their own."""
-    from easi_jax.io.report.html import write_report
+    """Writes a report, then its figures as files of their own, then both together; a
+    figure that cannot be drawn becomes a note."""
+    from dataclasses import replace
 
+    from easi_jax.io.report.html import write_report
+    from train._extras import Extras
+
+    path = folder.path / "report.html"
+    write_report(path, replace(report, pictures=()))
+    report = Extras(folder).drawn(report)
     for picture in report.pictures:
         if picture.file:
-            folder.write(f"figures/{picture.file}.svg", picture.svg)
-    write_report(folder.path / "report.html", report)
+            folder.write(f"figures/{picture.file}.svg", picture.text)
+    write_report(path, report)
 
 
 def truth_of(pipe: "Pipeline", theta: ArrayLike) -> np.ndarray:

@@ -11,11 +11,12 @@ import pytest
 from easi_jax.errors import UserError
 from easi_jax.gap import summary
 from easi_jax.io.report import gap_report
-from easi_jax.io.report.html import Picture
+from easi_jax.io.report.html import Picture, Report, Table
 from easi_jax.io.runs.folder import RunFolder
 from tests.commands import read
 from tests.gap_results import result
 from train import _extras, _gap_results, gap
+from train._results import write_pages
 
 PARTS = {
     "model.xml": (_gap_results, "_write_model"),
@@ -95,6 +96,35 @@ def test_where_nothing_fails_nothing_is_noted(
     assert whole and told.notes == result().notes
     assert read(tmp_path / "out" / "gap.json")["not_in_model_xml"] == []
     assert not (tmp_path / "out" / _extras.FAILURES).exists()
+
+
+@pytest.mark.fault("an optional part fails")
+def test_a_report_is_there_before_its_pictures(tmp_path: Path) -> None:
+    """As train.easi writes it."""
+    page = tmp_path / "out" / "report.html"
+
+    def fails() -> str:
+        assert "<h2>Errors" in page.read_text()
+        raise ZeroDivisionError("no such scale")
+
+    svg = '<svg width="1" height="1"></svg>'
+    report = Report(
+        "Pendulum",
+        ["It errs less."],
+        tables=[Table("Errors", ["joint"], [("swing",)])],
+        pictures=[
+            Picture("Errors in bars", fails, "bars", file="errors"),
+            Picture("By generation", lambda: svg, "lines", file="parameters"),
+        ],
+        notes=["a note"],
+    )
+    with RunFolder.open(tmp_path / "out", {}) as folder:
+        write_pages(folder, report)
+    text = page.read_text()
+    assert "ZeroDivisionError: no such scale" in text and "a note" in text
+    assert "<h2>By generation" in text and "<h2>Errors in bars" not in text
+    figures = sorted(p.name for p in (tmp_path / "out" / "figures").iterdir())
+    assert figures == ["parameters.svg"]
 
 
 def test_a_mistake_of_the_user_has_no_traceback(tmp_path: Path) -> None:

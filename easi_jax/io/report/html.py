@@ -3,7 +3,7 @@
 import dataclasses
 import html
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +22,8 @@ _KINDS = {
     "taken": "plain",
     "at bound": "bad",
 }
+Svg = str | Callable[[], str]
+
 # Colors that need another shade on a dark page.
 _THEMED = {
     INK: "--ink",
@@ -108,17 +110,22 @@ class Picture:
 
     Attributes:
         title: heading.
-        svg: its SVG text; trusted, so it must not come from outside.
+        svg: its SVG text, or what draws it; trusted, so it must not come from outside.
         alt: what it shows, for who cannot see it.
         caption: one sentence below.
         file: name of its file in a run's ``figures/``, where it has one.
     """
 
     title: str
-    svg: str
+    svg: Svg
     alt: str
     caption: str = ""
     file: str = ""
+
+    @property
+    def text(self) -> str:
+        """The SVG text, drawn now where it is not yet."""
+        return self.svg if isinstance(self.svg, str) else self.svg()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,7 +212,8 @@ def inline_svg(picture: Picture, index: int) -> str:
 
     Its names become unique within the page, its size and colors the page's.
     """
-    text = picture.svg[picture.svg.index("<svg") :]
+    drawn = picture.text
+    text = drawn[drawn.index("<svg") :]
     prefix = f"p{index}-"
     text = re.sub(r'\bid="', f'id="{prefix}', text)
     text = re.sub(r"url\(#", f"url(#{prefix}", text)

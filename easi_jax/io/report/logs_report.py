@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from easi_jax.io.report.figures import prediction_errors
-from easi_jax.io.report.html import Diagnostic, Picture, Report, Table
+from easi_jax.io.report.html import Diagnostic, Picture, Report, Svg, Table
 from easi_jax.io.report.numbers import number
 from easi_jax.io.report.parameters import doubtful, lost, parameter_rows, unseen_notes
 from easi_jax.model.parameters import ParameterSpace
@@ -22,7 +23,7 @@ def logs_report(
     seeds: Sequence[int],
     results: Sequence[SeedResult],
     errors: HeldOutErrors,
-    by_generation: str,
+    by_generation: Svg,
     non_finite: int,
     noise: Sequence[float],
     channels: Sequence[str],
@@ -55,7 +56,7 @@ def logs_report(
         pictures=[
             Picture(
                 TITLE,
-                error_bars(errors),
+                partial(error_bars, errors),
                 "Held-out error of each joint before and after identification",
                 file="errors",
             ),
