@@ -14,9 +14,10 @@ class Config:
     """Proposes what may vary in a model: a parameter file for train.easi to start from.
 
     Damping, friction and inertia of joints, gains and limits of drives, masses, ground
-    friction. Places that look alike are tied to one parameter. With --data it also says
-    what these logs can determine. Read the file, take out what you have measured, and
-    correct the ranges you know better.
+    friction. Places that look alike are tied to one parameter by a pattern of names
+    (legs, sides; never joints of one chain): --no-tie leaves them apart. With --data it
+    also says what these logs can determine. Read the file, take out what you have
+    measured, and correct the ranges you know better.
     """
 
     model: Path
@@ -30,6 +31,8 @@ class Config:
     """Measured logs (CSV, NPZ or Parquet)."""
     mapping: Path | None = None
     """Mapping file (YAML) for logs with foreign column names."""
+    tie: bool = True
+    """One parameter for places that look alike."""
     overwrite: bool = False
     """Replace the file if it is there."""
 
@@ -38,7 +41,6 @@ def run(config: Config) -> None:
     """Writes the file and shows what is in it."""
     from easi_jax.errors import UserError
     from easi_jax.io.files import atomic_write
-    from easi_jax.io.models.parameter_file import read_parameter_file
     from easi_jax.model.parameter_proposal import as_text, propose
     from train._log_problem import load_model
 
@@ -48,7 +50,7 @@ def run(config: Config) -> None:
             "it with --overwrite"
         )
     m = load_model(config.model, config.allow_assets)
-    proposals = propose(m)
+    proposals = propose(m, config.tie)
     verdicts: dict[str, str] = {}
     notes: list[str] = []
     head = [f"Proposed by python -m train.parameters for {config.model.name}."]
@@ -56,8 +58,12 @@ def run(config: Config) -> None:
         verdicts, notes = _verdicts(proposals, _information(config, m, proposals))
         names = ", ".join(p.name for p in config.data)
         head.append(f"What {names} can determine at best is said beside each name.")
+    if any(p.tied for p in proposals):
+        head.append(
+            "Addresses with * tie the places that are named below them: write an"
+        )
+        head.append("entry for each place, or run again with --no-tie, to part them.")
     atomic_write(config.out, as_text(proposals, head, verdicts))
-    read_parameter_file(config.out, m)
     rows = [
         (
             p.parameter.name,

@@ -69,6 +69,12 @@ def names(m: mujoco.MjModel, kind: str) -> dict[str, int]:
     return found
 
 
+def matching(pattern: str, known: Iterable[str]) -> list[str]:
+    """Those of some names that a pattern with ``*`` fits."""
+    regex = re.compile(".*".join(re.escape(part) for part in pattern.split("*")))
+    return [name for name in known if regex.fullmatch(name)]
+
+
 def split(address: str) -> tuple[str, str, str]:
     """Returns (kind, name, quantity); the name of an option is empty, the quantity of
     an effect is its field, with the entry of a vector (``com.0``).
@@ -129,9 +135,8 @@ def places(m: mujoco.MjModel, address: str) -> tuple[tuple[str, str, int], ...]:
     if name in known:
         ids, pattern = [known[name]], False
     else:
-        regex = re.compile(".*".join(re.escape(part) for part in name.split("*")))
         pattern = "*" in name
-        ids = [i for n, i in known.items() if pattern and regex.fullmatch(n)]
+        ids = [known[n] for n in matching(name, known)] if pattern else []
     if not ids:
         what = "matches no" if pattern else "names no"
         raise UserError(

@@ -1,13 +1,16 @@
 """A first parameter file for a model: what can vary in it, and in which range.
 
-Places whose names differ in one part and whose values are the same are tied. Where the
-model says zero (no friction, no armature) the range comes from the machine itself: from
-what its drives or its weight can do, and from its inertia.
+Places whose names differ in one part are tied where they are alike: of one type, at the
+same depth of the tree, with the same values but for mirroring. Where the model says
+zero (no friction, no armature) the range comes from the machine itself: from what its
+drives or its weight can do, and from its inertia. What moves nothing is left out.
 """
 
-import fnmatch
+import copy
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -15,12 +18,22 @@ import numpy as np
 from easi_jax.errors import UserError
 from easi_jax.model import addresses as language
 from easi_jax.model.joint_space import is_scalar, scalar_dofs
-from easi_jax.model.parameters import Parameter, ParameterSpace, declare
+from easi_jax.model.parameters import Parameter, ParameterSpace, Range, declare
 
 _GRAVITY = 9.81
 _SHORTEST = 0.01  # m, arm of a weight
 _SPEED = {"slide": 1.0, "hinge": 10.0}  # m/s, rad/s: of a brisk motion
 _FACTOR = 1e3  # of the middle of the range, that bounds allow either way
+_DIGITS = 4  # significant ones, of a proposed number
+# Share of a joint's inertia, or of the weight on it, that a body must have, and the
+# acceleration [rad/s2, m/s2] that such a weight must make: no log shows less.
+_FELT = 1e-3
+_INERTIA_DECIMALS = 9  # kg m2: rounding of what is said in a model
+_AT_JOINTS = {
+    int(mujoco.mjtTrn.mjTRN_JOINT),
+    int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
+}
+_POSES = 4  # in which bodies are felt for, drawn at random
 _SHARES = {  # of the drive's force, of that over a brisk speed, of the inertia
     "frictionloss": (1e-3, 0.1),
     "damping": (1e-3, 0.3),
@@ -35,14 +48,19 @@ class Proposal:
     Attributes:
         parameter: name, addresses and ranges.
         note: what a person should know of it; may be empty.
+        tied: names of the places that have it in common; empty where it is one place.
     """
 
     parameter: Parameter
     note: str = ""
+    tied: tuple[str, ...] = ()
 
 
-def propose(m: mujoco.MjModel) -> list[Proposal]:
+def propose(m: mujoco.MjModel, tie: bool = True) -> list[Proposal]:
     """What can vary in a model, in a sensible order.
+
+    Args:
+        tie: places that look alike are one parameter.
 
     Raises:
         UserError: nothing that has a name can vary.
@@ -50,18 +68,17 @@ def propose(m: mujoco.MjModel) -> list[Proposal]:
     joints = [n for n, j in language.names(m, "joint").items() if is_scalar(m, j)]
     out: list[Proposal] = []
     for quantity in ("damping", "frictionloss", "armature"):
-        out += _tied(m, "joint", quantity, joints)
-    drives = list(language.names(m, "actuator"))
-    for quantity in ("kp", "kv", "gain", "force_limit"):
-        out += _tied(m, "actuator", quantity, drives)
-    moving = [
-        n
-        for n, b in language.names(m, "body").items()
-        if m.body_weldid[b] and m.body_mass[b] > 0
+        out += _tied(m, "joint", quantity, joints, tie)
+    drives = [
+        n for n, a in language.names(m, "actuator").items() if m.actuator_gear[a].any()
     ]
-    out += _tied(m, "body", "mass", moving)
+    for quantity in ("kp", "kv", "gain", "force_limit"):
+        out += _tied(m, "actuator", quantity, drives, tie)
+    felt = _felt(m)
+    heavy = [n for n, b in language.names(m, "body").items() if felt[b]]
+    out += _tied(m, "body", "mass", heavy, tie)
     touching = [n for n, g in language.names(m, "geom").items() if not m.geom_bodyid[g]]
-    out += _tied(m, "geom", "friction", touching)
+    out += _tied(m, "geom", "friction", touching, tie)
     if not out:
         raise UserError(
             "nothing can vary in this model: give its joints, actuators and bodies "
@@ -70,45 +87,131 @@ def propose(m: mujoco.MjModel) -> list[Proposal]:
     return _with_own_names(out)
 
 
+def _felt(m: mujoco.MjModel) -> np.ndarray:
+    """Which bodies have a mass that a joint feels, ``(nbody,)`` bool."""
+    rng = np.random.default_rng(0)
+    poses = []
+    for _ in range(_POSES):
+        d = mujoco.MjData(m)
+        mujoco.mj_integratePos(m, d.qpos, rng.uniform(-1, 1, m.nv), 1.0)
+        mujoco.mj_forward(m, d)
+        poses.append(d)
+    out = np.zeros(m.nbody, bool)
+    inertia, weight = _loads(m, poses)
+    for b in np.flatnonzero((m.body_weldid > 0) & (m.body_mass > 0)):
+        lighter = copy.copy(m)
+        lighter.body_mass[b] = lighter.body_inertia[b] = 0.0
+        rest = _loads(lighter, poses)
+        lost = np.abs(weight - rest[1])
+        heavy = lost > _FELT * np.maximum(np.abs(weight).max(0), inertia)
+        out[b] = bool(heavy.any() or (inertia - rest[0] > _FELT * inertia).any())
+    return out
+
+
+def _loads(
+    m: mujoco.MjModel, poses: Sequence[mujoco.MjData]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Inertia and weight on each degree of freedom, ``(poses, nv)`` both."""
+    inertia, weight = [], []
+    for d in poses:
+        d.qvel[:] = 0.0
+        mujoco.mj_forward(m, d)
+        full = np.zeros((m.nv, m.nv))
+        mujoco.mj_fullM(m, d, full)
+        inertia.append(np.diagonal(full).copy())
+        weight.append(d.qfrc_bias.copy())
+    return np.array(inertia), np.array(weight)
+
+
 def space_of(proposals: list[Proposal]) -> ParameterSpace:
     """The proposed parameters as a space."""
     return ParameterSpace(tuple(p.parameter for p in proposals))
 
 
 def _tied(
-    m: mujoco.MjModel, kind: str, quantity: str, names: list[str]
+    m: mujoco.MjModel, kind: str, quantity: str, names: list[str], tie: bool
 ) -> list[Proposal]:
     """One proposal for every group of places that look alike."""
-    values: dict[str, tuple[float, str]] = {}
+    objects = language.names(m, kind)
+    traits: dict[str, tuple[Any, ...]] = {}
     for name in names:
         address = (f"{kind}.{name}.{quantity}",)
         try:
             unit, _ = language.describe(m, address)
-            values[name] = (language.nominal(m, address), unit)
+            traits[name] = (
+                language.nominal(m, address),
+                unit,
+                *_look(m, kind, objects[name]),
+            )
         except UserError:  # cannot vary here, or the model states no value
             continue
-    every = list(language.names(m, kind))
-    out, left = [], dict(values)
-    for name in values:
+    every = list(objects)
+    out, left = [], dict(traits)
+    for name in traits:
         if name not in left:
             continue
-        pattern = _pattern(name, left, every)
-        for member in fnmatch.filter(left, pattern):
+        pattern = _pattern(name, left, every) if tie else name
+        members = language.matching(pattern, left)
+        for member in members:
             del left[member]
-        made = _proposal(m, kind, quantity, pattern, name, *values[name])
+        value, unit = traits[name][:2]
+        made = _proposal(m, kind, quantity, pattern, name, value, unit)
         if made is not None:
-            out.append(made)
+            tied = tuple(members) if len(members) > 1 else ()
+            out.append(replace(made, tied=tied))
     return out
 
 
-def _pattern(name: str, values: dict[str, tuple[float, str]], every: list[str]) -> str:
-    """The pattern that ties most places of one value to ``name``, or ``name``."""
+def _look(m: mujoco.MjModel, kind: str, i: int) -> tuple[Any, ...]:
+    """What places must have in common to be tied.
+
+    Depth in the tree is part of it: joints of one serial chain differ in load and
+    gear, whatever their names and values are. Mirrored ranges are alike.
+    """
+    if kind == "joint":
+        return int(m.jnt_type[i]), _depth(m, i), _mirrored(m.jnt_range[i])
+    if kind == "actuator":
+        way, at = int(m.actuator_trntype[i]), int(m.actuator_trnid[i, 0])
+        look = (
+            way,
+            _mirrored(m.actuator_ctrlrange[i]),
+            _mirrored(m.actuator_forcerange[i]),
+            abs(float(m.actuator_gear[i, 0])),
+        )
+        return (*look, *(_look(m, "joint", at) if way in _AT_JOINTS else ()))
+    if kind == "body":
+        return (_body_depth(m, i), *np.round(m.body_inertia[i], _INERTIA_DECIMALS))
+    return ()
+
+
+def _mirrored(ends: np.ndarray) -> tuple[float, ...]:
+    """A range ``(2,)`` so that it equals that of its mirror image."""
+    return tuple(sorted(np.abs(ends).tolist()))
+
+
+def _depth(m: mujoco.MjModel, joint: int) -> int:
+    """Joints on the way from the world to a joint."""
+    b = int(m.jnt_bodyid[joint])
+    return _body_depth(m, int(m.body_parentid[b])) + joint - int(m.body_jntadr[b])
+
+
+def _body_depth(m: mujoco.MjModel, body: int) -> int:
+    """Joints on the way from the world to a body."""
+    count = 0
+    while body:
+        count += int(m.body_jntnum[body])
+        body = int(m.body_parentid[body])
+    return count
+
+
+def _pattern(name: str, traits: dict[str, tuple[Any, ...]], every: list[str]) -> str:
+    """The pattern that ties most places that are like ``name``, or ``name``."""
     best, size = name, 1
     tries = [re.sub(head, "*_", name) for head in (r"^[^_]+_", r"^.*_")]
     tries += [re.sub(tail, "", name) + "*" for tail in (r"[^_]+$", r"\d+$")]
-    for pattern in (t for t in tries if t != "*"):
-        members = fnmatch.filter(every, pattern)
-        alike = all(m in values and values[m] == values[name] for m in members)
+    for pattern in (t for t in tries if t.strip("*_")):
+        members = language.matching(pattern, every)
+        alike = all(m in traits and traits[m] == traits[name] for m in members)
         if alike and len(members) > size:
             best, size = pattern, len(members)
     return best
@@ -123,22 +226,42 @@ def _proposal(
     value: float,
     unit: str,
 ) -> Proposal | None:
+    """None where no range can be given that physics allows."""
     address = f"{kind}.{pattern}.{quantity}"
     stem = re.sub(r"[*_]+$|^[*_]+", "", pattern) or kind
     name = re.sub(r"\W", "_", f"{stem}_{quantity}")
+    _, (least, most) = language.describe(m, (address,))
+    note = ""
     if value != 0:
-        p = declare(m, name, address)
-        low = 0.0 if quantity in _SHARES else value / _FACTOR
-        bounds = (low, _FACTOR * value) if value > 0 else p.bounds
-        return Proposal(replace(p, bounds=bounds))
-    if quantity not in _SHARES:
+        initial = _ordered(value / 3, 3 * value)
+        bounds = _ordered(value / _FACTOR, _FACTOR * value)
+        if value < 0:
+            bounds = least, most
+        elif quantity in _SHARES:
+            bounds = 0.0, bounds[1]
+    elif quantity in _SHARES:
+        scale = _scale(m, m.joint(example).id, quantity)
+        initial = _ordered(*(s * scale for s in _SHARES[quantity]))
+        bounds, note = (0.0, _FACTOR * initial[1]), "the model has none"
+    else:
         return None
-    scale = _scale(m, m.joint(example).id, quantity)
-    low, high = (s * scale for s in _SHARES[quantity])
-    p = declare(
-        m, name, address, initial=(low, high), bounds=(0.0, _FACTOR * high), unit=unit
-    )
-    return Proposal(p, "the model has none")
+    bounds = _inside(bounds, (least, most))
+    initial = _inside(initial, bounds)
+    try:
+        parameter = declare(m, name, address, initial=initial, bounds=bounds, unit=unit)
+    except UserError:  # its own value is beyond what physics allows
+        return None
+    return Proposal(parameter, note)
+
+
+def _ordered(a: float, b: float) -> Range:
+    return min(a, b), max(a, b)
+
+
+def _inside(ends: Range, outer: Range) -> Range:
+    """A range with few digits that lies within another."""
+    low, high = (float(f"{x:.{_DIGITS}g}") for x in ends)
+    return max(low, outer[0]), min(high, outer[1])
 
 
 def _scale(m: mujoco.MjModel, joint: int, quantity: str) -> float:
@@ -197,8 +320,10 @@ def as_text(proposals: list[Proposal], head: list[str], notes: dict[str, str]) -
     for p in proposals:
         q = p.parameter
         remarks = "; ".join(x for x in (p.note, notes.get(q.name, "")) if x)
+        lines += [f"  - name: {q.name}" + (f"  # {remarks}" if remarks else "")]
+        if p.tied:
+            lines += [f"    # one value for {', '.join(p.tied)}"]
         lines += [
-            f"  - name: {q.name}" + (f"  # {remarks}" if remarks else ""),
             f'    address: "{q.addresses[0]}"',
             f"    initial: [{_number(q.initial[0])}, {_number(q.initial[1])}]",
             f"    bounds: [{_number(q.bounds[0])}, {_number(q.bounds[1])}]",
@@ -208,11 +333,12 @@ def as_text(proposals: list[Proposal], head: list[str], notes: dict[str, str]) -
 
 
 def _number(x: float) -> str:
-    """Short, and a number to every YAML reader."""
+    """All digits, and a number to every YAML reader."""
     if np.isinf(x):
         return ".inf" if x > 0 else "-.inf"
-    text = f"{x:.4g}"
-    return text if "e" not in text else f"{x:.12f}".rstrip("0")
+    text = repr(float(x))
+    mantissa, e, power = text.partition("e")
+    return text if not e or "." in mantissa else f"{mantissa}.0e{power}"
 
 
 def own_space(m: mujoco.MjModel) -> ParameterSpace:

@@ -83,3 +83,54 @@ def test_a_file_is_not_replaced_unasked(
         call("--model", EXAMPLE / "model.xml", "--out", out)
     assert stop.value.code == 2 and "--overwrite" in capsys.readouterr().err
     assert out.read_text() == "mine"
+
+
+REFUSED = {
+    "dcmotor": (
+        '<dcmotor joint="swing" motorconst="0.1" resistance="1"/>',
+        "dcmotor actuators, which MJX does not simulate: write them as <motor>",
+    ),
+    "delay": (
+        '<position joint="swing" kp="3" delay="0.01" nsample="6"/>',
+        "effect.delay.ACTUATOR",
+    ),
+    "pid": ('<pid joint="swing" kp="2"/>', "mjGAIN_PID"),
+    "no xml": ("<motor joint='swing' <", "MuJoCo cannot read this model"),
+    "no such joint": ('<motor joint="swin"/>', "MuJoCo cannot read this model"),
+    "no mesh": (
+        '</actuator><asset><mesh name="m" file="gone.stl"/></asset><actuator>',
+        "gone.stl",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_a_model_that_no_command_can_use(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One line with what to do, and no file."""
+    drive, message = REFUSED[kind]
+    path, out = tmp_path / "robot.xml", tmp_path / "p.yaml"
+    tail = f"<actuator>{drive}</actuator></mujoco>"
+    path.write_text(BARE.replace("</mujoco>", tail))
+    with pytest.raises(SystemExit) as stop:
+        call("--model", path, "--out", out)
+    told = capsys.readouterr().err
+    assert stop.value.code == 2 and message in told
+    assert told.count("\n") == 1 and "Traceback" not in told
+    assert not out.exists()
+
+
+def test_what_is_tied_is_shown_and_can_be_parted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "robot.xml"
+    asset = resources.files("envs") / "assets" / "go2.xml"
+    path.write_text(asset.read_text())
+    call("--model", path, "--out", tmp_path / "p.yaml")
+    assert "*_calf" in capsys.readouterr().out
+    text = (tmp_path / "p.yaml").read_text()
+    assert "# one value for FL_calf, FR_calf" in text and "--no-tie" in text
+    call("--model", path, "--out", tmp_path / "q.yaml", "--no-tie")
+    text = (tmp_path / "q.yaml").read_text()
+    assert "*" not in text and "body.FR_calf.mass" in text

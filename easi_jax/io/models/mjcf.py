@@ -12,6 +12,7 @@ import mujoco
 
 from easi_jax.errors import UserError
 from easi_jax.io.files import os_reason, regular_file
+from easi_jax.model.mjx_model import put_model
 
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
 _NESTED = ("include", "model")  # elements whose file is MJCF as well
@@ -241,12 +242,17 @@ def _character(reference: re.Match[str]) -> str:
 
 
 def read_machine(path: Path, allowed: Sequence[Path] = ()) -> mujoco.MjModel:
-    """`read_mjcf` of something that moves.
+    """`read_mjcf` of something that moves and that MJX can simulate.
 
     Raises:
-        UserError: as `read_mjcf`; or the model has no joint.
+        UserError: as `read_mjcf` and `easi_jax.model.mjx_model.put_model`; or the model
+            has no joint.
     """
     model = read_mjcf(path, allowed)
     if model.nv == 0:
         raise UserError(f"{path}: the model has no joint, so nothing can be identified")
+    try:
+        put_model(model, sensors=False)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from None
     return model
