@@ -43,7 +43,7 @@ from easi_jax.gap.whitening import (
 )
 from easi_jax.gap.window_set import join, reach, spread, window_set
 from easi_jax.io.runs.step_cache import key_of
-from easi_jax.model.joint_space import scalar_dofs
+from easi_jax.model.joint_space import is_hinge, scalar_dofs
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.progress import Progress, silent
 
@@ -158,7 +158,7 @@ class Analysis:
     def _cycles(self, j: int) -> list[float]:
         """Cycles per revolution that a ripple is looked for at."""
         span = float(self.scales.span[int(self.m.jnt_dofadr[j])])
-        slow = 1 if self.m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE else 2
+        slow = 1 if is_hinge(self.m, j) else 2
         return [slow * k * 2 * math.pi / span for k in _RIPPLES]
 
     @property

@@ -15,6 +15,7 @@ import numpy as np
 
 from easi_jax.data.recording import Run
 from easi_jax.data.windows import fitted_velocity
+from easi_jax.model.joint_space import joint_name
 
 _LONGEST = 0.1  # s
 _LATE = 0.003  # s; less is the velocity fit's own doing
@@ -63,7 +64,7 @@ class ReadingFault:
 
 def reading_faults(m: mujoco.MjModel, runs: Sequence[Run]) -> list[ReadingFault]:
     """What is wrong with the velocities and the named sensors of ``runs``."""
-    joints = {int(d): m.joint(j).name for j, d in enumerate(m.jnt_dofadr)}
+    joints = {int(d): joint_name(m, j) for j, d in enumerate(m.jnt_dofadr)}
     out = [
         _late(f"qvel.{joints[dof]}", lag.seconds, lag.std, lag.confidence)
         for dof, lag in velocity_lags(runs).items()

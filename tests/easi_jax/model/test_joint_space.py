@@ -75,6 +75,8 @@ def test_jax_gives_what_numpy_gives(model):
     with jax.enable_x64(True):
         tangent = space.difference(jnp.asarray(a), b)
         moved = space.integrate(a, tangent)
+        many = space.integrate(jnp.asarray(np.stack([a, b])), tangent)
+    np.testing.assert_allclose(many[0], moved, atol=1e-12)
     assert isinstance(tangent, jax.Array) and isinstance(moved, jax.Array)
     np.testing.assert_allclose(tangent, space.difference(a, b), atol=1e-12)
     back = space.integrate(a, np.asarray(tangent))
