@@ -112,8 +112,10 @@ def repeated_stamps(time: np.ndarray) -> np.ndarray:
     return rows if len(rows) <= few else rows[:0]
 
 
-def rate(path: Path, dt: float, timestep: float) -> str:
+def rate(path: Path, dt: float, timestep: float, counts: bool = False) -> str:
     """Compares the control step ``dt`` with the model's ``timestep``, both s.
+
+    ``counts``: whether the times go up by ones, as numbers of rows do.
 
     Returns:
         A note where they are oddly far apart, else ``""``.
@@ -135,6 +137,11 @@ def rate(path: Path, dt: float, timestep: float) -> str:
         _CLOCKS[0],
     )
     hint = f"if time is in {unit} and not in seconds, {scaled('time', factor)}"
+    if counts:
+        hint = (
+            f"if time counts rows of {timestep:.6g} s, {scaled('time', timestep)}, and "
+            "so for another step"
+        )
     if not _FEWEST_STEPS <= ratio <= _MOST_STEPS:
         raise UserError(f"{path}: wrong rate, {text}; {hint}")
     if ratio > _MANY_STEPS:

@@ -291,7 +291,9 @@ class _Reader:
             )
         # nine digits: equal rates stay equal under the rounding of time stamps
         dt = float(f"{np.median(gaps):.9g}")
-        rate_note = log_checks.rate(self.path, dt, self.model.opt.timestep)
+        rate_note = log_checks.rate(
+            self.path, dt, self.model.opt.timestep, bool(np.all(gaps == 1))
+        )
         if rate_note:
             self.note(rate_note)
         # a piece ends before every row that cannot follow the one before it

@@ -387,6 +387,19 @@ def test_clocks_of_other_units(tmp_path, cart, factor, unit, line, start):
     assert len(run) == ROWS
 
 
+@pytest.mark.parametrize("timestep", [0.01, 0.001])
+def test_a_time_that_counts_the_rows(tmp_path, timestep):
+    """Told where it may be seconds, refused where it cannot be."""
+    model = mujoco.MjModel.from_xml_string(CART)
+    model.opt.timestep = timestep
+    path = save(tmp_path / "a.csv", cart_columns() | {"time": np.arange(ROWS)})
+    line = f"'scale: {{time: {timestep}}}' in a mapping file"
+    if timestep < 0.002:
+        assert line in failure(path, model)
+    else:
+        assert line in said(read_logs(path, model), "counts rows")
+
+
 def test_times_that_no_clock_shows(tmp_path, cart):
     columns = cart_columns()
     columns["time"][7] = 1e154
