@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.errors import UserError
+from easi_jax.io.models.mjcf import mujoco_warnings
 from easi_jax.io.models.repaired_mjcf import Repaired, repaired_model
 from easi_jax.model.found_effects import EffectEntry
 from easi_jax.simulation.mujoco_c import InMujoco
@@ -32,7 +33,8 @@ def identified_model(
         UserError: ``source`` is another model than the machine's, or MuJoCo cannot
             write it.
     """
-    read = mujoco.MjModel.from_xml_path(str(source))
+    with mujoco_warnings():
+        read = mujoco.MjModel.from_xml_path(str(source))
     if _sizes(read) != _sizes(simulator.mj_model):
         raise UserError(f"{source} is not the model that these parameters are of")
     write = InMujoco(simulator)

@@ -276,7 +276,9 @@ def _scale(m: mujoco.MjModel, joint: int, quantity: str) -> float:
     if kind == "hinge":
         arm = np.linalg.norm(d.subtree_com[body] - d.xanchor[joint])
         weight *= max(float(arm), _SHORTEST)
-    force = max([weight, *_drives(m, joint)])
+    # What brings it to a brisk speed within a second counts where nothing weighs on it.
+    push = _SPEED[kind] * float(m.dof_M0[m.jnt_dofadr[joint]])
+    force = max([weight, push, *_drives(m, joint)])
     return force / _SPEED[kind] if quantity == "damping" else force
 
 

@@ -139,3 +139,14 @@ def test_what_moves_nothing_is_left_out() -> None:
     assert "body.arm.mass" in found
     assert not {"body.base.mass", "body.mast.mass"} & {*found}
     assert not [a for a in addresses(MODELS["negative gain"]) if "idle" in a]
+
+
+def test_ranges_follow_the_inertia_where_nothing_weighs() -> None:
+    """A rotor that carries a milligram."""
+    m = mujoco.MjModel.from_xml_string(MODELS["tiny body"])
+    found = {p.parameter.name: p.parameter for p in propose(m)}
+    for quantity in ("damping", "frictionloss"):
+        # Torque at 10 rad/s against what turns the rotor to that speed in a second.
+        low, high = found[f"k_{quantity}"].initial
+        speed = 10 if quantity == "damping" else 1
+        assert low * speed < 0.01 * 0.1 < 0.5 * high * speed < 0.1

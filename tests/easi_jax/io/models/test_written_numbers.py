@@ -36,6 +36,7 @@ def one(
 <actuator>{drive}</actuator>{tail}</mujoco>"""
 
 
+ROOT = Path(__file__).parents[4]
 KINDS = {
     "plain": one(),
     "fullinertia": one(
@@ -117,7 +118,7 @@ def moved(m: mujoco.MjModel) -> None:
     """Other masses, gains and friction, as a search leaves them."""
     m.body_mass[1] *= 1.2345678901
     m.body_inertia[1] *= 1.2345678901
-    m.body_ipos[2, 0] += 0.0123456789
+    m.body_ipos[-1, 0] += 0.0123456789
     m.dof_armature[-1] += 0.0212345678
     m.dof_damping[-1] = 0.3123456789
     m.dof_frictionloss[-1] = 0.1123456789
@@ -133,6 +134,24 @@ def moved(m: mujoco.MjModel) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_identified_numbers(kind: str, file: Callable[[str], Path]) -> None:
     path = file(KINDS[kind])
+    want = mujoco.MjModel.from_xml_path(str(path))
+    moved(want)
+    got = repaired_model(path, [], want)
+    assert got.left == []
+    same(mujoco.MjModel.from_xml_string(got.xml), want)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("fullinertia", "dampratio", "inertiafromgeom", "settotalmass"),
+        *("inheritrange", "timeconst"),
+    ],
+)
+def test_models_as_people_have_them(name: str) -> None:
+    path = ROOT.parent / "shared" / "cases" / "model_xml" / f"{name}.xml"
+    if not path.exists():
+        pytest.skip("../shared/cases is not here")
     want = mujoco.MjModel.from_xml_path(str(path))
     moved(want)
     got = repaired_model(path, [], want)
