@@ -3,8 +3,18 @@
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
+if TYPE_CHECKING:
+    import mujoco
+    import numpy as np
+
+    from easi_jax.excite.play import Bench
+    from easi_jax.model.effect_catalog import Scales
+    from easi_jax.model.parameters import ParameterSpace
+    from train._excite_config import Config
+
+Strengths = Mapping[str, Mapping[str, float]]  # by effect, then by column
 _NOISE = 1e-3  # rad, m
 _TRAVEL = {2: 0.5, 3: math.pi}  # m for slides, rad for hinges
 _RATE = 100.0  # Hz
@@ -28,18 +38,18 @@ class ExciteProblem:
     """
 
     name: str
-    mj_model: Any
-    space: Any
-    bench: Any
-    most: Any
-    noise: Any
-    scales: Any
+    mj_model: "mujoco.MjModel"
+    space: "ParameterSpace"
+    bench: "Bench"
+    most: "np.ndarray"
+    noise: "np.ndarray"
+    scales: "Scales | None"
     pairs: list[tuple[str, str]]
-    strengths: Mapping[str, Mapping[str, float]]
+    strengths: Strengths
     notes: list[str]
 
 
-def read_excite_problem(config: Any) -> ExciteProblem:
+def read_excite_problem(config: "Config") -> ExciteProblem:
     """Reads and checks everything; nothing is written yet.
 
     Raises:
@@ -123,7 +133,7 @@ def read_excite_problem(config: Any) -> ExciteProblem:
     )
 
 
-def _check_numbers(config: Any, lead: float) -> None:
+def _check_numbers(config: "Config", lead: float) -> None:
     from easi_jax.errors import UserError
 
     least = 2 * lead + max(2.0, 4 * config.horizon)
@@ -142,7 +152,7 @@ def _check_numbers(config: Any, lead: float) -> None:
         raise UserError(f"--seed is {config.seed}: give a whole number from 0 up")
 
 
-def _check_out(config: Any) -> None:
+def _check_out(config: "Config") -> None:
     """Refuses to touch a file before minutes of work, not after."""
     from easi_jax.errors import UserError
 
@@ -162,8 +172,8 @@ def _check_out(config: Any) -> None:
 
 
 def _numbers(
-    option: str, given: Sequence[str], index: Mapping[str, int], default: Any
-) -> Any:
+    option: str, given: Sequence[str], index: Mapping[str, int], default: "np.ndarray"
+) -> "np.ndarray":
     """Values of ``1.5`` (for all) and ``NAME=1.5`` over defaults ``(n,)``.
 
     Raises:
@@ -194,7 +204,9 @@ def _numbers(
     return out
 
 
-def _from_data(config: Any, m: Any, notes: list[str]) -> tuple[Any, Any, Any]:
+def _from_data(
+    config: "Config", m: "mujoco.MjModel", notes: list[str]
+) -> "tuple[float | None, np.ndarray, Scales | None]":
     """Control step, noise ``(nv,)`` and scales of earlier logs."""
     import numpy as np
 
@@ -213,7 +225,9 @@ def _from_data(config: Any, m: Any, notes: list[str]) -> tuple[Any, Any, Any]:
     return runs[0].dt, noise, scales_of(m, runs)
 
 
-def _from_gap(config: Any, notes: list[str]) -> tuple[list[Any], Any]:
+def _from_gap(
+    config: "Config", notes: list[str]
+) -> tuple[list[tuple[str, str]], Strengths]:
     """What a result of train.gap leaves open, with the strengths that it found."""
     if config.gap is None:
         return [], {}

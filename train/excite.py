@@ -1,86 +1,19 @@
 """``python -m train.excite``: which commands would show what the model lacks?"""
 
-import dataclasses
-from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING
 
 from train._command import main, say
+from train._excite_config import Config
 
-
-@dataclasses.dataclass(frozen=True)
-class Config:
-    """Writes commands to play on the machine, so that its log says the most.
-
-    Multisines, chirps, pulses and steps of several sizes are simulated in the model,
-    and in the model with mass and friction 20 % wrong either way, and scaled down
-    until every joint stays inside its range less a margin, every command inside its
-    ctrlrange and every force inside its forcerange. Each test is then judged by how
-    far apart its data would set the effects that train.gap knows, in units of sensor
-    noise, with the model's own parameters refitted. The best is written to
-    commands.csv, with the positions that the model predicts: look at them before you
-    play it. excite.json holds the limits, what was tried and what to expect.
-
-    What is assumed: that the machine starts at rest in the pose of the first row, that
-    nothing stands in its way (only joints are checked, not collisions), and that it
-    is no farther from the model than the 20 %. Stay at the emergency stop.
-
-    Motors that cannot hold the machine still by constant commands (an arm against
-    gravity) get a test to be added to your own controller: its columns are then
-    called feedforward.ACTUATOR, not ctrl.ACTUATOR. Log what is sent in all.
-    """
-
-    model: str = ""
-    """MuJoCo model (MJCF), or the name of a built-in robot."""
-    allow_assets: tuple[Path, ...] = ()
-    """Files, or folders with all below them, that the model may read besides those in
-    its own folder (meshes, textures, includes)."""
-    out: Path = Path("results/excite")
-    """Folder for commands.csv and excite.json; or a file NAME.csv, with NAME.json
-    beside it."""
-    duration: float = 20.0
-    """Length [s], 1 s of rest at either end included."""
-    rate: float | None = None
-    """Rows per second; not given: that of --data, of the built-in robot, or 100."""
-    gap: Path | None = None
-    """Results of train.gap for this model: only what those data could not tell apart
-    counts."""
-    effects: tuple[str, ...] = ()
-    """Only these effects count, such as coulomb_friction; not given: all."""
-    data: tuple[Path, ...] = ()
-    """Earlier logs; sensor noise, control rate and the size of effects come from
-    them."""
-    noise: tuple[str, ...] = ()
-    """Sensor noise [rad, m], as 0.001 for all joints or JOINT=0.001; not given: that
-    of --data, or 0.001."""
-    horizon: float = 0.2
-    """Length of the predictions that train.gap will make [s]."""
-    margin: float = 0.05
-    """Share of a joint's range that is left free at both ends."""
-    travel: tuple[str, ...] = ()
-    """How far a driven joint without a range may go from its start [rad, m], as 1.5
-    or JOINT=1.5; not given: 3.14 rad, 0.5 m."""
-    max_speed: tuple[str, ...] = ()
-    """Largest speed [rad/s, m/s], as 2 for all joints or JOINT=2; not given: none."""
-    amplitude: tuple[str, ...] = ()
-    """Largest change of a command, in its own units, as 0.5 or ACTUATOR=0.5; not
-    given: what the limits leave."""
-    play: Literal["auto", "open-loop", "feed-forward"] = "auto"
-    """Whether the commands are all that is sent, or are added to your controller's;
-    auto: the first where the model then stays put."""
-    parameters: Path | None = None
-    """What train.gap may refit in the model; not given: as there."""
-    mapping: Path | None = None
-    """Mapping file (YAML) for --data with foreign column names."""
-    seed: int = 0
-    """Of the random parts; the same seed gives the same commands."""
-    overwrite: bool = False
-    """Replace earlier results in --out."""
+if TYPE_CHECKING:
+    from easi_jax.excite.candidates import Test
+    from train._excite_problem import ExciteProblem
 
 
 def run(config: Config) -> None:
     """Reads and checks, simulates, chooses, writes."""
     from train._excite_problem import read_excite_problem
-    from train._excite_results import results, show, write_results
+    from train._excite_results import show, write_results
     from train._robots import check_seeds
 
     check_seeds((config.seed,))
@@ -89,6 +22,7 @@ def run(config: Config) -> None:
         say(f"note: {note}")
     tests = _tests(config, problem)
     from easi_jax.excite.choose import choose
+    from easi_jax.excite.result import excite_result
 
     choice = choose(
         problem.mj_model,
@@ -102,13 +36,23 @@ def run(config: Config) -> None:
         problem.scales,
         tell=say,
     )
-    content = results(config, problem, tests, choice)
-    show(content)
-    written = write_results(config, problem, tests[choice.best], content)
+    result = excite_result(
+        problem.bench,
+        tests,
+        choice,
+        model=problem.name,
+        noise=problem.noise,
+        horizon=config.horizon,
+        margin=config.margin,
+        duration=config.duration,
+        notes=problem.notes,
+    )
+    show(result)
+    written = write_results(config, problem.bench, tests[choice.best], result)
     say(f"commands: {written}")
 
 
-def _tests(config: Config, problem: Any) -> list[Any]:
+def _tests(config: Config, problem: "ExciteProblem") -> "list[Test]":
     from easi_jax.errors import UserError
     from easi_jax.excite.candidates import make_tests, recipes
 

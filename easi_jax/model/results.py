@@ -350,3 +350,168 @@ class HeldOutErrors:
     def best(self) -> int:
         """Place of the seed that fits its own data best."""
         return int(np.argmin(self.fit))
+
+
+# -- what to record ----------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A test.
+
+    Attributes:
+        what: in words.
+        kind: of signal; ``band`` [Hz]; ``level``, share of the largest safe amplitude.
+        amplitude, hold: of each actuator, in units of its command.
+        start: position of each joint.
+        seed: of its random parts.
+        duration: [s].
+        rate: rows per second.
+    """
+
+    what: str
+    kind: str
+    band: tuple[float, float]
+    level: float
+    amplitude: Mapping[str, float]
+    hold: Mapping[str, float]
+    start: Mapping[str, float]
+    seed: int
+    duration: float
+    rate: float
+
+
+@dataclass(frozen=True)
+class Controller:
+    """That a feed-forward test was simulated with; gains by actuator."""
+
+    assumed: str
+    kp: Mapping[str, float]
+    kd: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class JointUse:
+    """What a joint may do, and does: in the model and in the wrong ones, or
+    (``model_reaches``) in the model alone. ``range`` is the model's; None without."""
+
+    allowed: tuple[float, float]
+    reached: tuple[float, float]
+    model_reaches: tuple[float, float]
+    range: tuple[float, float] | None
+    speed_allowed: float
+    speed_reached: float
+
+
+@dataclass(frozen=True)
+class ActuatorUse:
+    """What an actuator may do, and does, in all models."""
+
+    ctrl_allowed: tuple[float, float]
+    ctrl_reached: tuple[float, float]
+    force_allowed: float
+    force_reached: float
+
+
+@dataclass(frozen=True)
+class NumberSeen:
+    """A number of an effect at its size, and how well the test would tell it."""
+
+    name: str
+    unit: str
+    size: float
+    std: float
+    std_per_size: float
+
+
+@dataclass(frozen=True)
+class EffectSeen:
+    """What a test says of an effect: distances from nothing (``visible``) and from its
+    nearest rival (``apart``), in units of noise."""
+
+    visible: float
+    nearest: str | None
+    apart: float
+    numbers: tuple[NumberSeen, ...]
+
+
+@dataclass(frozen=True)
+class PairSeen:
+    """How far an effect is from its rival, in units of noise and of `visible`."""
+
+    effect: str
+    rival: str
+    apart: float
+    of_visible: float
+
+
+@dataclass(frozen=True)
+class PairWanted:
+    """A pair that was to be told apart: by this test, and by the best of all."""
+
+    effect: str
+    rival: str
+    apart: float
+    best_of_all: float
+    no_test_can: bool
+
+
+@dataclass(frozen=True)
+class Alias:
+    """An effect that no test tells from another: its twin, or a case of it."""
+
+    effect: str
+    rival: str
+    twins: bool
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A test that was tried."""
+
+    what: str
+    amplitude: Mapping[str, float]
+    score: float
+
+
+@dataclass(frozen=True)
+class ExciteResult:
+    """What ``train.excite`` chose, and what it promises.
+
+    Attributes:
+        model: name.
+        signal: the test that was chosen, of ``score``.
+        controller: of feed-forward tests; None where commands are all that is sent.
+        margin: share of a joint's range that is left free at both ends.
+        joints, actuators: limits and what is reached.
+        noise: of each joint's position.
+        horizon: of the predictions that train.gap will make [s].
+        effects: what the test says of each.
+        worst_pairs: that it tells apart worst.
+        told_apart: pairs that were asked for.
+        no_trace: effects that show in no test.
+        twins: names that no test tells apart.
+        tried: tests, the best first.
+        windows, changes: windows of each test and changes of the model that were
+            simulated.
+        notes: what the user should know.
+    """
+
+    model: str
+    signal: Signal
+    controller: Controller | None
+    margin: float
+    joints: Mapping[str, JointUse]
+    actuators: Mapping[str, ActuatorUse]
+    score: float
+    noise: Mapping[str, float]
+    horizon: float
+    effects: Mapping[str, EffectSeen]
+    worst_pairs: tuple[PairSeen, ...]
+    told_apart: tuple[PairWanted, ...]
+    no_trace: tuple[str, ...]
+    twins: tuple[Alias, ...]
+    tried: tuple[Tried, ...]
+    windows: int
+    changes: int
+    notes: tuple[str, ...]
