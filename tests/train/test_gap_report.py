@@ -58,7 +58,7 @@ def test_an_effect_with_which_the_error_rises_is_marked() -> None:
     assert "on held-out data rises, from 1 to 1.5 times the sensor noise" in second
     changes = [row[4] for row in effect_rows(found, "; ", "none")]
     assert changes == ["0.2 to 0.1", "0.1 to 0.15, rises"]
-    assert "+ armature@hinge (rises)" in steps_picture(found).svg
+    assert "+ armature@hinge (rises)" in str(steps_picture(found).svg)
     assert "the held-out gap rises is marked" in render(gap_report(found))
     assert "rises" not in render(gap_report(result()))
 
