@@ -19,18 +19,20 @@ from easi_jax.data.recording import Log
 from easi_jax.devices.runtime import fast_loops, quick_compile
 from easi_jax.errors import UserError
 from easi_jax.estimation.from_runs import (
+    held_out_errors,
     ready_errors,
     ready_finish,
     replayed,
     search_data,
 )
-from easi_jax.estimation.identifiability import identifiability
+from easi_jax.estimation.identifiability import seed_result
 from easi_jax.estimation.problem import HORIZON, Problem, checked_horizon, problem_of
-from easi_jax.export.mjcf import identified_model
+from easi_jax.export.mjcf import written_machine
 from easi_jax.export.policy import Interface, interface_of, policy_files
 from easi_jax.gap.analysis import Analysis
 from easi_jax.gap.excitation_coverage import coverage_notes
-from easi_jax.gap.result import Outcome
+from easi_jax.gap.sensor_faults import reading_faults
+from easi_jax.gap.summary import gap_result
 from easi_jax.io.files import atomic_write
 from easi_jax.io.logs.reader import read_logs
 from easi_jax.io.models.mjcf import read_machine
@@ -38,8 +40,10 @@ from easi_jax.io.models.parameter_file import read_parameter_file
 from easi_jax.model import distribution
 from easi_jax.model.checks import checked_array
 from easi_jax.model.distribution import Distribution
+from easi_jax.model.found_effects import FoundEffects
 from easi_jax.model.parameter_proposal import own_space
 from easi_jax.model.parameters import ParameterSpace
+from easi_jax.model.results import Flag, GapResult, HeldOutErrors
 from easi_jax.pipeline.stages import seed_keys
 from easi_jax.rl.networks import PolicyParams, act
 from easi_jax.rl.presets import training_preset
@@ -128,53 +132,46 @@ class Estimated:
 
     Attributes:
         names, units: of the parameters, ``n`` each.
-        mean, std: SI units, ``(n,)``; where ``determined`` is False, hardly more than
-            where the search started.
-        determined: whether the data fix a parameter by itself, ``(n,)`` bool.
-        joints: names of the degrees of freedom, ``nv``.
-        before, after, floor: RMS error of open-loop predictions over ``horizon`` on
-            held-out data [m, rad], ``(nv,)``: of the model as given, of the estimate,
-            and what a perfect model would have.
-        horizon: of the predictions [s].
-        held_out: which data these are.
+        mean, std: SI units, ``(n,)``; where a flag is not ``determined``, hardly more
+            than where the search started.
+        flags: ``determined``, ``not determined`` or ``at bound``, ``n``.
+        undetermined: combinations that the logs leave open, a sentence each.
+        held_out: errors of predictions on data that no fit saw.
         notes: on data and fit, one line each.
         space: the parameters, ``distribution`` in its unit coordinates.
         distribution: that policies are trained under.
-        simulator: the machine.
+        simulator: the machine; ``effects``: those that it was given.
     """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     mean: np.ndarray
     std: np.ndarray
-    determined: np.ndarray
-    joints: tuple[str, ...]
-    before: np.ndarray
-    after: np.ndarray
-    floor: np.ndarray
-    horizon: float
-    held_out: str
+    flags: tuple[Flag, ...]
+    undetermined: tuple[str, ...]
+    held_out: HeldOutErrors
     notes: tuple[str, ...]
     space: ParameterSpace
     distribution: Distribution
     simulator: Simulator
+    effects: FoundEffects
 
     def __str__(self) -> str:
         """A line for each parameter, and one for each joint's held-out error."""
-        width = max(map(len, (*self.names, *self.joints)))
+        e = self.held_out
+        width = max(map(len, (*self.names, *e.channels)))
         lines = [
             f"{name:{width}}  {mean:.4g} ± {std:.2g} {unit}".rstrip()
-            + ("" if known else "  (not determined)")
-            for name, mean, std, unit, known in zip(
-                *(self.names, self.mean, self.std, self.units, self.determined),
-                strict=True,
+            + (f"  ({flag})" if flag != "determined" else "")
+            for name, mean, std, unit, flag in zip(
+                *(self.names, self.mean, self.std, self.units, self.flags), strict=True
             )
         ]
         lines += [
-            f"{name:{width}}  error over {self.horizon:.3g} s: {old:.3g} as given, "
-            f"{new:.3g} identified, {floor:.3g} noise floor"
-            for name, old, new, floor in zip(
-                self.joints, self.before, self.after, self.floor, strict=True
+            f"{name:{width}}  error over {e.horizon:.3g} s: {old:.3g} as given, "
+            f"{new:.3g} identified, {floor:.3g} noise floor [{unit}]"
+            for name, unit, old, new, floor in zip(
+                *(e.channels, e.units, e.before, e.after[0], e.floor[0]), strict=True
             )
         ]
         return "\n".join(lines)
@@ -186,6 +183,7 @@ def search_parameters(
     log: Log,
     *,
     held_out: Log | None = None,
+    effects: FoundEffects | None = None,
     generations: int | None = None,
     population: int | None = None,
     settings: str = "default",
@@ -200,6 +198,8 @@ def search_parameters(
         parameters: what may vary in it.
         log: measured motion.
         held_out: kept out of the search; None: part of ``log`` is.
+        effects: that the model gets (``find_effects(...).found``); their numbers join
+            ``parameters``.
         generations, population: of the search; those of ``settings`` where None.
         settings: ``default``, or ``paper`` (the reference's recipe but for its
             controller, which logs come without).
@@ -212,7 +212,7 @@ def search_parameters(
         UserError: what is wrong with the data or the options; no simulation of a
             generation stayed finite.
     """
-    problem = _problem(model, parameters, log, held_out, noise, horizon)
+    problem = _problem(model, parameters, log, held_out, effects, noise, horizon)
     return _searched(problem, generations, population, settings, seed)[1]
 
 
@@ -222,6 +222,7 @@ def estimate_parameters(
     log: Log,
     *,
     held_out: Log | None = None,
+    effects: FoundEffects | None = None,
     start: Searched | None = None,
     generations: int | None = None,
     population: int | None = None,
@@ -239,6 +240,7 @@ def estimate_parameters(
         parameters: what may vary in it.
         log: measured motion.
         held_out: kept out of the fit, to test it on; None: part of ``log`` is.
+        effects: as in `search_parameters`.
         start: of `search_parameters`; None: it is called first, with ``generations``,
             ``population``, ``settings`` and ``seed``.
         noise, horizon: as in `search_parameters`.
@@ -249,7 +251,7 @@ def estimate_parameters(
     Raises:
         UserError: as `search_parameters`; ``start`` is of other parameters.
     """
-    problem = _problem(model, parameters, log, held_out, noise, horizon)
+    problem = _problem(model, parameters, log, held_out, effects, noise, horizon)
     if start is None:
         search, start = _searched(problem, generations, population, settings, seed)
     else:
@@ -265,31 +267,23 @@ def estimate_parameters(
     (found,) = estimates
     space, unit = search.space, found.distribution.mean
     root = np.asarray(found.distribution.factor, float)
-    std = np.sqrt((root**2).sum(1))
     if not (np.isfinite(unit).all() and np.isfinite(root).all()):
         raise UserError("the fit is not finite: try another seed, or fewer parameters")
-    low, mean, high = (np.asarray(space.to_si(unit + k * std)) for k in (-1, 0, 1))
+    result = seed_result(space, unit, root @ root.T, found.hessian)
     errors = ready_errors(problem, space)
-    before, _, _ = errors(jnp.asarray(space.nominal, jnp.result_type(float)))
-    after, _, floor = errors(space.to_si(unit))
-    simulator = problem.simulator
-    positions = simulator.state_names[: simulator.mj_model.nv]
     return Estimated(
         names=space.names,
         units=space.units,
-        mean=mean,
-        std=0.5 * (high - low),
-        determined=identifiability(space, np.asarray(found.hessian)).determined,
-        joints=tuple(n.removeprefix("qpos.") for n in positions),
-        before=np.asarray(before),
-        after=np.asarray(after),
-        floor=np.asarray(floor),
-        horizon=problem.horizon,
-        held_out=problem.held_name,
+        mean=np.array(result.mean),
+        std=np.array(result.std),
+        flags=tuple(result.flags),
+        undetermined=tuple(u.meaning for u in result.undetermined),
+        held_out=held_out_errors(problem, space, [unit], errors),
         notes=(*problem.notes, *notes),
         space=space,
         distribution=found.distribution,
-        simulator=simulator,
+        simulator=problem.simulator,
+        effects=effects or FoundEffects(),
     )
 
 
@@ -301,7 +295,7 @@ def find_effects(
     held_out: Log | None = None,
     horizon: float = HORIZON,
     tell: Tell = _silent,
-) -> Outcome:
+) -> GapResult:
     """Which physical effects the model lacks, and where, judged on held-out data.
 
     Args:
@@ -314,8 +308,9 @@ def find_effects(
         tell: takes a line on how far it is.
 
     Returns:
-        ``verdict``, the effects ``found`` with their values and confidence, and the gap
-        ``before``, after a ``refit`` of the parameters and ``after`` all of it.
+        ``verdict``, ``effects`` with their values and confidence, the gap ``before``,
+        after a ``refit`` of the parameters and ``after`` all of it, and ``found``, the
+        effects as `estimate_parameters` takes them.
 
     Raises:
         UserError: data too short, too still, or that the model does not cover.
@@ -330,10 +325,14 @@ def find_effects(
         horizon,
         tell=tell,
     )
-    outcome = analysis.run()
-    coverage = coverage_notes(model, runs.fit, runs.held)
-    outcome.notes = [*runs.notes, *coverage, *outcome.notes]
-    return outcome
+    return gap_result(
+        analysis.run(),
+        model=_name(model),
+        readings=reading_faults(model, runs.recorded),
+        held_out=[run.name for run in runs.held],
+        held_name=runs.held_name,
+        notes=[*runs.notes, *coverage_notes(model, runs.fit, runs.held)],
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -459,7 +458,10 @@ def export_model(
     Raises:
         UserError: ``source`` is of another model; a folder that cannot be written.
     """
-    model = identified_model(Path(source), estimated.simulator, estimated.mean)
+    e, machine = estimated, estimated.simulator
+    values = dict(zip(e.names, e.mean.tolist(), strict=True))
+    given = Path(source), machine.mj_model, machine.dt
+    model = written_machine(*given, e.space.parameters, values, e.effects)
     return _written(folder, model.files())
 
 
@@ -475,13 +477,18 @@ def _problem(
     parameters: ParameterSpace,
     log: Log,
     held_out: Log | None,
+    effects: FoundEffects | None,
     noise: Sequence[float],
     horizon: float | None,
 ) -> Problem:
     runs = measured_runs(model, log, held_out, checked_horizon(horizon))
-    return problem_of(
-        "the model", model, parameters, runs, noise=noise, horizon=horizon
-    )
+    given = {"found": effects, "noise": noise, "horizon": horizon}
+    return problem_of(_name(model), model, parameters, runs, **given)
+
+
+def _name(model: mujoco.MjModel) -> str:
+    """Its own, the first of all names in it."""
+    return model.names.split(b"\0", 1)[0].decode() or "the model"
 
 
 def _search(

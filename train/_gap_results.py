@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from easi_jax.io.models.repaired_mjcf import Repaired
     from easi_jax.io.report.html import Picture
     from easi_jax.io.runs.folder import RunFolder
-    from easi_jax.model.found_effects import EffectEntry
     from easi_jax.model.results import GapResult, Retrained
     from train._gap_config import Config
     from train._gap_problem import GapProblem
@@ -112,16 +111,6 @@ def _write(
     write_report(folder.path / REPORT, report)
 
 
-def _entries(result: "GapResult") -> "list[EffectEntry]":
-    from easi_jax.model.found_effects import EffectEntry
-
-    return [
-        EffectEntry(e.effect, at, e.kind, e.columns, e.std)
-        for e in (*result.effects, *result.readings)
-        for at in e.at
-    ]
-
-
 def _write_effects(
     folder: "RunFolder", problem: "GapProblem", result: "GapResult"
 ) -> None:
@@ -130,7 +119,7 @@ def _write_effects(
     write_effects(
         folder.path / EFFECTS,
         str(problem.model.path or problem.model.name),
-        _entries(result),
+        result.found.entries,
         [
             {k: v for k, (v, _, _) in e.values.items()}
             for e in (*result.effects, *result.readings)
@@ -160,7 +149,7 @@ def _with_found(problem: "GapProblem", result: "GapResult") -> "Repaired":
     from easi_jax.model.parameters import ParameterSpace
     from easi_jax.simulation.simulator import Simulator
 
-    source, entries = problem.model.source, _entries(result)
+    source, entries = problem.model.source, result.found.entries
     values = {p.address: p.value for p in result.refitted}
     moved = [p for p in problem.space.parameters if p.addresses[0] in values]
     if not moved and problem.model.path is not None:

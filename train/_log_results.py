@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from easi_jax.io.report.html import Report
     from easi_jax.io.runs.folder import RunFolder
     from easi_jax.model.parameters import ParameterSpace
-    from easi_jax.model.results import HeldOutErrors
 
 
 def write(
@@ -35,6 +34,7 @@ def write(
 
     ``errors_of`` is of `easi_jax.estimation.from_runs.ready_errors`.
     """
+    from easi_jax.estimation.from_runs import held_out_errors
     from easi_jax.estimation.identifiability import seed_result
     from easi_jax.io.report.logs_report import logs_report
     from easi_jax.io.runs.versions import versions
@@ -46,7 +46,7 @@ def write(
             seed_result(space, found.distribution.mean, root @ root.T, found.hessian)
         )
     means = [found.distribution.mean for found in estimates]
-    errors = _errors(problem, means, space, errors_of)
+    errors = held_out_errors(problem, space, means, errors_of)
     best = errors.best
     folder.write_json(
         "distribution.json",
@@ -85,32 +85,3 @@ def write(
     )
     write_pages(folder, report)
     return report
-
-
-def _errors(
-    problem: "Problem",
-    means: Sequence[Any],
-    space: "ParameterSpace",
-    errors_of: Callable[[Any], Any],
-) -> "HeldOutErrors":
-    """Open-loop errors, the model as given and each seed's."""
-    import jax.numpy as jnp
-
-    from easi_jax.model.joint_space import tangent_units
-    from easi_jax.model.results import HeldOutErrors
-
-    before, scale, _ = errors_of(jnp.asarray(space.nominal, jnp.result_type(float)))
-    scale = np.maximum(scale, 1e-12)
-    each = [errors_of(space.to_si(unit)) for unit in means]
-    simulator = problem.simulator
-    coordinates = simulator.state_names[: simulator.mj_model.nv]
-    return HeldOutErrors(
-        what=problem.held_name,
-        horizon=problem.horizon,
-        channels=[n.removeprefix("qpos.") for n in coordinates],
-        units=list(tangent_units(simulator.mj_model)),
-        before=before.tolist(),
-        after=[after.tolist() for after, _, _ in each],
-        floor=[floor.tolist() for _, _, floor in each],
-        fit=[float(np.mean((own / scale) ** 2)) for _, own, _ in each],
-    )

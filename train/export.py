@@ -130,64 +130,29 @@ def _parameter_files(
 def _model_files(
     config: Config, settings: dict[str, Any], found: dict[str, Any], seed: str
 ) -> dict[str, str | bytes]:
-    import numpy as np
+    from easi_jax.export.mjcf import written_machine
+    from easi_jax.model.parameters import Parameter
+    from train._effects import found_in
 
-    from easi_jax.export.mjcf import identified_model
-
-    values = dict(
-        zip(
-            (p["name"] for p in found["parameters"]),
-            found["seeds"][seed]["mean"],
-            strict=True,
+    parameters = [
+        Parameter(
+            name=p["name"],
+            addresses=tuple(p["addresses"]),
+            nominal=p["nominal"],
+            initial=tuple(p["initial"]),
+            bounds=tuple(p["bounds"]),
+            unit=p["unit"],
+            log=p["scale"] == "log",
         )
-    )
-    source, simulator, entries = _machine_of(config, settings, found, values)
-    theta = np.array([values[name] for name in simulator.space.names], float)
-    model = identified_model(source, simulator, theta, entries)
+        for p in found["parameters"]
+    ]
+    means = found["seeds"][seed]["mean"]
+    values = {p.name: mean for p, mean in zip(parameters, means, strict=True)}
+    effects = found_in(settings.get("effects"))
+    model = written_machine(*_model_of(config, settings), parameters, values, effects)
     if model.left:
         say(f"note: not in model.xml: {', '.join(model.left)}")
     return model.files()
-
-
-def _machine_of(
-    config: Config,
-    settings: dict[str, Any],
-    found: dict[str, Any],
-    values: dict[str, float],
-) -> tuple[Path, Any, list[Any]]:
-    """File of the model, a machine with the identified parameters but those of effects,
-    and the effects as identified."""
-    from easi_jax.model.parameters import Parameter, ParameterSpace
-    from easi_jax.simulation.simulator import Simulator
-    from train._effects import found_in
-
-    effects = found_in(settings.get("effects"))
-    space, by_address = [], {}
-    for p in found["parameters"]:
-        by_address |= {address: values[p["name"]] for address in p["addresses"]}
-        if not p["addresses"][0].startswith("effect."):
-            space.append(
-                Parameter(
-                    name=p["name"],
-                    addresses=tuple(p["addresses"]),
-                    nominal=p["nominal"],
-                    initial=tuple(p["initial"]),
-                    bounds=tuple(p["bounds"]),
-                    unit=p["unit"],
-                    log=p["scale"] == "log",
-                )
-            )
-    own = {a: v for a, v in (effects.own or {}).items() if a not in by_address}
-    entries = [
-        dataclasses.replace(
-            e,
-            columns={c: by_address.get(e.address(c), v) for c, v in e.columns.items()},
-        )
-        for e in effects.entries
-    ]
-    source, mj_model, dt = _model_of(config, settings)
-    simulator = Simulator(mj_model, ParameterSpace(tuple(space)), dt, fixed=own)
-    return source, simulator, entries
 
 
 def _model_of(config: Config, settings: dict[str, Any]) -> tuple[Path, Any, Any]:

@@ -1,6 +1,6 @@
 """From measured runs to an estimate: the search's data, and its finish."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +21,9 @@ from easi_jax.estimation.prediction_error import (
     outlier_weights,
 )
 from easi_jax.estimation.problem import Problem
+from easi_jax.model.joint_space import tangent_units
 from easi_jax.model.parameters import ParameterSpace
+from easi_jax.model.results import HeldOutErrors
 from easi_jax.search.config import SearchConfig
 from easi_jax.search.easi import Search, SearchData
 from easi_jax.simulation import open_loop
@@ -196,3 +198,28 @@ def ready_errors(
     like = placed(jnp.zeros(space.size))
     compiled = jax.jit(errors).lower(like).compile(quick_compile())
     return lambda theta: jax.device_get(compiled(placed(theta)))
+
+
+def held_out_errors(
+    problem: Problem,
+    space: ParameterSpace,
+    means: Sequence[jax.Array],
+    errors_of: Callable[[jax.Array], tuple[Any, Any, Any]],
+) -> HeldOutErrors:
+    """Open-loop errors of the model as given and at each of ``means (n,)``, unit
+    coordinates; ``errors_of`` is of `ready_errors`."""
+    before, scale, _ = errors_of(jnp.asarray(space.nominal, jnp.result_type(float)))
+    scale = np.maximum(scale, 1e-12)
+    each = [errors_of(space.to_si(unit)) for unit in means]
+    simulator = problem.simulator
+    coordinates = simulator.state_names[: simulator.mj_model.nv]
+    return HeldOutErrors(
+        what=problem.held_name,
+        horizon=problem.horizon,
+        channels=[n.removeprefix("qpos.") for n in coordinates],
+        units=list(tangent_units(simulator.mj_model)),
+        before=before.tolist(),
+        after=[after.tolist() for after, _, _ in each],
+        floor=[floor.tolist() for _, _, floor in each],
+        fit=[float(np.mean((own / scale) ** 2)) for _, own, _ in each],
+    )

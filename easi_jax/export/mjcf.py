@@ -1,7 +1,7 @@
 """An identified machine as MJCF that plain MuJoCo loads."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -11,7 +11,8 @@ import numpy as np
 from easi_jax.errors import UserError
 from easi_jax.io.models.mjcf import mujoco_warnings
 from easi_jax.io.models.repaired_mjcf import Repaired, repaired_model
-from easi_jax.model.found_effects import EffectEntry
+from easi_jax.model.found_effects import EffectEntry, FoundEffects
+from easi_jax.model.parameters import Parameter, ParameterSpace
 from easi_jax.simulation.mujoco_c import InMujoco
 from easi_jax.simulation.simulator import Simulator
 
@@ -52,3 +53,41 @@ def identified_model(
 
 def _sizes(m: mujoco.MjModel) -> tuple[object, ...]:
     return (m.nq, m.nv, m.nu, m.nbody, m.ngeom, m.names)
+
+
+def written_machine(
+    source: Path,
+    mj_model: mujoco.MjModel,
+    dt: float | None,
+    parameters: Sequence[Parameter],
+    values: Mapping[str, float],
+    effects: FoundEffects,
+) -> Repaired:
+    """`identified_model` of a machine some of whose parameters are those of effects.
+
+    Args:
+        source: file that the model came from.
+        mj_model: the model as given.
+        dt: control step [s]; None: the model's timestep.
+        parameters: of the model and of its effects.
+        values: of each, by name, SI.
+        effects: as they were given.
+
+    Raises:
+        UserError: as `identified_model`.
+    """
+    by_address = {a: values[p.name] for p in parameters for a in p.addresses}
+    own = {a: v for a, v in (effects.own or {}).items() if a not in by_address}
+    entries = [
+        dataclasses.replace(
+            e,
+            columns={c: by_address.get(e.address(c), v) for c, v in e.columns.items()},
+        )
+        for e in effects.entries
+    ]
+    space = ParameterSpace(
+        tuple(p for p in parameters if not p.addresses[0].startswith("effect."))
+    )
+    theta = np.array([values[name] for name in space.names], float)
+    simulator = Simulator(mj_model, space, dt, fixed=own)
+    return identified_model(source, simulator, theta, entries)

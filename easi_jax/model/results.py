@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from easi_jax.model.found_effects import EffectEntry, FoundEffects
 from easi_jax.model.parameters import ParameterSpace
 
 Flag = Literal["determined", "not determined", "at bound"]
@@ -201,6 +202,16 @@ class GapResult:
     def times_floor(self, gap: float) -> float:
         """A gap in units of that of a perfect model."""
         return gap / self.floor if self.floor > 0 else math.inf
+
+    @property
+    def found(self) -> FoundEffects:
+        """Effects and refitted values, as models are given them."""
+        entries = (
+            EffectEntry(e.effect, at, e.kind, e.columns, e.std)
+            for e in (*self.effects, *self.readings)
+            for at in e.at
+        )
+        return FoundEffects(tuple(entries), {r.address: r.value for r in self.refitted})
 
     def noted(self, notes: Sequence[str]) -> "GapResult":
         """With more notes."""

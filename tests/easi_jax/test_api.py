@@ -16,6 +16,7 @@ import pytest
 
 import easi_jax
 from easi_jax import UserError, api
+from easi_jax.model.found_effects import EffectEntry, FoundEffects
 from tests.tiny_robot.env import Tiny
 
 ROOT = Path(__file__).parents[2]
@@ -88,16 +89,16 @@ def test_the_example_finds_the_truth(
     exec(compile(text, str(EXAMPLE), "exec"), names)
     found, lacks = names["found"], names["lacks"]
     assert found.mean[0] == pytest.approx(DAMPING, rel=0.02)
-    assert 0 < found.std[0] < 0.1 * DAMPING and found.determined.all()
-    assert found.after[0] < 0.3 * found.before[0]
-    assert found.held_out == "moves"
+    assert 0 < found.std[0] < 0.1 * DAMPING and found.flags == ("determined",)
+    errors = found.held_out
+    assert errors.what == "moves" and errors.after[0][0] < 0.3 * errors.before[0]
     said = capsys.readouterr().out
     assert re.search(r"damping +0\.\d+ ± [\de.-]+ N m s/rad\n", said)
     assert "hinge    error over 0.2 s" in said
     written = mujoco.MjModel.from_xml_path("results/arm/model.xml")
     assert written.dof_damping[0] == pytest.approx(found.mean[0], rel=1e-5)
     assert lacks.refit.gap < 0.3 * lacks.before.gap
-    assert not any("damping" in f.place.effect for f in lacks.found)
+    assert not any("damping" in e.effect for e in lacks.effects)
 
 
 def test_a_search_is_where_an_estimate_starts(
@@ -128,6 +129,29 @@ def test_a_search_is_where_an_estimate_starts(
     other = type(machine.space)((one,))
     with pytest.raises(UserError, match="start is of damping, parameters are other"):
         easi_jax.estimate_parameters(machine.model, other, machine.log, start=found)
+
+
+def test_found_effects_join_the_parameters_and_are_written(
+    machine: Any, tmp_path: Path
+) -> None:
+    entry = EffectEntry("armature", "hinge", "joint", {"armature": 0.02}, {})
+    effects = FoundEffects((entry,))
+    problem = api._problem(
+        machine.model, machine.space, machine.log, None, effects, (), None
+    )
+    names = problem.simulator.space.names
+    assert names == ("damping", "armature@hinge.armature")
+    found: Any = SimpleNamespace(
+        names=names,
+        mean=np.array([0.3, 0.04]),
+        space=problem.simulator.space,
+        simulator=problem.simulator,
+        effects=effects,
+    )
+    easi_jax.export_model(found, machine.folder / "model.xml", tmp_path)
+    written = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    assert written.dof_damping[0] == pytest.approx(0.3)
+    assert written.dof_armature[0] == pytest.approx(0.04)
 
 
 def test_a_policy_is_trained_and_exported(tmp_path: Path) -> None:
