@@ -85,6 +85,7 @@ def test_is_as_good_as_the_cramer_rao_bound(
     assert np.abs(out.delta).max() < 6 * float(NOISE.max())
 
 
+@pytest.mark.slow
 def test_the_best_of_several_starts_is_the_result(
     fit: Any, start: jax.Array, trajectories: Segments
 ) -> None:
@@ -141,7 +142,8 @@ def test_a_value_lost_near_zero_comes_back(
     assert abs(off[i]) < 0.3, dict(zip(space.names, off.round(3), strict=True))
 
 
-@pytest.mark.parametrize("met", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.slow
+@pytest.mark.parametrize("met", [True, False])
 def test_a_limit_that_was_not_met_is_not_known(met: bool) -> None:
     """Noise digs a dip into the edge of the plateau, where a fit from below stops."""
     rig = RIGS["cartpole"]()

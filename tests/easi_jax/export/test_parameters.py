@@ -89,8 +89,10 @@ def test_a_foreign_model_is_refused() -> None:
 
 
 def found(space: ParameterSpace, mean: Any, cov: Any) -> dict[str, Any]:
+    """What `distribution.json` holds of seed 3."""
     result = seed_result(space, mean, cov, np.eye(space.size))
-    return distribution_json(space, [3], [result])
+    told = distribution_json(space, [3], [result])
+    return {**told, "seeds": {"3": dataclasses.asdict(result)}}
 
 
 @pytest.fixture(scope="module")
