@@ -128,3 +128,17 @@ def test_processes_are_started_where_the_list_says() -> None:
         if "subprocess" in set(_imports(tree))
     }
     assert started == set(PROCESSES)
+
+
+def test_every_test_that_the_page_of_user_files_names_is_there() -> None:
+    page = (ROOT / "docs" / "user_files.md").read_text()
+    defined = {
+        node.name
+        for _, tree in _modules("tests")
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef)
+    }
+    files = set(re.findall(r"`((?:\w+/)*test_\w+\.py)", page))
+    named = set(re.findall(r"(?:`|::)(test_\w+)`", page))
+    assert len(named) > 30 and named <= defined, named - defined
+    assert all((ROOT / "tests" / name).is_file() for name in files)

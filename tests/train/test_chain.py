@@ -263,7 +263,7 @@ def test_bad_settings_leave_the_earlier_run(chain: Path, capsys) -> None:
 def test_export_writes_all_that_a_run_has(chain: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "export"
     command(export, chain / "easi", "--out", out)
-    assert "cart_speed_limit: not in model.xml" in capsys.readouterr().out
+    assert "not in model.xml: cart_speed_limit" in capsys.readouterr().out
     assert {p.name for p in out.iterdir()} == {
         *("policy.onnx", "policy.json", "policy.stablehlo", "policy.mlir"),
         *("model.xml", "randomization.yaml"),

@@ -1,6 +1,6 @@
 """A run in small: chunks of one program over the mesh, checkpoints, a result.
 
-    python -m tests.easi_jax.distributed_run --out FOLDER --distributed
+    python -m tests.easi_jax.devices.distributed_run --out FOLDER --distributed
 
 Written with what the commands are written with, so that tests of several processes
 need not compile a robot.
@@ -116,4 +116,4 @@ def run(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(Config, run, name="tests.easi_jax.distributed_run")
+    main(Config, run, name="tests.easi_jax.devices.distributed_run")

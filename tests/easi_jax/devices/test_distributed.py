@@ -15,7 +15,7 @@ from easi_jax.devices.distributed import Place, find_place
 from easi_jax.errors import UserError
 from tests.processes import LIMIT, Processes, own_words
 
-WALK = "tests.easi_jax.distributed_run"
+WALK = "tests.easi_jax.devices.distributed_run"
 SAME = 1e-6  # relative; sums over devices may round otherwise
 
 
