@@ -125,7 +125,7 @@ print(float(jax.jit(f)(jnp.ones((mesh.size, 1)))[0, 0]) == mesh.size)
     env.pop("XLA_FLAGS", None)
     got = subprocess.run(
         [sys.executable, "-c", code],
-        cwd=Path(__file__).parents[2],
+        cwd=Path(__file__).parents[3],
         env=env,
         capture_output=True,
         text=True,

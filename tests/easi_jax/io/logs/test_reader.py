@@ -19,7 +19,7 @@ from easi_jax.io.logs import tables as log_tables
 from easi_jax.io.logs.reader import read_logs, write_log
 from easi_jax.model.joint_space import Configuration
 
-SHARED = Path(__file__).parents[3] / "shared" / "data"
+SHARED = Path(__file__).parents[5] / "shared" / "data"
 
 CART = """
 <mujoco><compiler angle="radian"/><option timestep="0.01"/><worldbody>

@@ -82,7 +82,7 @@ def test_second_run_into_a_used_folder_is_refused_while_the_first_lives(run_at):
             capture_output=True,
             text=True,
             timeout=60,
-            cwd=Path(__file__).parents[2],
+            cwd=Path(__file__).parents[4],
             check=True,
         )
         assert "another run is writing" in found.stdout
