@@ -40,7 +40,7 @@ def either(names: Iterable[str], *slow: str) -> list[Any]:
     return [pytest.param(n, marks=pytest.mark.slow) if n in slow else n for n in names]
 
 
-@pytest.fixture(scope="module", params=either(CASES, "ballbalance", "go2_full"))
+@pytest.fixture(scope="module", params=either(CASES, "ant", "ballbalance", "go2_full"))
 def runs(request: pytest.FixtureRequest) -> Runs:
     case = CASES[request.param]
     env = case.make()

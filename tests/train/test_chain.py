@@ -101,6 +101,7 @@ KILLED_IN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", KILLED_IN)
 @pytest.mark.fault("killed (signal 9), then resumed")
 def test_killed_search_goes_on_bit_equal(
@@ -214,6 +215,7 @@ def _moved(run: Path, fresh: bool = False) -> float:
     return sum(jax.tree.leaves(apart)) ** 0.5
 
 
+@pytest.mark.slow
 def test_warm_start_goes_on_from_the_first_networks_alone(chain: Path) -> None:
     assert _moved(chain / "easi") < 0.3 * _moved(chain / "easi", fresh=True)
     old, search = _restored(chain / "udr", "train").state, cast(SearchState, None)

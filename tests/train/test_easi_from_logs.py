@@ -343,6 +343,7 @@ def test_degrees_are_noticed_and_earlier_results_kept(files, capsys):
     assert {p: p.read_bytes() for p in files["out"].rglob("*") if p.is_file()} == kept
 
 
+@pytest.mark.slow
 def test_a_fit_on_some_of_the_logs_ends_where_all_have_it(files, capsys, monkeypatch):
     """As larger robots have it, whose fits would take hours with all pieces."""
     swing(files["log"], damping=0.1)
@@ -377,6 +378,7 @@ def swing(path: Path, damping: float) -> None:
     path.write_text("\n".join(["time,qpos.hinge,ctrl.drive", *rows]) + "\n")
 
 
+@pytest.mark.slow
 @pytest.mark.fault("killed (signal 9), then resumed")
 def test_a_stopped_run_goes_on_bit_equal(files, tmp_path):
     """Stopped at a moment of no one's choosing, then resumed with the same command."""

@@ -51,7 +51,7 @@ def write_log(path: Path, late: tuple[int, ...]) -> None:
     "late",
     [
         pytest.param((15, 15, 15), id="alike", marks=pytest.mark.slow),
-        pytest.param((15, 15, 30), id="one more"),
+        pytest.param((15, 15, 30), id="one more", marks=pytest.mark.slow),
         pytest.param((0, 15, 0), id="one", marks=pytest.mark.slow),
     ],
 )

@@ -46,7 +46,7 @@ METHODS: dict[str, tuple[Method, tuple[float, float]]] = {
     "name",
     [
         pytest.param(n, marks=pytest.mark.slow)
-        if n in ("simopt", "easi_refined", "cma_es")
+        if n in ("simopt", "easi_refined", "cma_es", "dropo")
         else n
         for n in METHODS
     ],

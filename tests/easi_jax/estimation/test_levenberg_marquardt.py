@@ -122,7 +122,14 @@ def test_what_is_as_good_as_zero_comes_back_though_little_is_known(
     assert float(space.to_si(out.unit)[i]) == pytest.approx(space.nominal[i], rel=0.1)
 
 
-@pytest.mark.parametrize("depth", [6.0, 14.0, 20.0])
+@pytest.mark.parametrize(
+    "depth",
+    [
+        6.0,
+        pytest.param(14.0, marks=pytest.mark.slow),
+        pytest.param(20.0, marks=pytest.mark.slow),
+    ],
+)
 def test_a_value_lost_near_zero_comes_back(
     fit: Any,
     start: jax.Array,

@@ -44,6 +44,7 @@ def angle_to_null(found: Identifiability, direction: dict[str, float]) -> float:
     return float(np.linalg.norm(v - found.null @ (found.null.T @ v)))
 
 
+@pytest.mark.slow
 def test_steps_that_weigh_nothing_need_no_simulation(
     cartpole: Cartpole, trajectories: Segments
 ) -> None:

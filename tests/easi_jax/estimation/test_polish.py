@@ -87,6 +87,7 @@ def looks(problem: Any, found: RefineResult) -> float:
     return float(found.simulated) / whole
 
 
+@pytest.mark.slow
 def test_information_of_what_is_below_its_range_is_that_at_its_low_end(
     problem: Any, run: Any, fits: Any
 ) -> None:

@@ -104,6 +104,7 @@ def test_friction_is_neither_too_high_nor_too_sure(slow: Any) -> None:
     assert (left[:, 1] < 0.1).all()
 
 
+@pytest.mark.slow
 def test_noise_assumed_too_high_is_seen_in_the_cost(fits: Any, slow: Any) -> None:
     assert np.abs(fits(assumed=1.5)[1] - slow[1]).max() < 0.5
 

@@ -166,6 +166,7 @@ def log_of(arm: mujoco.MjModel, ctrl: np.ndarray) -> Run:
     return Run("run", "run.csv", DT, time, qpos, qvel, False, ctrl, c)
 
 
+@pytest.mark.slow
 def test_replay_predicts_what_the_gap_analysis_does(
     simulator: Simulator, none: np.ndarray, arm: mujoco.MjModel, ctrl: np.ndarray
 ) -> None:
@@ -245,6 +246,7 @@ def test_recorded_commands_begin_with_each_episode() -> None:
     np.testing.assert_array_equal(pieces.past[3], past[6])
 
 
+@pytest.mark.slow
 def test_a_search_recovers_a_hidden_friction_from_a_wrong_file() -> None:
     env = Cartpole()
     found = FoundEffects((entry("coulomb", 0.25, 0.03, at="cart"),))
