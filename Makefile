@@ -1,5 +1,5 @@
 # make demo   set up, train and identify Cartpole, print the results
-# make test   set up, lint, type-check and test; under 10 minutes on 2 cores
+# make test   set up, lint, type-check and test
 # make test-slow   every test, as users compile, with the coverage of lines; hours
 PYTHON ?= python3
 VENV := .venv

@@ -54,7 +54,7 @@ def counts(revision: str) -> Counter[str]:
 
     words = ["git", "archive", "--format=tar", revision]
     root = Path(__file__).parents[1]
-    done = subprocess.run(words, cwd=root, capture_output=True, check=False)
+    done = subprocess.run(words, cwd=root, capture_output=True, timeout=60, check=False)
     if done.returncode:
         raise UserError(f"{revision}: {done.stderr.decode().strip()}")
     found = Counter[str]()

@@ -34,7 +34,9 @@ def repeated(texts: dict[str, str], most: int) -> list[str]:
 
 def test_nothing_is_written_twice() -> None:
     words = ["git", "-C", str(ROOT), "ls-files", "*.py"]
-    told = subprocess.run(words, capture_output=True, text=True, check=False)
+    told = subprocess.run(
+        words, capture_output=True, text=True, timeout=60, check=False
+    )
     if told.returncode:
         pytest.skip("no git checkout to list files of")
     paths = (ROOT / name for name in told.stdout.split())
