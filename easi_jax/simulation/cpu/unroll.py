@@ -12,8 +12,8 @@ elementwise code over the batch. Same values up to rounding.
 import math
 import operator
 from collections import OrderedDict
-from collections.abc import Callable
-from functools import partial, wraps
+from collections.abc import Callable, Iterable, Sequence
+from functools import wraps
 from typing import Any
 
 import jax
@@ -479,18 +479,20 @@ class _Replay:
     def _gather(self, p: dict[str, Any], x: Entries, index: Entries) -> Any:
         if not _all_known(index) or not x.size:
             return NotImplemented
-        where = np.arange(1, x.size + 1, dtype=np.int32).reshape(x.shape)
-        picked = _eager(
-            partial(jax.lax.gather_p.bind, **p | {"fill_value": 0}),
-            where,
-            _values(index, np.int32),
+        d, drops = p["dimension_numbers"], jax.lax.GatherScatterMode.FILL_OR_DROP
+        gone = (*d.collapsed_slice_dims, *d.operand_batching_dims)
+        picked = _window_places(
+            *(x.shape, p["slice_sizes"], _values(index, np.int64)),
+            d.start_index_map,
+            zip(d.operand_batching_dims, d.start_indices_batching_dims, strict=True),
+            *(gone, d.offset_dims, p["mode"] == drops),
         )
         dtype = x.flat[0].dtype
         blank = np.nan if dtype.kind == "f" else 0
         missing = dtype.type(blank if p["fill_value"] is None else p["fill_value"])
         out = np.empty(picked.shape, object)
         for i in np.ndindex(out.shape):
-            out[i] = x.flat[picked[i] - 1] if picked[i] else missing
+            out[i] = missing if picked[i] < 0 else x.flat[picked[i]]
         return out
 
     def _dynamic_slice(self, p: dict[str, Any], x: Entries, *start: Entries) -> Any:
@@ -514,17 +516,20 @@ class _Replay:
     ) -> Any:
         if not _all_known(index):
             return NotImplemented
-        where = _values(index, np.int32)
+        d, clips = p["dimension_numbers"], jax.lax.GatherScatterMode.CLIP
+        gone = (*d.inserted_window_dims, *d.operand_batching_dims)
+        lengths = iter([new.shape[i] for i in d.update_window_dims])
+        sizes = [1 if i in gone else next(lengths) for i in range(x.ndim)]
+        places = _window_places(
+            *(x.shape, sizes, _values(index, np.int64)),
+            d.scatter_dims_to_operand_dims,
+            zip(d.operand_batching_dims, d.scatter_indices_batching_dims, strict=True),
+            *(gone, d.update_window_dims, p["mode"] != clips),
+        )
         out = np.array(x, object, copy=True)
         flat = out.reshape(-1)
-        blank = np.zeros(x.shape, np.int32)
-        dims, mode = p["dimension_numbers"], p["mode"]
-        add = partial(jax.lax.scatter_add, dimension_numbers=dims, mode=mode)
-        for k, value in enumerate(new.reshape(-1)):
-            mark = np.zeros(new.size, np.int32)
-            mark[k] = 1
-            hit = _eager(add, blank, where, mark.reshape(new.shape))
-            for i in np.flatnonzero(hit):
+        for i, value in zip(places.flat, new.flat, strict=True):
+            if i >= 0:
                 flat[i] = value if op is None else self._op(op, flat[i], value)
         return flat.reshape(x.shape)
 
@@ -606,9 +611,47 @@ def _cell(x: Any) -> Entries:
     return out
 
 
-def _eager(fun: Callable[..., Any], *arrays: np.ndarray) -> np.ndarray:
-    with jax.ensure_compile_time_eval():
-        return np.asarray(fun(*(jnp.asarray(a) for a in arrays)))
+def _window_places(
+    shape: Sequence[int],
+    sizes: Sequence[int],
+    index: np.ndarray,
+    axes: Sequence[int],
+    batching: Iterable[tuple[int, int]],
+    gone: Sequence[int],
+    window: Sequence[int],
+    drops: bool,
+) -> np.ndarray:
+    """Which entries of an array the windows of a gather or scatter hold.
+
+    Args:
+        shape: of the array.
+        sizes: of a window along each axis of the array.
+        index: where the windows begin, ``(..., len(axes))``.
+        axes: of the array that ``index`` is about.
+        batching: axes of the array and those of ``index`` that run along with them.
+        gone: axes of the array that the result lacks.
+        window: axes of the result that run within a window.
+        drops: a window that is not all inside counts as outside; else it is moved in.
+
+    Returns:
+        Places in the flattened array; -1 outside.
+    """
+    many = index.shape[:-1]
+    begin = np.zeros((*many, len(shape)), int)
+    begin[..., list(axes)] = index
+    for axis, along in batching:
+        begin[..., axis] = np.indices(many)[along]
+    last = np.subtract(shape, sizes)
+    inside = ((begin >= 0) & (begin <= last)).all(-1)
+    begin = np.clip(begin, 0, last)
+    flat = np.arange(math.prod(shape)).reshape(shape)
+    first = flat[tuple(np.moveaxis(begin, -1, 0))]
+    within = flat[tuple(map(slice, sizes))]  # of the window at the origin
+    places = first.reshape(*many, *[1] * len(shape)) + within
+    if drops:
+        places[~inside] = -1
+    places = places.squeeze(tuple(len(many) + axis for axis in gone))
+    return np.moveaxis(places, range(len(many), places.ndim), window)
 
 
 def _fold(name: str, p: dict[str, Any], dtype: Any, e: tuple[Any, ...]) -> Any:

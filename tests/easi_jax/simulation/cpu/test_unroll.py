@@ -156,3 +156,47 @@ def test_one_step_of_cartpole_is_all_scalar(
     expected = batch(physics.substep)
     np.testing.assert_allclose(found.qpos, expected.qpos, atol=1e-6)
     np.testing.assert_allclose(found.qvel, expected.qvel, atol=2e-5)
+
+
+_GATHER = {
+    "rows": jax.lax.GatherDimensionNumbers((1,), (0,), (0,)),
+    "windows": jax.lax.GatherDimensionNumbers((0, 2), (), (1, 0)),
+    "along": jax.lax.GatherDimensionNumbers((1,), (), (1,), (0,), (0,)),
+}
+_SIZES = {"rows": (1, 2), "windows": (2, 3), "along": (1, 2)}
+_INDEX = {
+    "rows": [[0], [3], [4], [-1]],
+    "windows": [[1, 0], [2, 3], [3, 2], [-1, 1]],
+    "along": [[0], [3], [4], [-2]],
+}
+_MODES = ("clip", "fill")
+
+
+@pytest.mark.parametrize("mode", _MODES)
+@pytest.mark.parametrize("kind", _GATHER)
+def test_windows_are_read_and_written_where_they_are(kind: str, mode: str) -> None:
+    """Some lie outside, in whole or in part."""
+    dims, index = _GATHER[kind], jnp.array(_INDEX[kind])
+    x = np.arange(20.0, dtype=np.float32).reshape(4, 5) + 1
+
+    def read(x: jax.Array) -> jax.Array:
+        return jax.lax.gather(x, index, dims, _SIZES[kind], mode=mode, fill_value=7)
+
+    def write(x: jax.Array, new: jax.Array) -> tuple[jax.Array, ...]:
+        at = jax.lax.ScatterDimensionNumbers(
+            dims.offset_dims,
+            dims.collapsed_slice_dims,
+            dims.start_index_map,
+            dims.operand_batching_dims,
+            dims.start_indices_batching_dims,
+        )
+        return tuple(
+            f(x, index, new, at, mode=mode)
+            for f in (jax.lax.scatter_add, jax.lax.scatter_mul)
+        )
+
+    found = read(jnp.asarray(x))
+    _same(jax.jit(scalarized(read))(x), found)
+    new = np.random.default_rng(0).normal(size=found.shape).astype(np.float32)
+    expected = write(jnp.asarray(x), jnp.asarray(new))
+    jax.tree.map(_same, jax.jit(scalarized(write))(x, new), expected)
