@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from easi_jax.io.models.completed import as_read
 from easi_jax.model.mjx_model import Model
 from easi_jax.model.parameters import ParameterSpace, declare
 from easi_jax.simulation.env import EnvState
@@ -90,7 +91,7 @@ def _read(name: str, model: Path | mujoco.MjModel | None) -> mujoco.MjModel:
     if isinstance(model, mujoco.MjModel):
         return model
     if model is not None:
-        return mujoco.MjModel.from_xml_path(str(model))
+        return as_read(model).compile()
     return mujoco.MjModel.from_xml_string(model_file(name).read_text())
 
 

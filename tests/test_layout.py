@@ -20,7 +20,6 @@ OUTSIDE_IO = {
     "easi_jax/devices/runtime.py": "makes the folder of jax's compilation cache",
     "easi_jax/baselines/npe.py": "sbi needs torch, which must not share our process",
     "easi_jax/baselines/_npe_process.py": "is that process",
-    "easi_jax/export/mjcf.py": "the model that it has written is loaded again",
 }
 PROCESSES = {
     "easi_jax/baselines/npe.py": "sbi in a process of its own",

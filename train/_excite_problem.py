@@ -75,14 +75,6 @@ def read_excite_problem(config: "Config") -> ExciteProblem:
     m = model.mj_model
     if not m.nu:
         raise UserError(f"{config.model}: the model has no actuator to excite")
-    for kind, count, named in (
-        ("joint", m.njnt, m.joint),
-        ("actuator", m.nu, m.actuator),
-    ):
-        if any(not named(i).name for i in range(count)):
-            raise UserError(
-                f"{config.model}: a log names every {kind}, so give each one a name"
-            )
     space = (
         own_space(m)
         if config.parameters is None

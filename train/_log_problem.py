@@ -92,11 +92,12 @@ def _model_and_space(config: Any) -> tuple[str, Any, Any]:
 
 def load_model(path: Path, allowed: tuple[Path, ...] = ()) -> Any:
     """The MuJoCo model in ``path``; ``allowed`` are places outside of its folder that
-    it may read.
+    it may read. What the user should know of it is said.
 
     Raises:
         UserError: as `easi_jax.io.models.mjcf.read_machine`.
     """
     from easi_jax.io.models.mjcf import read_machine
+    from train._command import say
 
-    return read_machine(path, allowed)
+    return read_machine(path, allowed, lambda text: say(f"note: {text}"))

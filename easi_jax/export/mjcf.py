@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.errors import UserError
+from easi_jax.io.models.completed import as_read
 from easi_jax.io.models.mjcf import mujoco_warnings
 from easi_jax.io.models.repaired_mjcf import Repaired, repaired_model
 from easi_jax.model.found_effects import EffectEntry, FoundEffects
@@ -35,7 +36,7 @@ def identified_model(
             write it.
     """
     with mujoco_warnings():
-        read = mujoco.MjModel.from_xml_path(str(source))
+        read = as_read(source).compile()
     if _sizes(read) != _sizes(simulator.mj_model):
         raise UserError(f"{source} is not the model that these parameters are of")
     write = InMujoco(simulator)

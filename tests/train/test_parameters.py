@@ -134,3 +134,15 @@ def test_what_is_tied_is_shown_and_can_be_parted(
     call("--model", path, "--out", tmp_path / "q.yaml", "--no-tie")
     text = (tmp_path / "q.yaml").read_text()
     assert "*" not in text and "body.FR_calf.mass" in text
+
+
+def test_joints_without_a_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, out = tmp_path / "rod.xml", tmp_path / "p.yaml"
+    path.write_text(BARE.replace('name="swing" ', ""))
+    call("--model", path, "--out", out)
+    told = capsys.readouterr().out
+    assert told.count("note: ") == 1
+    assert "1 joint without a name, called rod_joint: logs and addresses" in told
+    assert "joint.rod_joint.frictionloss" in out.read_text()

@@ -58,7 +58,7 @@ def log_columns(model: mujoco.MjModel) -> LogColumns:
             body = model.body(int(model.jnt_bodyid[i])).name
             raise UserError(
                 f'the model\'s joint {i} (in body "{body}") has no name, by which logs '
-                'find joints; give it one in the model file: name="..."'
+                "find joints: read the model with easi_jax.read_model, which names it"
             )
         size, dofs = widths(model, i)
         if size == FREE_WIDTH:
@@ -72,7 +72,8 @@ def log_columns(model: mujoco.MjModel) -> LogColumns:
         name = model.actuator(i).name
         if not name:
             raise UserError(
-                f"the model's actuator {i} has no name; logs find actuators by name"
+                f"the model's actuator {i} has no name, by which logs find actuators: "
+                "read the model with easi_jax.read_model, which names it"
             )
         ctrl.append(f"ctrl.{name}")
     sensors = {

@@ -5,13 +5,14 @@ import itertools
 import os
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import mujoco
 
 from easi_jax.errors import UserError
 from easi_jax.io.files import os_reason, regular_file
+from easi_jax.io.models.completed import as_read, names_note
 from easi_jax.model.mjx_model import put_model
 
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
@@ -34,8 +35,14 @@ _REFERENCE = re.compile(r"&(?:#x([0-9a-fA-F]{1,6})|#([0-9]{1,7})|(\w{2,4}));")
 _ENTITIES = {"lt": "<", "gt": ">", "amp": "&", "quot": '"', "apos": "'"}
 
 
-def read_mjcf(path: Path, allowed: Sequence[Path] = ()) -> mujoco.MjModel:
-    """The compiled model in ``path``.
+def _warn(text: str) -> None:
+    warnings.warn(text, stacklevel=5)
+
+
+def read_mjcf(
+    path: Path, allowed: Sequence[Path] = (), tell: Callable[[str], None] = _warn
+) -> mujoco.MjModel:
+    """The compiled model in ``path``; its joints and actuators without a name get one.
 
     Files that it includes, and its meshes, textures and height fields, must lie in
     its folder or below, symbolic links followed: a model from elsewhere cannot read
@@ -44,6 +51,7 @@ def read_mjcf(path: Path, allowed: Sequence[Path] = ()) -> mujoco.MjModel:
     Args:
         path: MJCF or URDF.
         allowed: further files, or folders with all below them, that it may name.
+        tell: takes what the user should know, a line each; warns where not given.
 
     Raises:
         UserError: the file cannot be read, it names a file outside, or MuJoCo does
@@ -53,13 +61,16 @@ def read_mjcf(path: Path, allowed: Sequence[Path] = ()) -> mujoco.MjModel:
     with mujoco_warnings() as said:
         try:
             model = mujoco.MjModel.from_xml_path(str(path))
+            note = names_note(model)
+            if note:
+                model = as_read(path).compile()
         except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
             reason = " ".join(f"{error} {' '.join(said)}".split())
             raise UserError(
                 f"{path}: MuJoCo cannot read this model: {reason}"
             ) from None
-    for text in said:
-        warnings.warn(f"{path}: {text}", stacklevel=2)
+    for text in dict.fromkeys([*said, note] if note else said):
+        tell(f"{path}: {text}")
     return model
 
 
@@ -241,14 +252,16 @@ def _character(reference: re.Match[str]) -> str:
     return chr(code) if code <= 0x10FFFF else reference[0]
 
 
-def read_machine(path: Path, allowed: Sequence[Path] = ()) -> mujoco.MjModel:
+def read_machine(
+    path: Path, allowed: Sequence[Path] = (), tell: Callable[[str], None] = _warn
+) -> mujoco.MjModel:
     """`read_mjcf` of something that moves and that MJX can simulate.
 
     Raises:
         UserError: as `read_mjcf` and `easi_jax.model.mjx_model.put_model`; or the model
             has no joint.
     """
-    model = read_mjcf(path, allowed)
+    model = read_mjcf(path, allowed, tell)
     if model.nv == 0:
         raise UserError(f"{path}: the model has no joint, so nothing can be identified")
     try:

@@ -18,6 +18,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.errors import UserError
+from easi_jax.io.models.completed import as_read
 from easi_jax.io.models.mjcf import mujoco_warnings, ways
 from easi_jax.model.effect_catalog import CATALOG
 from easi_jax.model.effect_numbers import EffectEntry
@@ -30,7 +31,9 @@ _RELATIVE = 1e-9  # of a number that is read again: far above rounding, below an
 _ABSOLUTE = 1e-12  # of one that is about zero, in its own unit
 _TOLD = 20  # deviations that are listed one by one
 # Places of names and files in tables of bytes.
-_NO_NUMBERS = re.compile(r"names|paths|.*adr$|.*_adr|signature|nbuffer|nnames|npaths")
+_NO_NUMBERS = re.compile(
+    r"names(_map)?|paths|.*adr$|.*_adr|signature|nbuffer|nnames|npaths"
+)
 _OBJECTS = {
     **{"body": "nbody", "jnt": "njnt", "geom": "ngeom", "actuator": "nu"},
     **{"dof": "nv", "tendon": "ntendon", "eq": "neq", "sensor": "nsensor"},
@@ -136,7 +139,7 @@ def _explicit(
 ) -> tuple[mujoco.MjSpec, mujoco.MjModel, dict[str, Path]]:
     """A model in which nothing is derived that can be stated, its numbers as given,
     and its files."""
-    spec = mujoco.MjSpec.from_file(str(path))
+    spec = as_read(path)
     given = spec.compile()  # says where files named by included ones are, too
     assets = _gathered(spec, path.parent)
     spec.compile()
