@@ -282,7 +282,7 @@ def test_commands_run(tmp_path: Path) -> None:
     chosen = [w for w in every if not w[0].startswith(SIZED_ELSEWHERE)]
     assert len(chosen) >= 25
     shop(tmp_path)
-    ran = set()
+    ran, failed = set(), []
     for given in chosen:
         words = tiny(given, tmp_path)
         if tuple(words) in ran:
@@ -296,8 +296,10 @@ def test_commands_run(tmp_path: Path) -> None:
             text=True,
             timeout=1200,
         )
-        assert done.returncode == 0, (words, done.stderr[-2000:])
-        if words[0] == "train.gap" and "robot.xml" in words:
+        if done.returncode:
+            failed.append((words, done.stderr[-2000:]))
+        elif words[0] == "train.gap" and "robot.xml" in words:
             shutil.copy(tmp_path / "results" / "gap" / "effects.yaml", tmp_path)
             told = (tmp_path / "effects.yaml").read_text()
             assert "coulomb_friction" in told and "at: cart" in told
+    assert not failed
