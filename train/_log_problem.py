@@ -10,8 +10,6 @@ if TYPE_CHECKING:
     from easi_jax.data.measured import MeasuredRuns
     from easi_jax.estimation.problem import Problem
 
-FINISH = 0.5  # s, of pieces in the least-squares finish
-
 
 def read_problem(config: Any) -> "Problem":
     """Reads and checks everything; nothing is written yet.

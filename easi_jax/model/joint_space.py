@@ -76,15 +76,6 @@ def tangent_names(m: Any) -> tuple[str, ...]:
     )
 
 
-def position_names(m: Any) -> tuple[str, ...]:
-    """Names of the ``nq`` entries of ``qpos``."""
-    return tuple(
-        name
-        for j in range(m.njnt)
-        for name in numbered(joint_name(m, j), widths(m, j)[0])
-    )
-
-
 def tangent_units(m: Any) -> tuple[str, ...]:
     """Units of the ``nv`` entries of a tangent vector: m or rad."""
     return tuple(u for j in range(m.njnt) for u in _TANGENT_UNITS[_kind(m, j)])

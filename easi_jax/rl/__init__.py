@@ -1,4 +1,4 @@
-"""Policy training: SAC, PPO, evaluation, and probes that tell which part is broken."""
+"""Policy training: SAC, PPO, evaluation."""
 
 from easi_jax.rl.config import PpoConfig, SacConfig
 from easi_jax.rl.evaluate import evaluate

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import pytest
 
 from easi_jax.rl import Sac, SacConfig, SacState, init_seeds, run_seeds
-from easi_jax.rl.probes import Probe, probe_models
+from tests.easi_jax.rl.probes import Probe, probe_models
 
 DISCOUNT = 0.8
 CHUNK = 25

@@ -13,7 +13,7 @@ from jax.sharding import Mesh
 from easi_jax.devices.mesh import make_mesh
 from easi_jax.errors import UserError
 from easi_jax.rl import Ppo, PpoConfig, act, init_seeds, run_seeds
-from easi_jax.rl.probes import Probe, probe_models
+from tests.easi_jax.rl.probes import Probe, probe_models
 
 OBS = jnp.array([[-1.0], [1.0]])
 GAMMA = 0.8

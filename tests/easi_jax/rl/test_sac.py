@@ -11,8 +11,8 @@ import pytest
 from easi_jax.errors import UserError
 from easi_jax.rl import Sac, SacConfig, act
 from easi_jax.rl.episodes import Episodes
-from easi_jax.rl.probes import Probe, probe_models
 from easi_jax.simulation.env import EnvState
+from tests.easi_jax.rl.probes import Probe, probe_models
 
 OBS = jnp.array([[-1.0], [1.0]])
 GAMMA = 0.8

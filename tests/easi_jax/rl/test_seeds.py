@@ -11,7 +11,7 @@ import pytest
 from easi_jax.devices.mesh import make_mesh
 from easi_jax.io.runs import checkpoints
 from easi_jax.rl import Sac, SacConfig, act, evaluate, train_seeds
-from easi_jax.rl.probes import Probe, probe_models
+from tests.easi_jax.rl.probes import Probe, probe_models
 
 
 @pytest.fixture(scope="module")
