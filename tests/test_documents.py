@@ -277,7 +277,7 @@ def tiny(words: list[str], folder: Path) -> list[str]:
 @pytest.mark.timeout(7200)
 def test_commands_run(tmp_path: Path) -> None:
     pages = [ROOT / "README.md", *(ROOT / "docs" / f"{n}.md" for n in ORDER)]
-    assert {p.stem for p in PAGES} == {*ORDER, "method", "reference"}
+    assert {p.stem for p in PAGES} == {*ORDER, "method", "reference", "user_files"}
     every = [w for p in pages for w in commands(p.read_text())]
     chosen = [w for w in every if not w[0].startswith(SIZED_ELSEWHERE)]
     assert len(chosen) >= 25
