@@ -20,12 +20,16 @@ from easi_jax.export.randomization import (
     read_randomization,
     to_yaml,
 )
+from easi_jax.io.files import to_json
+from easi_jax.io.runs.folder import RunFolder
 from easi_jax.model import distribution
 from easi_jax.model.found_effects import EffectEntry
 from easi_jax.model.parameters import ParameterSpace, declare
 from easi_jax.simulation.mujoco_c import InMujoco
 from easi_jax.simulation.simulator import Simulator
 from envs import make
+from tests.commands import command
+from train import export
 from train._results import distribution_json
 
 FRICTION = EffectEntry("coulomb_friction", "pole", "joint", {"coulomb": 0.05}, {})
@@ -93,6 +97,20 @@ def found(space: ParameterSpace, mean: Any, cov: Any) -> dict[str, Any]:
     result = seed_result(space, mean, cov, np.eye(space.size))
     told = distribution_json(space, [3], [result])
     return {**told, "seeds": {"3": dataclasses.asdict(result)}}
+
+
+def test_the_command_says_what_the_model_lacks(tmp_path: Path, capsys) -> None:
+    """A built-in robot's own file is taken where no other is given."""
+    space, run = make("cartpole").space, tmp_path / "run"
+    unit = np.linspace(0.3, 0.7, space.size)
+    with RunFolder.open(run, {"robot": "cartpole"}, command="train.easi"):
+        told = found(space, unit, 1e-3 * np.eye(space.size))
+        (run / "distribution.json").write_text(to_json(told))
+    command(export, run, "--to", "mjcf")
+    assert "note: not in model.xml: cart_speed_limit" in capsys.readouterr().out
+    m = mujoco.MjModel.from_xml_path(str(run / "export" / "model.xml"))
+    kp = space.to_si(unit)[space.names.index("cart_kp")]
+    assert m.actuator("cart").gainprm[0] == pytest.approx(float(kp), rel=1e-4)
 
 
 @pytest.fixture(scope="module")
