@@ -20,6 +20,7 @@ from benchmarks import (
     gap_summary,
     lines,
     paper_tables,
+    parity,
     rivals_summary,
     scaling_summary,
 )
@@ -490,6 +491,7 @@ SECTIONS = (
     coverage_summary.section,
     _transfer,
     Section("## Real cart-pole", "real_cartpole.json", "real_cartpole", _real),
+    Section(*("## MuJoCo's features", "parity.json", "parity", parity.paragraphs)),
     Section("## Hostile and broken files", "fuzz.json", "fuzz", _fuzz),
     Section("## Exported policies", "export.json", "export", _export),
     Section(

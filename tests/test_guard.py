@@ -4,6 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from benchmarks.parity import load_plugins, paragraphs
+from benchmarks.parity_models import feature_models
 from easi_jax.simulation import guard
 
 ARM = """
@@ -83,3 +85,44 @@ def test_random_states_touch_and_stay_in_their_ranges() -> None:
         mujoco.mj_forward(m, d)
         touching += d.ncon > 0
     assert touching > 10
+
+
+def test_weak_forces_that_are_wrong_are_found_beside_strong_constraints() -> None:
+    """Springs are a thousandth of what a stiff constraint does."""
+    rest = '<equality><joint joint1="elbow" solref="0.004 1"/></equality>'
+    found = _compare(ARM, '<flag spring="disable"/>', rest)
+    assert found.deviates and found.force_error > 0.5
+    assert found.causes == ("passive forces (dampers)",)
+
+
+def test_state_that_mjx_does_not_carry_is_a_deviation() -> None:
+    """One step from a fresh start looks right: a yielded spring, a sleeping body."""
+    text = ARM.replace('damping="0.2"', 'springyield="0.2"')
+    assert "(plastic)" in _compare(text).refusal
+    assert "sleep" in _compare(ARM, '<flag sleep="enable"/>').refusal
+
+
+def test_every_feature_of_the_table_is_a_model() -> None:
+    load_plugins()
+    models = feature_models()
+    assert len(models) > 150
+    for name, text in models.items():
+        m = mujoco.MjModel.from_xml_string(text)
+        assert m.nv, name
+
+
+def test_the_table_says_what_deviates_and_what_is_refused() -> None:
+    row = {"engine": "mjx", "error": 1e-14, "causes": [], "refusal": "", "seconds": 1.0}
+    deviates = {"engine": "mujoco", "error": 0.2, "causes": ["weld constraints"]}
+    refused = {"engine": "mujoco", "error": None, "refusal": "no flex"}
+    text = "\n".join(
+        paragraphs(
+            {
+                "command": "c",
+                "features": {"a": row, "b": row | deviates, "c": row | refused},
+            }
+        )
+    )
+    assert "agrees on 1, deviates on 1, refuses 1" in text
+    assert "| b | mujoco | 2.0e-01 | weld constraints |" in text
+    assert "| c | mujoco |  | refused: no flex |" in text
