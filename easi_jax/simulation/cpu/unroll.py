@@ -516,6 +516,8 @@ class _Replay:
     ) -> Any:
         if not _all_known(index):
             return NotImplemented
+        if not x.size:  # no window lies inside
+            return x
         d, clips = p["dimension_numbers"], jax.lax.GatherScatterMode.CLIP
         gone = (*d.inserted_window_dims, *d.operand_batching_dims)
         lengths = iter([new.shape[i] for i in d.update_window_dims])

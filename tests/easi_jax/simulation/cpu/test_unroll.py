@@ -200,3 +200,17 @@ def test_windows_are_read_and_written_where_they_are(kind: str, mode: str) -> No
     new = np.random.default_rng(0).normal(size=found.shape).astype(np.float32)
     expected = write(jnp.asarray(x), jnp.asarray(new))
     jax.tree.map(_same, jax.jit(scalarized(write))(x, new), expected)
+
+
+@pytest.mark.parametrize("windows", [0, 2])
+def test_windows_of_an_array_without_entries(windows: int) -> None:
+    """A model that lacks a kind of object still has that kind's arrays."""
+    x, index = jnp.zeros((0, 2)), jnp.zeros((windows, 1), int)
+    dims = jax.lax.ScatterDimensionNumbers((1,), (0,), (0,))
+
+    def write(x: jax.Array, new: jax.Array) -> tuple[jax.Array, ...]:
+        found = jax.lax.scatter_add(x, index, new, dims, mode="fill")
+        return found, jnp.sum(new, initial=1.0)
+
+    new = jnp.ones((windows, 2))
+    jax.tree.map(_same, jax.jit(scalarized(write))(x, new), write(x, new))
