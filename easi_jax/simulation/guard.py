@@ -171,8 +171,9 @@ def random_states(
         d.act[:] = rng.uniform(0.05, 0.95, m.na)
         ctrl = rng.uniform(low, high) if m.nu else np.zeros(0)
         d.ctrl[:] = ctrl
-        for _ in range(int(rng.integers(_SIMULATED)) if i % 4 else 0):
-            mujoco.mj_step(m, d)
+        with _quiet():
+            for _ in range(int(rng.integers(_SIMULATED)) if i % 4 else 0):
+                mujoco.mj_step(m, d)
         row = (d.qpos.copy(), d.qvel.copy(), d.act.copy(), ctrl)
         lost = d.warning.number[mujoco.mjtWarning.mjWARN_BADQACC :].sum()
         if all(np.isfinite(x).all() for x in row) and not lost:
@@ -471,8 +472,8 @@ def _errors(
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """MuJoCo's warnings are neither shown nor written: models without a part of them
-    may be none that one would simulate."""
+    """MuJoCo's warnings are neither shown nor written: a random state may be wild, and
+    a model without a part of it none that one would simulate."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)
     try:
