@@ -35,6 +35,7 @@ from easi_jax.gap.sensor_faults import reading_faults
 from easi_jax.gap.summary import gap_result
 from easi_jax.io.files import atomic_write
 from easi_jax.io.logs.reader import read_logs
+from easi_jax.io.models.completed import base_joint, own_pose
 from easi_jax.io.models.mjcf import read_machine
 from easi_jax.io.models.parameter_file import read_parameter_file
 from easi_jax.model import distribution
@@ -61,18 +62,32 @@ def _silent(_: str) -> None:
     """Takes a line and shows nothing."""
 
 
-def read_model(path: PathLike, allow: Sequence[PathLike] = ()) -> mujoco.MjModel:
+def read_model(
+    path: PathLike,
+    allow: Sequence[PathLike] = (),
+    held_base: bool | Sequence[float] = False,
+) -> mujoco.MjModel:
     """Reads a MuJoCo model (MJCF or URDF) that something moves in.
 
     Args:
         path: of the file.
         allow: files or folders outside of its folder that it may read (meshes,
             textures, includes).
+        held_base: whether the base was held while logs were recorded; its free joint
+            is removed. Seven numbers say where (m, unit quaternion); True: the first
+            key frame's pose, or else the model's.
 
     Raises:
         UserError: no such file, no valid model, or one without a joint.
     """
-    return read_machine(Path(path), tuple(Path(p) for p in allow))
+
+    def pose(m: mujoco.MjModel) -> np.ndarray:
+        if isinstance(held_base, bool):
+            return own_pose(m, base_joint(m))
+        return checked_array("held_base", held_base, (7,))
+
+    held = None if held_base is False else pose
+    return read_machine(Path(path), tuple(Path(p) for p in allow), held=held)
 
 
 def read_parameters(path: PathLike, model: mujoco.MjModel) -> ParameterSpace:

@@ -3,7 +3,13 @@
 import dataclasses
 from pathlib import Path
 
-from train._options import ChainOptions, RunOptions, SearchOptions, TargetOptions
+from train._options import (
+    BaseOptions,
+    ChainOptions,
+    RunOptions,
+    SearchOptions,
+    TargetOptions,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +40,9 @@ class _Sources:
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(RunOptions, ChainOptions, SearchOptions, TargetOptions, _Sources):
+class Config(
+    RunOptions, ChainOptions, SearchOptions, TargetOptions, BaseOptions, _Sources
+):
     """Finds the distribution of physical parameters under which simulation looks like
     the measured motion (EASI), and trains the final policy under it.
 

@@ -65,13 +65,14 @@ def read_excite_problem(config: "Config") -> ExciteProblem:
     from easi_jax.model.joint_space import joint_name, scalar_dofs
     from easi_jax.model.parameter_proposal import own_space
     from train._gap_problem import read_model
+    from train._log_problem import held_of
 
     if not config.model:
         raise UserError("give --model M.xml (or a robot's name)")
     _check_numbers(config, LEAD)
     check_names(config.effects)
     _check_out(config)
-    model = read_model(config.model, config.allow_assets)
+    model = read_model(config.model, config.allow_assets, held_of(config))
     m = model.mj_model
     if not m.nu:
         raise UserError(f"{config.model}: the model has no actuator to excite")
@@ -105,8 +106,8 @@ def read_excite_problem(config: "Config") -> ExciteProblem:
         )
     if len(scalar_dofs(m)) < m.njnt:
         notes.append(
-            "nothing checks what a free or ball joint does: hang up the base, or watch "
-            "the predicted positions"
+            "nothing checks what a free or ball joint does: hang up the base "
+            "(--held-base), or watch the predicted positions"
         )
     rows = round(config.duration / dt) + 1
     bench, more = make_bench(m, limits, dt, rows, config.play)

@@ -3,11 +3,13 @@
 import dataclasses
 from pathlib import Path
 
+from train._options import BaseOptions
+
 _HORIZON = 0.2  # s
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(BaseOptions):
     """Finds where a simulation and measured logs disagree, and names what is missing.
 
     The model predicts short windows of the logs from their measured starts. Every

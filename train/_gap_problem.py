@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from easi_jax.model.parameters import ParameterSpace
     from envs.robot import Robot
     from train._gap_config import Config
+    from train._log_problem import Held
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,11 +89,11 @@ def read_gap_problem(config: "Config") -> GapProblem:
     from easi_jax.gap.sensor_faults import reading_faults
     from easi_jax.io.models.parameter_file import read_parameter_file
     from easi_jax.model.parameter_proposal import own_space
-    from train._log_problem import read_runs
+    from train._log_problem import held_of, read_runs
 
     if not (math.isfinite(config.horizon) and config.horizon > 0):
         raise UserError(f"--horizon is {config.horizon:g}: give seconds above 0")
-    model = read_model(config.model, config.allow_assets)
+    model = read_model(config.model, config.allow_assets, held_of(config))
     mj_model = model.mj_model
     space = (
         own_space(mj_model)
@@ -123,20 +124,24 @@ def beyond_mjcf(space: "ParameterSpace") -> dict[str, float]:
     }
 
 
-def read_model(text: str, allowed: tuple[Path, ...] = ()) -> GivenModel:
+def read_model(
+    text: str, allowed: tuple[Path, ...] = (), held: "Held | None" = None
+) -> GivenModel:
     """A built-in robot by its name, or an MJCF file; see `load_model`.
 
     Raises:
         UserError: no such model.
     """
     from envs import REGISTRY, make
+    from envs.robot import model_file
     from train._log_problem import load_model
 
     if text in REGISTRY:
         env = make(text)
-        return GivenModel(text, None, env.mj_model, env)
+        m = load_model(model_file(text), (), held) if held else env.mj_model
+        return GivenModel(text, None, m, env)
     path = Path(text)
-    mj_model = load_model(path, allowed)
+    mj_model = load_model(path, allowed, held)
     # The first of the model's names is its own.
     name = mj_model.names.split(b"\0", 1)[0].decode()
     return GivenModel(name or path.stem, path, mj_model, None)

@@ -153,7 +153,7 @@ def _with_found(problem: "GapProblem", result: "GapResult") -> "Repaired":
     values = {p.address: p.value for p in result.refitted}
     moved = [p for p in problem.space.parameters if p.addresses[0] in values]
     if not moved and problem.model.path is not None:
-        return repaired_model(source, entries)
+        return repaired_model(source, entries, problem.model.mj_model)
     simulator = Simulator(
         problem.model.mj_model, ParameterSpace(tuple(moved)), problem.fit[0].dt
     )

@@ -1,6 +1,7 @@
 """What ``train.easi --data`` is asked: model, parameters, logs, all checked."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +10,8 @@ from train._effects import found_in, read_given
 if TYPE_CHECKING:
     from easi_jax.data.measured import MeasuredRuns
     from easi_jax.estimation.problem import Problem
+
+Held = tuple[Sequence[Path], Path | None]
 
 
 def read_problem(config: Any) -> "Problem":
@@ -68,12 +71,15 @@ def _model_and_space(config: Any) -> tuple[str, Any, Any]:
                 "for a built-in robot"
             )
         from envs import make
+        from envs.robot import model_file
 
         env = make(config.robot)
-        space = env.space
+        space, mj_model = env.space, env.mj_model
+        if config.held_base:
+            mj_model = load_model(model_file(env.name), (), held_of(config))
         if config.parameters is not None:
-            space = read_parameter_file(config.parameters, env.mj_model)
-        return env.name, env.mj_model, space
+            space = read_parameter_file(config.parameters, mj_model)
+        return env.name, mj_model, space
     if config.robot is not None:
         raise UserError("--model and --robot exclude each other: choose one")
     if config.parameters is None and config.effects is None:
@@ -81,21 +87,38 @@ def _model_and_space(config: Any) -> tuple[str, Any, Any]:
             "--model needs --parameters P.yaml (or --effects E.yaml): say what may "
             "vary in the model (see docs/your_own_robot.md)"
         )
-    mj_model = load_model(config.model, config.allow_assets)
+    mj_model = load_model(config.model, config.allow_assets, held_of(config))
     if config.parameters is None:
         return config.model.stem, mj_model, ParameterSpace(())
     space = read_parameter_file(config.parameters, mj_model)
     return config.model.stem, mj_model, space
 
 
-def load_model(path: Path, allowed: tuple[Path, ...] = ()) -> Any:
+def held_of(config: Any) -> "Held | None":
+    """Logs and mapping that say where a held base was; None where it was not held."""
+    return (config.data, config.mapping) if config.held_base else None
+
+
+def load_model(
+    path: Path, allowed: tuple[Path, ...] = (), held: "Held | None" = None
+) -> Any:
     """The MuJoCo model in ``path``; ``allowed`` are places outside of its folder that
-    it may read. What the user should know of it is said.
+    it may read, ``held`` is as `held_of` gives it. What the user should know is said.
 
     Raises:
         UserError: as `easi_jax.io.models.mjcf.read_machine`.
     """
+    from easi_jax.io.logs.reader import first_pose
+    from easi_jax.io.models.completed import base_joint, own_pose
     from easi_jax.io.models.mjcf import read_machine
     from train._command import say
 
-    return read_machine(path, allowed, lambda text: say(f"note: {text}"))
+    def pose(m: Any) -> Any:
+        logs, mapping = held or ((), None)
+        logged = first_pose(logs, m, mapping)
+        return own_pose(m, base_joint(m)) if logged is None else logged
+
+    def tell(text: str) -> None:
+        say(f"note: {text}")
+
+    return read_machine(path, allowed, tell, pose if held else None)

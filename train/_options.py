@@ -98,3 +98,12 @@ class RunOptions:
     distributed: bool = False
     """One of several processes (srun, mpirun, Kubernetes) whose devices share the
     work."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BaseOptions:
+    """How the machine stood while logs were recorded."""
+
+    held_base: bool = False
+    """The base was held (in a stand): remove the model's free joint. The base stays at
+    its first logged pose, or else at that of the first key frame or of the model."""

@@ -166,7 +166,12 @@ def _model_of(config: Config, settings: dict[str, Any]) -> tuple[Path, Any, Any]
 
     if settings.get("model"):  # of measured logs
         path = Path(config.model or str(settings["model"]))
-        return path, load_model(path, config.allow_assets), None
+        held = None
+        if settings.get("held_base"):
+            mapping = settings.get("mapping")
+            logs = [Path(p) for p in settings.get("data", ())]
+            held = (logs, Path(mapping) if mapping else None)
+        return path, load_model(path, config.allow_assets, held), None
     settings = checked(settings, MADE_WITH, f"{config.run_folder} holds no run")
     env = env_of(config.run_folder, settings, config.env)
     if config.model is not None:

@@ -8,12 +8,13 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from train._command import main, say, show_table
+from train._options import BaseOptions
 
 _SHOWN = 20
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(BaseOptions):
     """Writes logs, as train.easi and train.gap read them, from other recordings.
 
     MCAP files and rosbag2 folders, LeRobot and Minari datasets, and PACE recordings
@@ -70,7 +71,8 @@ def run(config: Config) -> None:
         raise UserError(f"--step is {step:g}: give seconds above 0")
     if not (math.isfinite(config.command_slack) and config.command_slack >= 0):
         raise UserError(f"--command-slack is {config.command_slack:g}: 0 s or more")
-    mj_model = read_model(config.model).mj_model
+    held = ((), None) if config.held_base else None
+    mj_model = read_model(config.model, (), held).mj_model
     mapping = None if config.mapping is None else read_mapping(config.mapping)
     done = import_recordings(
         config.recordings,

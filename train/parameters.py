@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from train._command import main, say, show_table
+from train._options import BaseOptions
 
 _HORIZON = 0.2  # s, of the pieces that say what logs determine
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(BaseOptions):
     """Proposes what may vary in a model: a parameter file for train.easi to start from.
 
     Damping, friction and inertia of joints, gains and limits of drives, masses, ground
@@ -42,14 +43,14 @@ def run(config: Config) -> None:
     from easi_jax.errors import UserError
     from easi_jax.io.files import atomic_write
     from easi_jax.model.parameter_proposal import as_text, propose
-    from train._log_problem import load_model
+    from train._log_problem import held_of, load_model
 
     if config.out.exists() and not config.overwrite:
         raise UserError(
             f"{config.out} is there already: name another file with --out, or replace "
             "it with --overwrite"
         )
-    m = load_model(config.model, config.allow_assets)
+    m = load_model(config.model, config.allow_assets, held_of(config))
     proposals = propose(m, config.tie)
     verdicts: dict[str, str] = {}
     notes: list[str] = []

@@ -36,7 +36,7 @@ def identified_model(
             write it.
     """
     with mujoco_warnings():
-        read = as_read(source).compile()
+        read = as_read(source, simulator.mj_model).compile()
     if _sizes(read) != _sizes(simulator.mj_model):
         raise UserError(f"{source} is not the model that these parameters are of")
     write = InMujoco(simulator)

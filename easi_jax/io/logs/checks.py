@@ -1,18 +1,19 @@
 """What can be wrong with the values of a log."""
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from easi_jax.data.recording import physics_steps
+from easi_jax.data.recording import Run, physics_steps
 from easi_jax.data.resampling import Rows, recordings
 from easi_jax.errors import UserError
 from easi_jax.io.logs.columns import LogColumns
 from easi_jax.io.logs.cure import cure, scaled
 from easi_jax.model.joint_space import (
+    FREE_WIDTH,
     Configuration,
     dofs,
     is_hinge,
@@ -36,6 +37,9 @@ _CLOCKS = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9)
 # A recorder that stamps two rows alike now and then; more is a coarse clock.
 _FEW_REPEATED, _SHARE_REPEATED = 3, 0.01
 _ZERO_NORM = 1e-6
+# Spread [m, rad] of a base that rests while other joints move by more than the last:
+# exactly, and within the noise of a motion capture.
+_FIXED, _STILL, _MOVING = 1e-6, 1e-3, 0.1
 _NORM_OFF = 0.05
 _TURNS = 4
 _BEYOND = 0.01  # rad outside of its range, that a reading may be off
@@ -420,3 +424,34 @@ def _another_unit(column: str, values: np.ndarray, hinge: bool) -> str:
         f"{scaled(column, 2 * math.pi / _TICKS)} for {_TICKS} a turn (2 pi / ticks); "
         f"if degrees, {scaled(column, 1 / _DEGREE)}"
     )
+
+
+def still_base(path: Path, model: mujoco.MjModel, runs: Sequence[Run]) -> str:
+    """A note where a free base rests in all ``runs`` while its joints move, else "".
+
+    Raises:
+        UserError: it does not move at all, so it was held.
+    """
+    root = model.body_rootid[model.jnt_bodyid]
+    qpos = np.concatenate([run.qpos for run in runs])
+    spread = np.ptp(qpos, axis=0)
+    for j in range(model.njnt):
+        at = int(model.jnt_qposadr[j])
+        others = [
+            int(model.jnt_qposadr[k])
+            for k in range(model.njnt)
+            if k != j and root[k] == root[j] and is_scalar(model, k)
+        ]
+        free = widths(model, j)[0] == FREE_WIDTH
+        if not free or not others or spread[others].max() < _MOVING:
+            continue
+        most = spread[at : at + FREE_WIDTH].max()
+        text = (
+            f'the base "{joint_name(model, j)}" does not move in this log: remove its '
+            "free joint, or give --held-base"
+        )
+        if most < _FIXED:
+            raise UserError(f"{path}: {text}")
+        if most < _STILL:
+            return f"{text} (where it was held)"
+    return ""

@@ -9,6 +9,7 @@ import mujoco
 
 from easi_jax.errors import UserError, nearest
 from easi_jax.io.logs.cure import cure
+from easi_jax.io.models.completed import held_joint
 from easi_jax.model.joint_space import FREE_WIDTH, given_name, numbered, widths
 
 _CHECKED = ("qpos.", "qvel.", "ctrl.")
@@ -25,6 +26,8 @@ class LogColumns:
         ctrl: in the order of ``ctrl``, ``nu`` names.
         joints: each joint's velocity columns (all of them or none are given).
         free: names of free joints.
+        held: columns of a held base's free joint, which the model no longer has: the
+            pose first.
         sensors: each named sensor's columns.
     """
 
@@ -34,12 +37,13 @@ class LogColumns:
     joints: tuple[tuple[str, ...], ...]
     sensors: Mapping[str, tuple[str, ...]]
     free: tuple[str, ...] = ()
+    held: tuple[str, ...] = ()
 
     @property
     def known(self) -> tuple[str, ...]:
         """Every name that has a meaning."""
         sensors = (name for names in self.sensors.values() for name in names)
-        return ("time", "run", *self.qpos, *self.qvel, *self.ctrl, *sensors)
+        return ("time", "run", *self.qpos, *self.qvel, *self.ctrl, *sensors, *self.held)
 
 
 def log_columns(model: mujoco.MjModel) -> LogColumns:
@@ -90,6 +94,7 @@ def log_columns(model: mujoco.MjModel) -> LogColumns:
         joints=tuple(joints),
         sensors=sensors,
         free=tuple(free),
+        held=_held(model),
     )
     for name, count in Counter(columns.known).items():
         if count > 1:
@@ -97,6 +102,13 @@ def log_columns(model: mujoco.MjModel) -> LogColumns:
                 f'two parts of the model share the log column "{name}"; rename one'
             )
     return columns
+
+
+def _held(model: mujoco.MjModel) -> tuple[str, ...]:
+    name = held_joint(model)
+    if not name:
+        return ()
+    return (*numbered(f"qpos.{name}", FREE_WIDTH), *numbered(f"qvel.{name}", 6))
 
 
 def check_columns(
@@ -134,8 +146,8 @@ def check_columns(
         for name in columns.free:
             if missing[0].startswith(f"qpos.{name}."):
                 near += (
-                    f"; if {name} was held during the recording, take its free joint "
-                    "out of the model"
+                    f"; if {name} was held (the base does not move in this log), "
+                    "remove its free joint, or give --held-base"
                 )
         raise UserError(
             f"{path}: no column {first}, which the model needs"

@@ -25,11 +25,13 @@ from easi_jax.io.logs import checks as log_checks
 from easi_jax.io.logs.columns import LogColumns, check_columns, log_columns
 from easi_jax.io.logs.mapping import LogMapping, read_mapping
 from easi_jax.io.logs.tables import Table, read_table, write_table
-from easi_jax.model.joint_space import Configuration
+from easi_jax.io.models.completed import base_joint, held_body
+from easi_jax.model.joint_space import FREE_WIDTH, Configuration, numbered
 
 PathLike = str | os.PathLike[str]
 
 HOLE_STEPS = 3.0
+_HELD_WITHIN = 0.05  # m and rad that a stand may give, and readings be off
 
 
 def read_logs(
@@ -127,6 +129,39 @@ def write_log(
     write_table(path, out, digits)
 
 
+def first_pose(
+    paths: Sequence[PathLike],
+    mj_model: mujoco.MjModel,
+    mapping: PathLike | None = None,
+) -> np.ndarray | None:
+    """The base's first logged pose ``(7,)``, or None where no log has it.
+
+    Raises:
+        UserError: as `easi_jax.io.models.completed.base_joint` and `read_logs`.
+    """
+    name = mj_model.joint(base_joint(mj_model)).name
+    names = LogMapping() if mapping is None else read_mapping(mapping)
+    for path in paths:
+        table = names.rename(read_table(Path(path)))
+        pose = _poses(table, numbered(f"qpos.{name}", FREE_WIDTH), names)
+        if pose is not None:
+            return pose[0]
+    return None
+
+
+def _poses(
+    table: Table, names: Sequence[str], mapping: LogMapping
+) -> np.ndarray | None:
+    """A free joint's finite poses ``(T, 7)``; None where the table has none."""
+    if not names or any(name not in table.columns for name in names):
+        return None
+    pose = np.stack([mapping.apply(n, table.numbers(n)) for n in names], 1)
+    length = np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+    good = np.isfinite(pose).all(1) & (length[:, 0] > 0)
+    pose[:, 3:] /= np.where(length > 0, length, 1.0)
+    return pose[good] if good.any() else None
+
+
 class _Reader:
     """Reads one file; collects what is to be said about it."""
 
@@ -162,6 +197,7 @@ class _Reader:
         if others:
             self.note(f"columns ignored: {', '.join(others)}")
         raw = self._arrays(table)
+        self._check_held(table)
         if len(raw.time) < 2:
             rows = "a single row" if len(raw.time) else "no rows"
             raise UserError(f"{self.path} has {rows}; a log needs at least two")
@@ -198,6 +234,9 @@ class _Reader:
                 f"{self.path}: no two successive rows are whole and within "
                 f"{HOLE_STEPS:.0f} control steps of each other"
             )
+        still = log_checks.still_base(self.path, self.model, runs)
+        if still:
+            self.note(still)
         if self.uneven:
             worst, name = max(self.uneven)
             self.note(
@@ -255,6 +294,22 @@ class _Reader:
             ctrl=block(self.columns.ctrl),
             sensors=sensors,
         )
+
+    def _check_held(self, table: Table) -> None:
+        """Refuses a base that was not held where the model has it."""
+        pose = _poses(table, self.columns.held[:FREE_WIDTH], self.mapping)
+        if pose is None:
+            return
+        b = held_body(self.model)
+        far = np.linalg.norm(pose[:, :3] - self.model.body_pos[b], axis=1).max()
+        turn = np.abs(pose[:, 3:] @ self.model.body_quat[b])
+        angle = 2 * np.arccos(np.clip(turn, 0, 1)).max()
+        if far > _HELD_WITHIN or angle > _HELD_WITHIN:
+            raise UserError(
+                f"{self.path}: the base is up to {far:.2g} m and {angle:.2g} rad from "
+                "where --held-base holds it: leave that out, or give logs of one pose"
+            )
+        self.note("columns of the held base are not read")
 
     def _recording(
         self, name: str, raw: Rows, rows: np.ndarray, good: np.ndarray

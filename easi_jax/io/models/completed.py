@@ -5,9 +5,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
+from easi_jax.errors import UserError
 from easi_jax.model.joint_space import given_name
 
+_HELD = "held_base"  # custom text and number of a model whose base was held
 _LISTED = 6  # new names in the note
 _TARGETS = {
     mujoco.mjtTrn.mjTRN_JOINT: "joint",
@@ -92,12 +95,93 @@ def names_note(m: mujoco.MjModel) -> str:
     return f"{'; '.join(said)}: logs and addresses use these names"
 
 
-def as_read(path: Path) -> mujoco.MjSpec:
-    """The model file ``path`` with a name for every joint and actuator.
+def as_read(path: Path, like: mujoco.MjModel | None = None) -> mujoco.MjSpec:
+    """The model file ``path`` with a name for every joint and actuator, its base held
+    where it is in ``like``, which was read from it.
 
     Raises:
         ValueError: MuJoCo cannot read it.
     """
     spec = mujoco.MjSpec.from_file(str(path))
-    named(spec, spec.compile())
+    m = named(spec, spec.compile())
+    if like is not None and held_joint(like) and not held_joint(m):
+        b = held_body(like)
+        hold(spec, m, np.concatenate([like.body_pos[b], like.body_quat[b]]))
     return spec
+
+
+def base_joint(m: mujoco.MjModel) -> int:
+    """The free joint of the body that carries all other joints of its tree.
+
+    Raises:
+        UserError: none, or several.
+    """
+    root = [int(m.body_rootid[b]) for b in m.jnt_bodyid]
+    free = [
+        j
+        for j in range(m.njnt)
+        if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE and root.count(root[j]) > 1
+    ]
+    if len(free) == 1:
+        return free[0]
+    if not free:
+        raise UserError(
+            "the model has no free joint that carries other joints, so --held-base has "
+            "nothing to hold: leave it out"
+        )
+    names = ", ".join(m.joint(j).name for j in free)
+    raise UserError(
+        f"several free joints carry others ({names}), so --held-base is ambiguous: "
+        "remove those of held bodies from the model"
+    )
+
+
+def own_pose(m: mujoco.MjModel, j: int) -> np.ndarray:
+    """Where free joint ``j`` is in the first key frame, or else in the model ``(7,)``:
+    position [m], unit quaternion."""
+    at = int(m.jnt_qposadr[j])
+    return np.array((m.key_qpos[0] if m.nkey else m.qpos0)[at : at + 7])
+
+
+def held_joint(m: mujoco.MjModel) -> str:
+    """Name of the free joint that was removed from ``m`` for a held base, or ``""``."""
+    i = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_TEXT, _HELD)
+    if i < 0:
+        return ""
+    at = int(m.text_adr[i])
+    data = bytes(m.text_data[at : at + int(m.text_size[i])])
+    return data.rstrip(b"\0").decode()
+
+
+def held_body(m: mujoco.MjModel) -> int:
+    """The body whose free joint was removed, by `hold`."""
+    return int(m.numeric(_HELD).data[0])
+
+
+def hold(spec: mujoco.MjSpec, m: mujoco.MjModel, pose: np.ndarray) -> mujoco.MjModel:
+    """Removes the base's free joint from ``spec``, of which ``m`` was compiled.
+
+    The base stays at ``pose (7,)``, in the world: position [m], unit quaternion. Key
+    frames lose the joint's numbers. A custom text of the model keeps the joint's name,
+    so that logs may go on to have columns for it.
+
+    Raises:
+        UserError: as `base_joint`.
+        ValueError: something else in the model needs the joint.
+    """
+    j = base_joint(m)
+    b = int(m.jnt_bodyid[j])
+    joint = next(x for x in spec.joints if x.id == j)
+    body = joint.parent
+    spec.add_text(name=_HELD, data=joint.name)
+    spec.add_numeric(name=_HELD, data=[b], size=1)
+    spec.delete(joint)
+    body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    body.pos, body.quat = (0, 0, 0), (1, 0, 0, 0)
+    frame = spec.compile()  # of which only the frames around the base are left
+    back, local, turn = np.zeros(4), np.zeros(3), np.zeros(4)
+    mujoco.mju_negQuat(back, frame.body_quat[b])
+    mujoco.mju_rotVecQuat(local, pose[:3] - frame.body_pos[b], back)
+    mujoco.mju_mulQuat(turn, back, pose[3:] / np.linalg.norm(pose[3:]))
+    body.pos, body.quat = local, turn
+    return spec.compile()

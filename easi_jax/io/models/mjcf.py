@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from easi_jax.errors import UserError
 from easi_jax.io.files import os_reason, regular_file
-from easi_jax.io.models.completed import as_read, names_note
+from easi_jax.io.models.completed import as_read, held_joint, hold, names_note
 from easi_jax.model.mjx_model import put_model
 
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
@@ -40,7 +41,10 @@ def _warn(text: str) -> None:
 
 
 def read_mjcf(
-    path: Path, allowed: Sequence[Path] = (), tell: Callable[[str], None] = _warn
+    path: Path,
+    allowed: Sequence[Path] = (),
+    tell: Callable[[str], None] = _warn,
+    held: Callable[[mujoco.MjModel], np.ndarray] | None = None,
 ) -> mujoco.MjModel:
     """The compiled model in ``path``; its joints and actuators without a name get one.
 
@@ -52,6 +56,8 @@ def read_mjcf(
         path: MJCF or URDF.
         allowed: further files, or folders with all below them, that it may name.
         tell: takes what the user should know, a line each; warns where not given.
+        held: where the base was held, its pose ``(7,)`` given the free model; the free
+            joint is then removed (`easi_jax.io.models.completed.hold`).
 
     Raises:
         UserError: the file cannot be read, it names a file outside, or MuJoCo does
@@ -62,8 +68,13 @@ def read_mjcf(
         try:
             model = mujoco.MjModel.from_xml_path(str(path))
             note = names_note(model)
-            if note:
-                model = as_read(path).compile()
+            if note or held:
+                spec = as_read(path)
+                model = spec.compile()
+                if held and not held_joint(model):
+                    model = hold(spec, model, held(model))
+        except UserError as error:
+            raise UserError(f"{path}: {error}") from None
         except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
             reason = " ".join(f"{error} {' '.join(said)}".split())
             raise UserError(
@@ -253,7 +264,10 @@ def _character(reference: re.Match[str]) -> str:
 
 
 def read_machine(
-    path: Path, allowed: Sequence[Path] = (), tell: Callable[[str], None] = _warn
+    path: Path,
+    allowed: Sequence[Path] = (),
+    tell: Callable[[str], None] = _warn,
+    held: Callable[[mujoco.MjModel], np.ndarray] | None = None,
 ) -> mujoco.MjModel:
     """`read_mjcf` of something that moves and that MJX can simulate.
 
@@ -261,7 +275,7 @@ def read_machine(
         UserError: as `read_mjcf` and `easi_jax.model.mjx_model.put_model`; or the model
             has no joint.
     """
-    model = read_mjcf(path, allowed, tell)
+    model = read_mjcf(path, allowed, tell, held)
     if model.nv == 0:
         raise UserError(f"{path}: the model has no joint, so nothing can be identified")
     try:

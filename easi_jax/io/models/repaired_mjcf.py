@@ -92,7 +92,7 @@ def repaired_model(
 def _repaired(
     path: Path, entries: Sequence[EffectEntry], meant: mujoco.MjModel | None
 ) -> Repaired:
-    spec, given, assets = _explicit(path)
+    spec, given, assets = _explicit(path, meant)
     off = _set_all(spec, given if meant is None else meant)
     left = []
     for e in entries:
@@ -135,11 +135,11 @@ def _all_digits() -> Iterator[None]:
 
 
 def _explicit(
-    path: Path,
+    path: Path, meant: mujoco.MjModel | None
 ) -> tuple[mujoco.MjSpec, mujoco.MjModel, dict[str, Path]]:
     """A model in which nothing is derived that can be stated, its numbers as given,
     and its files."""
-    spec = as_read(path)
+    spec = as_read(path, meant)
     given = spec.compile()  # says where files named by included ones are, too
     assets = _gathered(spec, path.parent)
     spec.compile()

@@ -3,14 +3,21 @@
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import pytest
 
 import easi_jax
+from easi_jax.errors import UserError
 from easi_jax.io.logs.columns import log_columns
-from easi_jax.io.models.completed import names_note
+from easi_jax.io.logs.reader import first_pose, read_logs
+from easi_jax.io.models.completed import held_joint, names_note
 from easi_jax.io.models.mjcf import read_mjcf
 from easi_jax.io.models.repaired_mjcf import deviations, repaired_model
 from easi_jax.model.effect_numbers import EffectEntry
+from train._gap_config import Config as GapConfig
+from train._gap_problem import read_model
+from train._log_problem import held_of
+from train.parameters import Config, run
 
 VENDOR = """<mujoco model="vendor"><compiler autolimits="true"/>
 <default><default class="leg"><joint axis="0 1 0" damping=".1"/>
@@ -25,6 +32,7 @@ VENDOR = """<mujoco model="vendor"><compiler autolimits="true"/>
 <actuator><position class="leg" joint="leg_joint_2"/><motor joint="leg_joint_2"/>
   <motor site="tip"/><motor tendon="{tendon}"/></actuator>
 <keyframe><key qpos="0 0 1 1 0 0 0 .1 .2 .3 .4"/></keyframe></mujoco>"""
+OPTION = '<option timestep=".01"/><default>'
 JOINTS = ["base", "leg_joint", "leg_joint_3", "leg_joint_2", "body4_joint"]
 ACTUATORS = [
     *("leg_joint_2_actuator", "leg_joint_2_actuator_2", "tip_actuator"),
@@ -88,3 +96,89 @@ def test_a_written_model_has_the_names(vendor: Path) -> None:
     assert joints(m) == JOINTS
     assert actuators(m) == ACTUATORS
     assert m.joint("leg_joint_3").frictionloss == 0.2
+
+
+HUNG = (
+    VENDOR.replace("<fixed>", '<fixed name="cord">')
+    .format(tendon="cord")
+    .replace(
+        '<body name="base" pos="0 0 1">',
+        '<frame pos="1 0 0" euler="0 0 90"><body name="base" euler="0 20 0">',
+    )
+    .replace("</body></worldbody>", "</body></frame></worldbody>")
+)
+
+
+def test_a_held_base_stays_where_it_is_said(vendor: Path) -> None:
+    vendor.write_text(HUNG)
+    pose = np.array([0.3, 0.2, 0.9, 0.8, 0.6, 0.0, 0.0])
+    m = read_mjcf(vendor, tell=[].append, held=lambda _: pose)
+    assert joints(m) == JOINTS[1:]
+    np.testing.assert_allclose(m.key_qpos, [[0.1, 0.2, 0.3, 0.4]])
+    b = m.body("base").id
+    np.testing.assert_allclose(m.body_pos[b], pose[:3], atol=1e-12)
+    np.testing.assert_allclose(m.body_quat[b], pose[3:], atol=1e-12)
+    assert held_joint(m) == "base"
+    # What is written has it too, and needs no holding when it is read.
+    again = mujoco.MjModel.from_xml_string(repaired_model(vendor, [], m).xml)
+    assert deviations(again, m) == []
+    assert held_joint(again) == "base"
+
+
+def test_what_cannot_be_held(vendor: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no free joint that carries other joints"):
+        still = '<body><joint name="j"/><geom size=".1"/></body>'
+        vendor.write_text(f"<mujoco><worldbody>{still}</worldbody></mujoco>")
+        easi_jax.read_model(vendor, held_base=True)
+
+
+def log(path: Path, base: np.ndarray | None) -> Path:
+    """Joints that move, and the base's pose where it is given."""
+    time = 0.01 * np.arange(50)
+    columns = {"time": time}
+    if base is not None:
+        columns |= {f"qpos.base.{i}": base[:, i] for i in range(7)}
+    columns |= {f"qpos.{n}": 0.3 * np.sin(9 * time) for n in JOINTS[1:]}
+    columns |= {f"ctrl.{n}": 0 * time for n in ACTUATORS}
+    rows = np.stack([*columns.values()], 1)
+    np.savetxt(path, rows, delimiter=",", header=",".join(columns), comments="")
+    return path
+
+
+def test_logs_of_a_held_base(vendor: Path, tmp_path: Path) -> None:
+    vendor.write_text(vendor.read_text().replace("<default>", OPTION, 1))
+    free = read_mjcf(vendor, tell=[].append)
+    hung = np.tile([0.3, 0.2, 0.9, 0.8, 0.6, 0.0, 0.0], (50, 1))
+    joints_only = log(tmp_path / "joints.csv", None)
+    fixed = log(tmp_path / "fixed.csv", hung)
+    noisy = log(tmp_path / "noisy.csv", hung + 1e-4 * np.eye(7)[np.arange(50) % 3])
+    down = np.outer(np.arange(50) / 100, np.eye(7)[2])
+    fell = log(tmp_path / "fell.csv", hung - down)
+    for path in (joints_only, fixed):
+        with pytest.raises(UserError, match=r"not move in this log.*give --held-base"):
+            read_logs(path, free)
+    said = [n for n in read_logs(noisy, free).notes if "give --held-base" in n]
+    assert len(said) == 1
+    assert not any("--held" in n for n in read_logs(fell, free).notes)
+    pose = first_pose([joints_only, fixed], free)
+    assert pose is not None
+    np.testing.assert_allclose(pose, hung[0])
+    held = read_mjcf(vendor, tell=[].append, held=lambda _: pose)
+    for path in (joints_only, fixed, noisy):
+        assert read_logs(path, held).runs[0].qpos.shape == (50, 4)
+    with pytest.raises(UserError, match=r"up to 0.49 m and .* leave that out"):
+        read_logs(fell, held)
+
+
+def test_held_base_in_a_command(
+    vendor: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, path = tmp_path / "p.yaml", log(tmp_path / "joints.csv", None)
+    config = Config(model=vendor, out=out, held_base=True)
+    run(config)
+    assert "base_mass" not in out.read_text()
+    problem = GapConfig(model=str(vendor), data=(path,), held_base=True)
+    given = read_model(problem.model, (), held_of(problem))
+    assert joints(given.mj_model) == JOINTS[1:]
+    assert given.mj_model.body("base").pos[2] == 1  # of the key frame
+    capsys.readouterr()
