@@ -14,12 +14,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco.mjx._src import support
 
-from easi_jax.devices.runtime import on_cpu
+from easi_jax.devices.mesh import own_device
 from easi_jax.errors import UserError
 from easi_jax.model.mjx_data import make_data
 from easi_jax.model.mjx_model import put_model
@@ -381,8 +380,9 @@ def _mjx_outputs(m: mujoco.MjModel, states: list[State]) -> tuple[Any, list[Any]
     One simulation at a time, nothing optimized: most of the time goes into compiling.
     """
     with jax.enable_x64(True):
-        put = put_model(m, sensors=False).mjx
-        blank = make_data(put)
+        device = _device()
+        put = jax.device_put(put_model(m, sensors=False).mjx, device)
+        blank = jax.device_put(make_data(put), device)
 
         def step(model: Any, start: Any, qpos: Any, qvel: Any, act: Any, ctrl: Any):
             d = start.replace(qpos=qpos, qvel=qvel, act=act, ctrl=ctrl)
@@ -393,13 +393,22 @@ def _mjx_outputs(m: mujoco.MjModel, states: list[State]) -> tuple[Any, list[Any]
             results = (d.qvel, d.qpos, d.act, d.qacc, support.full_m(model, d))
             return results, forces, d.actuator_force, rows, i.contact.geom
 
-        level = {"xla_backend_optimization_level": 0} if on_cpu() else {}
+        on_cpu = device.platform == "cpu"
+        level = {"xla_backend_optimization_level": 0} if on_cpu else {}
         run = jax.jit(step, compiler_options=level)
         out = []
         for state in states:
-            arrays = [jnp.asarray(x, jnp.float64) for x in state]
+            arrays = [jax.device_put(np.asarray(x, float), device) for x in state]
             out.append(jax.tree.map(np.asarray, run(put, blank, *arrays)))
         return blank, out
+
+
+def _device() -> Any:
+    """A CPU where jax has one: double precision and compiling cost least there."""
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:
+        return own_device()
 
 
 def _mjx_step(m: mujoco.MjModel, blank: Any, output: Any) -> _Step:
