@@ -115,7 +115,7 @@ def paragraphs(result: dict[str, Any]) -> list[str]:
         f"`{result['command']}`: {len(rows)} features, each a small model; one step of "
         "this package's MJX beside MuJoCo C, double precision, solvers converged. "
         f"MJX agrees on {mjx}, deviates on {len(rows) - mjx - refused}, refuses "
-        f"{refused}; where it does not agree, `--engine auto` takes native MuJoCo. A "
+        f"{refused}; where it does not agree, native MuJoCo is to be taken. A "
         f"comparison took {times[len(times) // 2]:.1f} s in the median, "
         f"{times[-1]:.1f} s at most.",
         "Error: of a velocity after the step, as a share of the largest change.",

@@ -25,9 +25,9 @@ from easi_jax.model.mjx_model import put_model
 from easi_jax.simulation.step import WRITTEN_OUT, mjx_step
 
 # Share of a step's velocity change. What MJX computes as MuJoCo does agrees to 1e-12,
-# spheres, capsules and boxes that touch to 2e-4 (MJX rounds distances so that it does
+# spheres, capsules and boxes that touch to 6e-4 (MJX rounds distances so that it does
 # not divide by zero); the weakest fault seen is 2e-2 (benchmarks/parity.py).
-TOLERANCE = 1e-3
+TOLERANCE = 3e-3
 _STATES = 16  # compared; more cost milliseconds each, and rarely find more
 _LOOKED_AT = 512  # states among which those are chosen, at most
 _SHARE = 0.05  # of the largest cause: what is smaller is not named
