@@ -19,23 +19,35 @@ pytestmark = pytest.mark.timeout(1500)
 FOUND = """
 effects:
 - effect: coulomb_friction
-  at: cart
+  at: hinge
   kind: joint
   columns: {coulomb: 0.3}
   std: {coulomb: 0.02}
-- {effect: actuator_delay, at: cart, kind: actuator, columns: {delay: 0.03}}
+- {effect: actuator_delay, at: motor, kind: actuator, columns: {delay: 0.03}}
 refitted:
-- {address: joint.pole.damping, value: 0.003}
+- {address: joint.hinge.damping, value: 0.15}
 """
 HIDDEN = """
 effects:
-- {effect: coulomb_friction, at: cart, kind: joint, columns: {coulomb: 0.33}}
+- {effect: coulomb_friction, at: hinge, kind: joint, columns: {coulomb: 0.33}}
 """
 MASS = """<mujoco><option timestep="0.002"/><worldbody><body>
 <joint name="x" type="slide" axis="1 0 0"/><geom size="0.1" mass="1"/>
 </body></worldbody>
 <actuator><motor name="x" joint="x"/></actuator></mujoco>"""
-NAMES = ("coulomb_friction@cart.torque", "actuator_delay@cart.delay")
+SAC_AND_PPO = """
+from easi_jax.rl.config import PpoConfig
+from tests.tiny_robot.env import Tiny
+
+
+class Both(Tiny):
+    training = {**Tiny.training, "ppo": PpoConfig()}
+
+
+make = Both
+"""
+NAMES = ("coulomb_friction@hinge.torque", "actuator_delay@motor.delay")
+ENV = Path(__file__).parents[1] / "tiny_robot" / "env.py"
 SMALL = ("--env-steps", "2400", "--eval-episodes", "4")
 SEARCH = ("--generations", "2", "--population", "16", "--trajectories", "8")
 SETTINGS = ("--set", "segments=16", "real_batch=64", "discriminator_updates=2")
@@ -52,7 +64,8 @@ def files(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def trained(files: Path) -> Path:
     out = files / "udr"
-    command(udr, "--effects", files / "found.yaml", "--out", out, *SMALL, "--chunk", 24)
+    with_effects = ("--env", ENV, "--effects", files / "found.yaml")
+    command(udr, *with_effects, "--out", out, *SMALL, "--chunk", 24)
     return out
 
 
@@ -60,9 +73,9 @@ def test_the_run_says_what_it_was_trained_with(trained: Path) -> None:
     results = read(trained / "results.json")
     assert results["effects"]["effects"][0]["columns"] == {"coulomb": 0.3}
     assert results["target"][NAMES[0]] == 0.3 and results["target"][NAMES[1]] == 0.03
-    assert results["target"]["pole_damping"] == 0.003
+    assert results["target"]["damping"] == 0.15
     assert read(trained / "config.json")["config"]["effects"] == results["effects"]
-    assert "coulomb_friction@cart" in (trained / "report.html").read_text()
+    assert "coulomb_friction@hinge" in (trained / "report.html").read_text()
 
 
 def test_evaluate_restores_the_effects_and_takes_others(
@@ -71,39 +84,41 @@ def test_evaluate_restores_the_effects_and_takes_others(
     got = []
     for k, more in enumerate(((), ("--effects", files / "hidden.yaml"))):
         out = files / f"evaluated{k}.json"
-        command(evaluate, "--run", trained, "--episodes", 4, "--out", out, *more)
+        run = ("--env", ENV, "--run", trained)
+        command(evaluate, *run, "--episodes", 4, "--out", out, *more)
         got.append(read(out))
     assert set(NAMES) <= set(got[0]["target"])
     assert got[0]["effects"] == read(trained / "results.json")["effects"]
     assert NAMES[0] in got[1]["target"] and NAMES[1] not in got[1]["target"]
     assert got[0]["returns"] != got[1]["returns"]
-    assert "coulomb_friction@cart, actuator_delay@cart" in capsys.readouterr().out
+    assert "coulomb_friction@hinge, actuator_delay@motor" in capsys.readouterr().out
 
 
 def test_training_goes_on_from_another_run(trained: Path, files: Path, capsys) -> None:
     """One iteration with updates: networks are nearly those of the first run, for a
     seed of its own and for one that the run lacks."""
     out = files / "tuned"
-    short = ("--env-steps", 2100, "--eval-episodes", 4)
-    start = ("--start-from", trained, "--effects", files / "found.yaml")
+    short = ("--env-steps", 250, "--eval-episodes", 4)
+    start = ("--env", ENV, "--start-from", trained, "--effects", files / "found.yaml")
     command(udr, *start, "--out", out, *short, "--seeds", 0, 7)
-    first = load_policies(trained)["policies"]
-    tuned = load_policies(out)["policies"]
+    first = load_policies(trained, env_file=ENV)["policies"]
+    tuned = load_policies(out, env_file=ENV)["policies"]
     for a, b in zip(
         jax.tree.leaves(first.network), jax.tree.leaves(tuned.network), strict=True
     ):
         for seed in (0, 1):
             np.testing.assert_allclose(a[0], b[seed], atol=0.05)
-    said = refused(
-        capsys, udr, *start, "--out", files / "no", *short, "--algorithm", "ppo"
-    )
+    both = files / "both.py"
+    both.write_text(SAC_AND_PPO)
+    other = ("--env", both, *start[2:], "--out", files / "no", "--algorithm", "ppo")
+    said = refused(capsys, udr, *other)
     assert "its algorithm is sac, this training's ppo" in said
     assert not (files / "no").exists()
 
 
 def test_resume_needs_the_same_effects(trained: Path, files: Path, capsys) -> None:
     before = read(trained / "results.json")
-    again = ("--out", trained, *SMALL, "--chunk", 24, "--resume")
+    again = ("--env", ENV, "--out", trained, *SMALL, "--chunk", 24, "--resume")
     command(udr, "--effects", files / "found.yaml", *again)
     assert read(trained / "results.json") == before
     other = files / "other.yaml"
@@ -114,7 +129,7 @@ def test_resume_needs_the_same_effects(trained: Path, files: Path, capsys) -> No
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (HIDDEN.replace("at: cart", "at: hinge"), "names no joint"),
+        (HIDDEN.replace("at: hinge", "at: cart"), "names no joint"),
         (HIDDEN.replace("kind: joint", "kind: body"), "of kind joint"),
         ("refitted: 3\neffects: []", "holds a list"),
     ],
@@ -122,12 +137,14 @@ def test_resume_needs_the_same_effects(trained: Path, files: Path, capsys) -> No
 def test_bad_files_leave_nothing_behind(text: str, said: str, tmp_path, capsys) -> None:
     path = tmp_path / "effects.yaml"
     path.write_text(text)
+    own = ("--env", ENV)
     for option in ("--effects", "--target-effects"):
         out = tmp_path / "out"
-        assert said in refused(capsys, udr, option, path, "--out", out)
+        assert said in refused(capsys, udr, *own, option, path, "--out", out)
         assert not out.exists()
     line = refused(
-        capsys, udr, "--effects", tmp_path / "none.yaml", "--out", tmp_path / "out"
+        capsys,
+        *(udr, *own, "--effects", tmp_path / "none.yaml", "--out", tmp_path / "out"),
     )
     assert "cannot be read" in line
 
@@ -137,7 +154,8 @@ def test_the_chain_with_known_and_hidden_effects(trained: Path, files: Path) -> 
     out = files / "easi"
     command(
         easi,
-        *("--udr", trained, "--out", out, *SEARCH, *SETTINGS, "--oracle"),
+        *("--env", ENV, "--udr", trained, "--out", out, *SEARCH, *SETTINGS),
+        "--oracle",
         *("--target-effects", files / "hidden.yaml", "--eval-episodes", 4),
     )
     told = read(out / "distribution.json")
@@ -146,7 +164,7 @@ def test_the_chain_with_known_and_hidden_effects(trained: Path, files: Path) -> 
     results = read(out / "results.json")
     assert set(results["methods"]) == {"UDR", "EASI", "Oracle"}
     assert results["effects"] and results["target_effects"]
-    command(evaluate, "--run", out, "--policy", "Oracle", "--episodes", 4)
+    command(evaluate, "--env", ENV, "--run", out, "--policy", "Oracle", "--episodes", 4)
 
 
 @pytest.mark.slow
@@ -154,7 +172,8 @@ def test_the_whole_chain_in_one_program(files: Path) -> None:
     out = files / "pipeline"
     command(
         pipeline,
-        *("--effects", files / "found.yaml", "--out", out, *SMALL, *SEARCH),
+        *("--env", ENV, "--effects", files / "found.yaml", "--out", out),
+        *(*SMALL, *SEARCH),
         *("--target-effects", files / "hidden.yaml", *SETTINGS),
     )
     results = read(out / "results.json")
@@ -164,13 +183,14 @@ def test_the_whole_chain_in_one_program(files: Path) -> None:
 
 @pytest.mark.slow
 def test_retraining_tests_both_policies_with_the_effects(files: Path) -> None:
-    out = files / "retrained"
-    told = retrain("cartpole", out, files / "found.yaml", (0, 3), 2400)
+    out, found = files / "retrained", files / "cartpole.yaml"
+    found.write_text(FOUND.replace("hinge", "cart").replace("motor", "cart"))
+    told = retrain("cartpole", out, found, (0, 3), 2400)
     assert told.env_steps == 2400 and told.robot == "cartpole"
     for which, returns in (("with", told.with_effects), ("without", told.without)):
         assert set(returns) == {"0", "3"}
         results = read(out / f"retrain_{which}" / "results.json")
-        assert results["target"][NAMES[0]] == 0.3
+        assert results["target"]["coulomb_friction@cart.torque"] == 0.3
         assert ("effects" in results) == (which == "with")
     assert told.with_effects != told.without
 
