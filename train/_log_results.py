@@ -4,8 +4,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from train._results import (
     distribution_json,
     history_figure,
@@ -35,16 +33,11 @@ def write(
     ``errors_of`` is of `easi_jax.estimation.from_runs.ready_errors`.
     """
     from easi_jax.estimation.from_runs import held_out_errors
-    from easi_jax.estimation.identifiability import seed_result
+    from easi_jax.estimation.relative import seed_results
     from easi_jax.io.report.logs_report import logs_report
     from easi_jax.io.runs.versions import versions
 
-    results = []
-    for found in estimates:
-        root = np.asarray(found.distribution.factor, np.float64)
-        results.append(
-            seed_result(space, found.distribution.mean, root @ root.T, found.hessian)
-        )
+    results = seed_results(problem.simulator, space, estimates)
     means = [found.distribution.mean for found in estimates]
     errors = held_out_errors(problem, space, means, errors_of)
     best = errors.best

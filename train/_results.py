@@ -150,19 +150,23 @@ def write_transfer(
     Returns:
         The first seed's parameters, and what its data do not determine.
     """
-    from easi_jax.estimation.identifiability import seed_result
+    import jax
+
+    from easi_jax.estimation.relative import seed_results
     from easi_jax.io.report.easi_report import easi_report, medians_of, motion_strip
     from easi_jax.io.runs.versions import versions
     from easi_jax.rl.presets import algorithm_of
 
     space, config, notes = pipe.space, pipe.config, list(notes)
     truth = truth_of(pipe, theta)
-    dist = estimate.distribution
-    results = []
-    for i in range(len(seeds)):
-        root = np.asarray(dist.factor[i], np.float64)
-        found = seed_result(space, dist.mean[i], root @ root.T, estimate.hessian[i])
-        results.append(found)
+    noisy = any(x > 0 for x in config.noise)
+    results = seed_results(
+        pipe.simulator,
+        space,
+        [jax.tree.map(lambda x, i=i: x[i], estimate) for i in range(len(seeds))],
+        free_starts=noisy,
+        adjusted=True,
+    )
     shares = medians_of(transfer.held_out)
     folder.write_json(
         "distribution.json",

@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,12 +11,11 @@ from easi_jax.model.parameters import Parameter, ParameterSpace
 from easi_jax.model.results import (
     LEAK,
     Flag,
-    Relative,
     SeedResult,
     Undetermined,
 )
 
-_WEAK = 0.5  # std of a log ratio beyond which a direction is called undetermined
+WEAK = 0.5  # std of a log ratio beyond which a direction is called undetermined
 _ALONE = 0.998  # of a parameter's own direction unseen: it leaves no trace
 _PART = 0.3  # of a mass in what is unseen: enough to settle a direction
 _AT = 1e-3  # unit coordinates from a bound that count as at it
@@ -59,7 +57,7 @@ class Identifiability:
 
 
 def identifiability(
-    space: ParameterSpace, hessian: np.ndarray, weak: float = _WEAK
+    space: ParameterSpace, hessian: np.ndarray, weak: float = WEAK
 ) -> Identifiability:
     """Reads the Fisher information ``hessian (n, n)`` (unit coordinates).
 
@@ -200,44 +198,6 @@ def seed_result(
         cramer_rao_std=ident.std.tolist(),
         determined_directions=ident.rank,
         undetermined=[Undetermined(d, describe(d)) for d in ident.undetermined],
-        relative=relative(space, ident, mean, cov),
-    )
-
-
-def relative(
-    space: ParameterSpace, ident: Identifiability, unit_mean: np.ndarray, cov: Any
-) -> Relative | None:
-    """The result given what the owner of a machine knows: masses and lengths in the
-    undetermined directions are taken at their nominal values, and all move with them.
-
-    ``cov (n, n)`` in unit coordinates. None where there are none.
-    """
-    gain, chosen = settled(space, ident)
-    if not chosen:
-        return None
-    names, n = ident.names, space.size
-    nominal = np.asarray(space.to_unit(space.nominal), float)
-    move = np.eye(n)
-    move[:, chosen] -= gain
-    scaled = np.asarray(unit_mean, float) * ident.scale
-    off = scaled[chosen] - nominal[chosen] * ident.scale[chosen]
-    center = (scaled - gain @ off) / ident.scale
-    outer = np.outer(ident.scale, ident.scale)
-    spread = move @ (cov * outer) @ move.T
-    below, above = _ends(space, center, spread / outer)
-    bound = move @ (ident.covariance * outer) @ move.T
-    alone = (ident.null**2).sum(1) > _ALONE
-    unseen = np.linalg.norm(move @ np.where(alone[:, None], 0.0, ident.null), axis=1)
-    # Found so closely, and not only to be found so by data of this kind.
-    widest = np.sqrt(np.maximum(np.diag(bound), np.diag(spread)))
-    known = (widest < _WEAK) & (unseen < LEAK) & ~alone
-    known[chosen] = False
-    return Relative(
-        taken={names[i]: float(space.nominal[i]) for i in chosen},
-        mean=_si(space, center).tolist(),
-        std=(0.5 * (above - below)).tolist(),
-        determined=known.tolist(),
-        gain=gain.tolist(),
     )
 
 

@@ -56,14 +56,14 @@ def polish(
     noise: jax.Array,
     mesh: Mesh | None = None,
     misfit: jax.Array | None = None,
+    free_starts: bool = True,
 ) -> RefineResult:
-    """A fit ``unit (n,)`` after steps on ``segments``, starts free; pure, for use
-    inside jit.
+    """A fit ``unit (n,)`` after steps on ``segments``; pure, for use inside jit.
 
     Args:
         segments: those that count now, all M of them; the fit may come from others.
         noise: standard deviations of the measurement, ``(2 nv,)``, above zero.
-        misfit: as in `easi_jax.estimation.levenberg_marquardt.refine`.
+        misfit, free_starts: as in `easi_jax.estimation.levenberg_marquardt.refine`.
 
     Returns:
         The place of least cost among the fit's own, its starts as they were measured,
@@ -72,7 +72,7 @@ def polish(
         does not get through at ``unit`` counts nothing; at a place where one of the
         others explodes the cost is infinite.
     """
-    paired = PairedFit(simulator, space, segments, noise, mesh)
+    paired = PairedFit(simulator, space, segments, noise, mesh, free_starts)
     weight = step_weights(segments, noise, misfit)
     low, high = space.unit_bounds
     given = unit

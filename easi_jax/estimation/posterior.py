@@ -48,6 +48,8 @@ class Estimate:
             (`easi_jax.estimation.levenberg_marquardt.excess`).
         simulated: control steps simulated since the search, ``()``; a derivative
             counts as one more.
+        pieces: M segments that all this is about, with their weights.
+        misfit: what the model errs by in every step, ``(2 nv,)``, beyond the noise.
     """
 
     distribution: Distribution
@@ -60,6 +62,8 @@ class Estimate:
     fit: jax.Array
     excess: jax.Array
     simulated: jax.Array
+    pieces: Segments
+    misfit: jax.Array
 
 
 def estimate(
@@ -99,6 +103,7 @@ def estimate(
     What may be as good as zero is stated as `_near_zero` says.
     """
     assumed = effective_noise(simulator, pieces, noise)
+    off = jnp.zeros_like(assumed) if misfit is None else misfit
     if refined:
         fit = refine(
             simulator,
@@ -121,7 +126,7 @@ def estimate(
             more = polished(*given)
             simulated = fit.simulated + more.simulated
             return replace(more, search_mean=mean, simulated=simulated)
-        return _of_fit(space, fit, mean, cov, assumed, informed)
+        return _of_fit(space, fit, mean, cov, assumed, informed, pieces, off)
     weight = step_weights(pieces, assumed, misfit)
     zero = jnp.zeros((pieces.count, len(noise)))
     paired = PairedFit(simulator, space, pieces, assumed, mesh, free_starts)
@@ -141,6 +146,8 @@ def estimate(
         fit=mean,
         excess=left,
         simulated=simulated,
+        pieces=pieces,
+        misfit=off,
     )
 
 
@@ -154,6 +161,8 @@ def polished(
     informed: bool = True,
     mesh: Mesh | None = None,
     misfit: jax.Array | None = None,
+    free_starts: bool = True,
+    adjusted: bool = False,
 ) -> Estimate:
     """The `estimate` of a fit at ``center (n,)`` after `easi_jax.estimation.polish`;
     pure.
@@ -162,11 +171,15 @@ def polished(
         cov: of the search, ``(n, n)``.
         rest: pieces of the whole recording, R of them: cost, corrections of starts
             ``(R, 2 nv)`` and information are theirs.
-        noise, informed, misfit: as in `estimate`.
+        noise, informed, misfit, free_starts, adjusted: as in `estimate`.
     """
     assumed = effective_noise(simulator, rest, noise)
-    fit = polish(simulator, space, center, rest, assumed, mesh, misfit)
-    return _of_fit(space, fit, center, cov, assumed, informed)
+    off = jnp.zeros_like(assumed) if misfit is None else misfit
+    fit = polish(simulator, space, center, rest, assumed, mesh, off, free_starts)
+    if adjusted and free_starts and not simulator.by_differences:
+        given = simulator, space, fit.unit, rest, assumed, mesh, off
+        fit = _adjusted(fit, adjust(*given))
+    return _of_fit(space, fit, center, cov, assumed, informed, rest, off)
 
 
 def _of_fit(
@@ -176,6 +189,8 @@ def _of_fit(
     cov: jax.Array,
     noise: jax.Array,
     informed: bool,
+    pieces: Segments,
+    misfit: jax.Array,
 ) -> Estimate:
     """What is stated of a fit, after a search that ended at ``mean``, ``cov``."""
 
@@ -196,6 +211,8 @@ def _of_fit(
         fit=fit.unit,
         excess=fit.excess,
         simulated=fit.simulated,
+        pieces=pieces,
+        misfit=misfit,
     )
 
 

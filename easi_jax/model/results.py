@@ -8,7 +8,6 @@ from typing import Literal
 import numpy as np
 
 from easi_jax.model.found_effects import EffectEntry, FoundEffects
-from easi_jax.model.parameters import ParameterSpace
 
 Flag = Literal["determined", "not determined", "at bound"]
 LEAK = 0.05  # part of a parameter in what is unseen, above which it is not known
@@ -236,7 +235,7 @@ class Relative:
     """Parameters once some are known that data alone do not determine.
 
     Masses and lengths along undetermined directions are taken as the model has them,
-    as their owner has weighed or measured them. The other parameters move with them.
+    as their owner has weighed or measured them. The others are fitted again with them.
 
     Attributes:
         taken: these parameters and their values in the model, SI.
@@ -256,20 +255,6 @@ class Relative:
         """Those of ``taken`` that the value of parameter ``i`` rests on."""
         pairs = zip(self.taken, self.gain[i], strict=True)
         return [name for name, gain in pairs if abs(gain) > LEAK]
-
-    def settle(self, space: ParameterSpace, values: np.ndarray) -> np.ndarray:
-        """SI values ``(n,)`` moved along the undetermined directions, to where
-        ``taken`` have their values; NaN stays NaN."""
-        low, high = space.initial
-        width = high - low
-        off = np.zeros(len(self.taken))
-        for k, (name, known) in enumerate(self.taken.items()):
-            i = space.index(name)
-            ratio = np.log(values[i] / known) if space.log[i] and values[i] > 0 else 0.0
-            off[k] = ratio if space.log[i] else (values[i] - known) / width[i]
-        step = np.asarray(self.gain) @ np.nan_to_num(off)
-        log = space.log
-        return np.where(log, values * np.exp(-step * log), values - step * width)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ _RANKS: dict[Known, int] = {
     "at bound": 2,
     "not determined": 3,
 }
+_SAME = 1e-6  # relative, of a value in single precision that nobody has changed
 COLUMNS = ("parameter", "unit", "model", "found", "change", "known from the data")
 
 
@@ -26,11 +27,10 @@ def parameter_rows(
     """A row a parameter: those first that the data determine, and have moved.
 
     Where data leave a direction open, such as one factor of all masses and forces,
-    values are those of `SeedResult.relative`, and so is ``truth (n,)``.
+    values are those of `SeedResult.relative`. They have no ``truth (n,)`` to compare
+    with where what they rest on is another in truth than in the model.
     """
     known = result.relative
-    if truth is not None and known is not None:
-        truth = known.settle(space, truth)
     rows = []
     for i, p in enumerate(space.parameters):
         flag: Known = result.flags[i]
@@ -42,6 +42,10 @@ def parameter_rows(
             elif depends and known.determined[i]:
                 flag = "relative"
             mean, std = known.mean[i], known.std[i]
+        rests_on = [space.index(name) for name in depends] if flag == "relative" else []
+        comparable = truth is not None and np.allclose(
+            truth[rests_on], space.nominal[rests_on], rtol=_SAME, atol=0.0
+        )
         rows.append(
             ParameterRow(
                 name=p.name,
@@ -51,7 +55,7 @@ def parameter_rows(
                 mean=mean,
                 std=std,
                 flag=flag,
-                truth=None if truth is None else float(truth[i]),
+                truth=float(truth[i]) if comparable else None,
                 bounds=p.bounds,
                 nominal=p.nominal,
                 depends=depends if flag == "relative" else (),
