@@ -38,6 +38,7 @@ from easi_jax.io.logs.reader import read_logs
 from easi_jax.io.models.completed import base_joint, own_pose
 from easi_jax.io.models.mjcf import read_machine
 from easi_jax.io.models.parameter_file import read_parameter_file
+from easi_jax.io.report.numbers import quantity
 from easi_jax.model import distribution
 from easi_jax.model.checks import checked_array
 from easi_jax.model.distribution import Distribution
@@ -176,7 +177,7 @@ class Estimated:
         e = self.held_out
         width = max(map(len, (*self.names, *e.channels)))
         lines = [
-            f"{name:{width}}  {mean:.4g} ± {std:.2g} {unit}".rstrip()
+            f"{name:{width}}  {quantity(mean, std)} {unit}".rstrip()
             + (f"  ({flag})" if flag != "determined" else "")
             for name, mean, std, unit, flag in zip(
                 *(self.names, self.mean, self.std, self.units, self.flags), strict=True

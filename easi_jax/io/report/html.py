@@ -74,10 +74,12 @@ class ParameterRow:
 
     @property
     def change(self) -> str:
-        """A multiple of the model's value, where what was found can be believed."""
+        """A multiple of the model's value, where what was found can be believed; two
+        digits where the deviation leaves no more."""
         if self.flag not in ("determined", "relative") or not self.nominal:
             return "-"
-        return f"x {number(self.mean / self.nominal, 3)}"
+        digits = 3 if self.std < 0.1 * abs(self.mean) else 2
+        return f"x {number(self.mean / self.nominal, digits)}"
 
     @property
     def verdict(self) -> str:

@@ -64,10 +64,11 @@ def quantity(mean: float, std: float) -> str:
     largest = max(abs(mean), std)
     power = math.floor(math.log10(largest))
     shift = power if power < -3 or power > 5 else 0
-    place = 1 - math.floor(math.log10(std)) + shift
+    # The power of the rounded number: 0.0996 has that of 0.1.
+    place = 1 - int(f"{std:.1e}".split("e")[1]) + shift
     digits = max(0, place)
     scale = 10.0**shift
-    text = f"{mean / scale:.{digits}f} ± {std / scale:.{digits}f}"
+    text = " ± ".join(f"{round(x / scale, place):.{digits}f}" for x in (mean, std))
     return f"({text})·{_power(shift)}" if shift else text
 
 

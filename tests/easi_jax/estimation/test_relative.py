@@ -1,6 +1,7 @@
 """Results once the owner's weighed masses settle what motion alone cannot show."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -38,32 +39,34 @@ class Bench:
     ) -> None:
         self.space = space = cartpole.space.select(list(names))
         self.simulator = Simulator(cartpole.mj_model, space, cartpole.dt)
-        self.std, self.seen = 0.01, lambda value: jnp.zeros(12)
+        self.std = 0.01
+        self.seen: Seen = lambda _: jnp.zeros(12)
         addresses = {p.addresses[0]: p.name for p in space.parameters}
         bench = self
 
-        class Seen(PairedFit):
+        class Bare(PairedFit):
             def _residual(self, unit: jax.Array, d: jax.Array, s: Segments) -> Any:
                 own = dict(zip(self.space.names, self.space.to_si(unit), strict=True))
                 held = {addresses[a]: x for a, x in self.simulator.fixed.items()}
-                return bench.seen(own | held).reshape(3, 4) - s.next_qvel
+                measured = jnp.concatenate([s.next_qpos, s.next_qvel], 1)
+                return bench.seen(own | held).reshape(3, 4) - measured
 
-        monkeypatch.setattr(module, "PairedFit", Seen)
-        self.fit = Seen
+        monkeypatch.setattr(module, "PairedFit", Bare)
 
     def numbers(self, unit: Any) -> jax.Array:
         si = self.space.to_si(jnp.asarray(unit))
         return self.seen(dict(zip(self.space.names, si, strict=True)))
 
-    def found(self, unit: Any, measured: Any, misfit: float = 0.0) -> Estimate:
+    def found(self, unit: Any, measured: Any) -> Estimate:
         """A fit that ended at ``unit``, where it sees ``measured``."""
         noise = jnp.full(4, self.std)
+        measured = jnp.asarray(measured).reshape(1, 3, 4)
         pieces = Segments(
             qpos=jnp.zeros((1, 2)),
             qvel=jnp.zeros((1, 2)),
             ctrl=jnp.zeros((1, 3, 1)),
-            next_qpos=jnp.zeros((1, 3, 2)),
-            next_qvel=jnp.asarray(measured).reshape(1, 3, 4),
+            next_qpos=measured[..., :2],
+            next_qvel=measured[..., 2:],
             weight=jnp.ones(1),
         )
         unit = jnp.asarray(unit)
@@ -82,7 +85,7 @@ class Bench:
             excess=jnp.zeros(()),
             simulated=jnp.zeros(()),
             pieces=pieces,
-            misfit=jnp.full(4, misfit),
+            misfit=jnp.zeros(4),
         )
 
     def stated(self, estimates: Sequence[Estimate]) -> list[SeedResult]:
@@ -187,11 +190,15 @@ def test_what_is_not_known_closely_is_not_called_known(bench: Bench) -> None:
     exact, found = _found(bench, np.zeros(space.size), [_common(space)])
     assert found.relative is not None and any(found.relative.determined)
     # A search alone, whose place is no best fit.
-    (unfitted,) = bench.stated([exact.replace(cost=jnp.zeros(0))])
+    (unfitted,) = bench.stated([replace(exact, cost=jnp.zeros(0))])
     assert unfitted.relative is None
     # Far more is left over than the noise makes.
     (poor,) = bench.stated(
-        [exact.replace(pieces=exact.pieces.replace(next_qvel=jnp.full((1, 3, 4), 9.0)))]
+        [
+            replace(
+                exact, pieces=replace(exact.pieces, next_qvel=jnp.full((1, 3, 2), 9.0))
+            )
+        ]
     )
     assert poor.relative is not None and not any(poor.relative.determined)
     # The data themselves show little.
@@ -210,23 +217,20 @@ def test_what_is_stated_covers_the_truth_along_a_curve(
     def parts(v: dict[str, Any]) -> jax.Array:
         whole = v["cart_mass"] + v["pole_mass"]
         inertia = v["pole_armature"] + 0.03 * v["pole_mass"]
-        return jnp.log(jnp.stack([whole, inertia, v["cart_kp"]]))
+        return jnp.stack([whole, inertia, v["cart_kp"]])
 
-    bench.seen = lambda v: jnp.tile(parts(v), 4)
+    right = parts(dict(zip(bench.space.names, bench.space.nominal, strict=True)))
+    bench.seen = lambda v: jnp.tile(jnp.log(parts(v) / right), 4)
     space, draws = bench.space, 200
     rng = np.random.default_rng(0)
     truth = np.asarray(space.nominal, float)
-    exact = np.asarray(bench.numbers(space.to_unit(truth)), float)
     noise = rng.normal(0.0, bench.std, (draws, 12))
     noise[0] = 0.0
-    measured = exact + noise
     # Best fits are all along the curve; each search ends somewhere on it.
-    whole, inertia, kp = np.exp(measured.reshape(draws, 4, 3).mean(1)).T
+    whole, inertia, kp = (np.exp(noise.reshape(draws, 4, 3).mean(1)) * right).T
     pole = truth[0] * np.exp(rng.normal(0.0, 0.3, draws))
     fits = np.stack([pole, whole - pole, inertia - 0.03 * pole, kp], 1)
-    ends = [
-        bench.found(space.to_unit(f), m) for f, m in zip(fits, measured, strict=True)
-    ]
+    ends = [bench.found(space.to_unit(f), m) for f, m in zip(fits, noise, strict=True)]
     stated = [r.relative for r in bench.stated(ends)]
     given = [i for i, r in enumerate(stated) if r and "pole_mass" in r.taken]
     assert len(given) > 0.9 * draws and given[0] == 0

@@ -196,3 +196,8 @@ def test_written_whole_or_refused(tmp_path, report):
     with pytest.raises(UserError, match="cannot write"):
         write_report(tmp_path / "report.html" / "x.html", report)
     assert (tmp_path / "report.html").read_text(encoding="utf-8") == written
+
+
+def test_a_change_has_no_more_digits_than_its_deviation_leaves():
+    assert _row(nominal=0.3, mean=0.3704, std=0.004).change == "x 1.23"
+    assert _row(nominal=0.3, mean=0.3704, std=0.1).change == "x 1.2"
