@@ -43,9 +43,11 @@ def parameter_rows(
                 flag = "relative"
             mean, std = known.mean[i], known.std[i]
         rests_on = [space.index(name) for name in depends] if flag == "relative" else []
-        comparable = truth is not None and np.allclose(
+        real = None if truth is None else float(truth[i])
+        if truth is not None and not np.allclose(
             truth[rests_on], space.nominal[rests_on], rtol=_SAME, atol=0.0
-        )
+        ):
+            real = None
         rows.append(
             ParameterRow(
                 name=p.name,
@@ -55,7 +57,7 @@ def parameter_rows(
                 mean=mean,
                 std=std,
                 flag=flag,
-                truth=float(truth[i]) if comparable else None,
+                truth=real,
                 bounds=p.bounds,
                 nominal=p.nominal,
                 depends=depends if flag == "relative" else (),
