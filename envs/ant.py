@@ -192,6 +192,11 @@ class FootLoads:
         contacts = [int(np.flatnonzero(pairs[:, 1] == f.id)[0]) for f in feet]
         return cls(tuple(contacts), tuple(int(f.bodyid[0]) for f in feet))
 
+    @property
+    def native(self) -> "NativeFootLoads":
+        """The same on the engine ``mujoco``."""
+        return NativeFootLoads(self.bodies)
+
     def __call__(self, m: Any, d: Any) -> jax.Array:
         out = []
         for k, body in zip(self.contacts, self.bodies, strict=True):
@@ -201,3 +206,25 @@ class FootLoads:
             arm = contact.pos[k] - d.xpos[body]
             out += [frame @ force, frame @ jnp.cross(arm, force)]
         return jnp.concatenate(out)
+
+
+@dataclass(frozen=True)
+class NativeFootLoads:
+    """As `FootLoads`, of MuJoCo C's forces from outside on each foot."""
+
+    bodies: tuple[int, ...]
+    fields = ("cfrc_ext", "subtree_com", "xpos", "xmat")
+    size = 24
+    root = 1  # the torso, whose subtree is the robot
+
+    def __call__(self, *given: np.ndarray) -> np.ndarray:
+        outer, com, pos, mat = given
+        rows = np.array(self.bodies)
+        torque, force = outer[:, rows, :3], outer[:, rows, 3:]
+        # MuJoCo's torque is about the center of mass of the whole robot.
+        arm = pos[:, rows] - com[:, self.root, None]
+        torque = torque - np.cross(arm, force)
+        frame = mat[:, rows].reshape(len(mat), len(rows), 3, 3)
+        loads = np.stack([force, torque], 2)
+        return np.einsum("nbji,nbkj->nbki", frame, loads).reshape(len(mat), self.size)
+

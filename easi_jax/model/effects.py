@@ -31,6 +31,7 @@ from easi_jax.model.effect_numbers import (
     fields_that_act,
 )
 from easi_jax.model.joint_space import scalar_places
+from easi_jax.model.native_model import NativeModel
 from easi_jax.model.set_const import set_const
 
 _TINY = 1e-9
@@ -199,6 +200,7 @@ def with_effects(
     def on(*names: str) -> bool:
         return present is None or any(name in present for name in names)
 
+    native = isinstance(m, NativeModel)
     new: dict[str, Any] = {}
     if on("mass", "spread"):
         mass = m.body_mass
@@ -223,7 +225,7 @@ def with_effects(
         new["geom_friction"] = m.geom_friction.at[:, 0].multiply(e.friction)
         if m.npair:
             new["pair_friction"] = m.pair_friction.at[:, :2].multiply(e.friction)
-    if on("softness") and m.opt.integrator == IntegratorType.RK4:
+    if on("softness") and (native or m.opt.integrator == IntegratorType.RK4):
         new["geom_solref"] = _softened(m.geom_solref, e.softness)
         if m.npair:
             new["pair_solref"] = _softened(m.pair_solref, e.softness)

@@ -18,6 +18,7 @@ from easi_jax.model import effects as physical
 from easi_jax.model.addresses import Writer, open_gates, resolve
 from easi_jax.model.effects import Effects
 from easi_jax.model.mjx_data import make_data, without_idle_cone
+from easi_jax.model.native_model import NativeModel, Template
 from easi_jax.model.quantities import length_of, long_axis, unit_inertia
 from easi_jax.model.set_const import set_const
 from easi_jax.model.torque_speed import TorqueSpeed
@@ -30,7 +31,8 @@ class Model:
     """What a simulation runs on; a pytree.
 
     Attributes:
-        mjx: the MJX model.
+        mjx: the MJX model; for the engine ``mujoco`` a `NativeModel`, which has the
+            same fields.
         speed_limit: largest joint speed, ``(nv,)`` [m/s, rad/s]; inf where none.
         writers: which numbers follow which parameter (static).
         long_axes: the axis of each geom that its length is measured along (static).
@@ -151,6 +153,8 @@ def put_model(
     addresses_per_parameter: Iterable[Iterable[str]] = (),
     fixed: Mapping[str, float] | None = None,
     sensors: bool = True,
+    native: bool = False,
+    timestep: float | None = None,
 ) -> Model:
     """Puts a MuJoCo model on the device, ready to have parameters written into it.
 
@@ -160,13 +164,15 @@ def put_model(
         fixed: values by address that stay, effects among them.
         sensors: whether ``sensordata`` is computed; without, sensors that MJX lacks
             do no harm.
+        native: for the engine ``mujoco``, which simulates all that MuJoCo can.
+        timestep: physics step [s]; the model's own where None.
 
     Raises:
         UserError: an address that does not fit the model; or the model uses what MJX
             cannot simulate or would ignore, by name.
     """
     per_parameter = tuple(tuple(a) for a in addresses_per_parameter)
-    ignored = _unsupported(mj_model)
+    ignored = None if native else _unsupported(mj_model)
     if ignored is not None:
         what, do = ignored
         raise UserError(
@@ -180,11 +186,17 @@ def put_model(
     if not sensors:
         opened.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
         opened.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK  # known to MJX
-    with refusals(Exception):
-        put = mjx.put_model(without_idle_cone(opened), own_device(), impl="jax")
-        make_data(put)
-    if any(w.row.moves_center for w in writers):
-        put = full_structure(put)
+    if timestep is not None:
+        opened.opt.timestep = timestep
+    moves_center = any(w.row.moves_center for w in writers)
+    if native:
+        put: Any = _put_native(opened, writers, moves_center)
+    else:
+        with refusals(Exception):
+            put = mjx.put_model(without_idle_cone(opened), own_device(), impl="jax")
+            make_data(put)
+        if moves_center:
+            put = full_structure(put)
     n = len(per_parameter)
     lasting = [replace(w, parameter=w.parameter - n) for w in writers]
     lasting = tuple(w for w in lasting if w.parameter >= 0)
@@ -201,6 +213,19 @@ def put_model(
     return _written(model, values).replace(
         writers=tuple(w for w in writers if w.parameter < n)
     )
+
+
+def _put_native(
+    opened: mujoco.MjModel, writers: Iterable[Writer], moves_center: bool
+) -> NativeModel:
+    """The model for MuJoCo C, which must not take shortcuts that a parameter undoes."""
+    # What diverges is told, not put back to its start.
+    opened.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    if moves_center:
+        opened.body_sameframe[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+        opened.geom_sameframe[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    limits = any(e.field == "speed_limit" for w in writers for e in w.entries)
+    return NativeModel(Template(opened, limits))
 
 
 def full_structure(m: mjx.Model) -> mjx.Model:

@@ -15,6 +15,7 @@ from mujoco import mjx
 from mujoco.mjx._src import smooth, support
 
 from easi_jax.model.mjx_data import make_data
+from easi_jax.model.native_model import NativeModel
 
 _ELIMINATE_UP_TO = 24
 
@@ -65,8 +66,11 @@ def set_const(m: mjx.Model) -> mjx.Model:
     Sets body_subtreemass, body_invweight0, dof_invweight0, dof_M0,
     tendon_invweight0, actuator_acc0, cam_poscom0 and stat.meaninertia, as
     `mujoco.mj_setConst` does. Lengths and poses at ``qpos0`` do not follow from masses
-    and stay. Pure; works under jit, vmap and forward derivatives.
+    and stay. Pure; works under jit, vmap and forward derivatives. For the engine
+    ``mujoco`` nothing is done here: MuJoCo C does it where the model is simulated.
     """
+    if isinstance(m, NativeModel):
+        return m
     mass = m.body_mass
     subtree = jnp.asarray(_ancestry(m), mass.dtype)
     m = m.replace(body_subtreemass=subtree @ mass)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,12 +19,15 @@ from easi_jax.model.joint_space import Configuration, tangent_names
 from easi_jax.model.mjx_model import Model, Sense, put_model, with_parameters
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.torque_speed import TorqueSpeed
+from easi_jax.simulation import native_step
+from easi_jax.simulation.engine import Engine, resolved
 from easi_jax.simulation.step import WRITTEN_OUT, Physics, at_rest, control_step
 
 # Small enough for XLA to run a simulation as one piece (see `runtime`).
 _BATCH = 128  # benchmarks/speed.py
 _WIDE_BATCH = 32  # benchmarks/physics.py
 _ACCELERATOR_BATCH = 16_384  # benchmarks/scaling.py
+_NATIVE_BATCH = 4_096  # few calls, and 100 MB at most of models' numbers
 _FORWARD_MODE = 3  # degrees of freedom: of six, written out, it compiles for minutes
 _SETTLED = 4.0  # time constants after which a lag has forgotten
 
@@ -36,6 +40,7 @@ class Simulator:
         space: the parameters that may vary.
         base: the model on the device, nominal values in it, gates opened.
         dt: control step [s].
+        engine: ``mjx`` or ``mujoco`` (`easi_jax.simulation.engine`).
         substeps: physics steps in a control step. The physics step is ``dt``
             divided by the smallest whole number that brings it to the model's own
             timestep or below.
@@ -59,7 +64,9 @@ class Simulator:
         sense_size: int = 0,
         torque_speed: TorqueSpeed | None = None,
         fixed: Mapping[str, float] | None = None,
+        engine: Engine | None = None,
     ) -> None:
+        self.engine = resolved(engine, mj_model)
         step = float(mj_model.opt.timestep)
         self.dt = float(dt) if dt is not None else step
         if not 0 < self.dt < 10:
@@ -68,8 +75,9 @@ class Simulator:
         self.mj_model = mj_model
         self.space = space
         self.fixed = dict(fixed or {})
+        native = self.engine == "mujoco"
         self.wide = mj_model.nv > WRITTEN_OUT
-        self.by_differences = mj_model.nv > _FORWARD_MODE
+        self.by_differences = native or mj_model.nv > _FORWARD_MODE
         self.base = self._put(sense is not None).replace(
             sense=sense,
             sense_size=sense_size,
@@ -87,6 +95,8 @@ class Simulator:
     def batch(self) -> int:
         """Simulations at once on a device. More would leave a CPU core's cache; an
         accelerator hides behind thousands what each step waits for."""
+        if self.engine == "mujoco":
+            return _NATIVE_BATCH
         if not on_cpu():
             return _ACCELERATOR_BATCH
         return _WIDE_BATCH if self.wide else _BATCH
@@ -104,9 +114,14 @@ class Simulator:
     def _put(self, sensors: bool) -> Model:
         # Eagerly, also where a machine is made while something is traced.
         with jax.ensure_compile_time_eval():
-            model = put_model(self.mj_model, self.space.addresses, self.fixed, sensors)
-            step = jnp.asarray(self.dt / self.substeps, model.mjx.opt.timestep.dtype)
-            return model.replace(mjx=model.mjx.tree_replace({"opt.timestep": step}))
+            return put_model(
+                self.mj_model,
+                self.space.addresses,
+                self.fixed,
+                sensors,
+                self.engine == "mujoco",
+                self.dt / self.substeps,
+            )
 
     def rebuilt(
         self,
@@ -125,6 +140,7 @@ class Simulator:
             base.sense_size,
             base.torque_speed,
             self.fixed if fixed is None else fixed,
+            self.engine,
         )
 
     def model(self, theta: jax.Array) -> Model:
@@ -155,6 +171,26 @@ class Simulator:
     def step(self, model: Model, state: Physics, ctrl: jax.Array) -> Physics:
         """One control step with ``ctrl`` ``(nu,)`` held."""
         return control_step(model, state, ctrl, self.substeps)
+
+    def replay(
+        self, model: Model, state: Physics, ctrl: jax.Array
+    ) -> tuple[jax.Array, jax.Array] | None:
+        """Positions and velocities ``(H, ...)`` after each of the commands
+        ``(H, nu)``, where the engine has a call for all of them; else None."""
+        if self.engine != "mujoco":
+            return None
+        e, substeps = model.effects, self.substeps
+        if e is None or not effects.has_command_memory(model.present):
+            shape = (len(ctrl), substeps, ctrl.shape[1])
+            arrived = jnp.broadcast_to(ctrl[:, None], shape)
+        else:
+
+            def sent(memory: Any, u: jax.Array) -> Any:
+                arrived, memory = effects.commands(e, memory, u, self.dt, substeps)
+                return memory, arrived
+
+            arrived = jax.lax.scan(sent, state.memory, ctrl)[1]
+        return native_step.replay(model, state, arrived)
 
     @cached_property
     def state_names(self) -> tuple[str, ...]:

@@ -22,9 +22,11 @@ from easi_jax.model.effects import Effects
 from easi_jax.model.joint_space import scalar_places
 from easi_jax.model.mjx_data import make_data
 from easi_jax.model.mjx_model import refusals
-from easi_jax.simulation import constraint_solver
+from easi_jax.model.native_model import NativeModel
+from easi_jax.simulation import constraint_solver, native_step
 from easi_jax.simulation.cpu.unroll import scalarized
 from easi_jax.simulation.mjx_patches import with_velocity_products
+from easi_jax.simulation.native import first_rest
 
 WRITTEN_OUT = 8  # degrees of freedom up to which a step is written out by entries
 
@@ -41,6 +43,8 @@ class Physics:
         sensed: what ``model.sense`` read in the last physics step; zeros before.
         memory: what the way of a command remembers, where effects lie on it.
         rotor: drives with play, where there are any.
+        rest: on the engine ``mujoco`` what else its state has (delayed commands and
+            readings, plugins, plastic deformation), ``(k,)``.
     """
 
     qpos: jax.Array
@@ -50,6 +54,7 @@ class Physics:
     sensed: Any = ()
     memory: Any = ()
     rotor: Any = ()
+    rest: Any = ()
 
     if TYPE_CHECKING:  # made by flax
 
@@ -66,7 +71,9 @@ def at_rest(model: Any, qpos: jax.Array, qvel: jax.Array) -> Physics:
         rotor = first_rotor(scalar_places(m), qpos, qvel)
     if e is not None and effects.has_command_memory(model.present):
         memory = effects.first_memory(model.delay_steps, m.nu)
-    return Physics(qpos, qvel, act, warm, sensed, memory, rotor)
+    native = isinstance(m, NativeModel)
+    rest = jnp.asarray(first_rest(m.template.mj), qpos.dtype) if native else ()
+    return Physics(qpos, qvel, act, warm, sensed, memory, rotor, rest)
 
 
 def data_at(model: Any, state: Physics, ctrl: jax.Array) -> mjx.Data:
@@ -215,6 +222,9 @@ _batched_substep = scalarized(substep, otherwise=partial(substep, wide=True))
 def control_step(model: Any, state: Physics, ctrl: jax.Array, substeps: int) -> Physics:
     """Holds ``ctrl`` ``(nu,)`` for ``substeps`` physics steps."""
     if model.effects is None or not effects.has_command_memory(model.present):
+        if isinstance(model.mjx, NativeModel):
+            held = jnp.broadcast_to(ctrl, (substeps, *ctrl.shape))
+            return arrived_step(model, state, held)
 
         def step(s: Physics, _: None) -> tuple[Physics, None]:
             return _batched_substep(model, s, ctrl), None
@@ -230,6 +240,8 @@ def control_step(model: Any, state: Physics, ctrl: jax.Array, substeps: int) -> 
 
 def arrived_step(model: Any, state: Physics, arrived: jax.Array) -> Physics:
     """One control step in which ``arrived (substeps, nu)`` reaches the actuators."""
+    if isinstance(model.mjx, NativeModel):
+        return native_step.steps(model, state, arrived)
 
     def step(s: Physics, u: jax.Array) -> tuple[Physics, None]:
         return _batched_substep(model, s, u), None

@@ -1,0 +1,478 @@
+"""Native MuJoCo on all cores, called from compiled programs.
+
+What a program carries across the boundary is `Physics` and the fields of the model that
+vary (`easi_jax.model.native_model`). On the other side are numpy and `mujoco.batch`
+only: a callback that used jax could wait for itself. Simulations are independent of
+each other and of the number of threads.
+"""
+
+import threading
+import weakref
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import batch as mujoco_batch
+
+from easi_jax.devices.runtime import cores
+from easi_jax.model.contact_pairs import pair_ids
+from easi_jax.model.native_model import NativeModel, Template, nominal_field
+from easi_jax.model.quantities import direct_solref
+
+_CTRL = int(mujoco.mjtState.mjSTATE_CTRL)
+_ALL = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+# Components of the state that `Physics` has no name for, where a model has them.
+_REST = (
+    mujoco.mjtState.mjSTATE_TIME,
+    mujoco.mjtState.mjSTATE_HISTORY,
+    mujoco.mjtState.mjSTATE_USERDATA,
+    mujoco.mjtState.mjSTATE_PLUGIN,
+    mujoco.mjtState.mjSTATE_PLASTIC,
+)
+_KEPT = 8  # batches kept for each model: chunks of a few sizes, on each device
+_RECORDED = 2**25  # numbers recorded at once, 256 MB
+
+
+def rest_size(m: mujoco.MjModel) -> int:
+    """How many numbers of the state `Physics` has no name for; 0 where nothing but the
+    time would be."""
+    sizes = [mujoco.mj_stateSize(m, int(part)) for part in _REST]
+    return sum(sizes) if sum(sizes) > 1 else 0
+
+
+def first_rest(m: mujoco.MjModel) -> np.ndarray:
+    """Those numbers at the start of a simulation."""
+    if not rest_size(m):
+        return np.zeros(0)
+    d, found = mujoco.MjData(m), []
+    for part in _REST:
+        row = np.zeros(mujoco.mj_stateSize(m, int(part)))
+        mujoco.mj_getState(m, d, row, int(part))
+        found.append(row)
+    return np.concatenate(found)
+
+
+class _Batch:
+    """Simulations on threads, with their models' numbers in place.
+
+    Attributes:
+        size: number of simulations.
+        fields: names of the fields that vary.
+        written: bytes of what they hold, and of which simulation has which.
+        failed: simulations whose model MuJoCo could not complete, ``(size,)`` bool.
+    """
+
+    def __init__(self, mj: mujoco.MjModel, size: int, fields: tuple[str, ...]) -> None:
+        self.size, self.fields = size, fields
+        self.written: tuple[Any, ...] | None = None
+        self.failed = np.zeros(size, bool)
+        self.batch = mujoco_batch.Batch(mj, size, _threads())
+        # Set before the first write: rows are shared with what is bound.
+        self.first = self.batch.state[:1].copy()
+
+    def component(self, part: mujoco.mjtState) -> np.ndarray:
+        offset, size = self.batch._component(part)
+        return self.batch.state[:, offset : offset + size]
+
+
+def _threads() -> int:
+    devices = jax.local_device_count() if jax.default_backend() == "cpu" else 1
+    return max(1, cores() // devices)
+
+
+class _Host:
+    """The other side of the boundary, of one template."""
+
+    def __init__(self, template: Template) -> None:
+        self.mj = template.mj
+        self._lock = threading.Lock()
+        self._free: list[_Batch] = []
+        self._derived: dict[tuple[str, ...], tuple[str, ...]] = {}
+
+    # Models ------------------------------------------------------------------
+
+    def _taken(self, key: tuple[Any, ...], size: int, fields: tuple[str, ...]) -> Any:
+        with self._lock:
+            fits = [b for b in self._free if (b.size, b.fields) == (size, fields)]
+            same = [b for b in fits if b.written == key]
+            if same or fits:
+                found = (same or fits)[-1]
+                self._free.remove(found)
+                return found
+        return _Batch(self.mj, size, fields)
+
+    def _back(self, b: _Batch) -> None:
+        with self._lock:
+            self._free.append(b)
+            del self._free[:-_KEPT]
+
+    def ready(
+        self, fields: tuple[str, ...], values: Sequence[np.ndarray], which: np.ndarray
+    ) -> _Batch:
+        """A batch in which simulation i has row ``which[i]`` of values ``(P, ...)``."""
+        key = (*(v.tobytes() for v in values), which.tobytes())
+        b = self._taken(key, len(which), fields)
+        if b.written == key or not fields:
+            b.written = key
+            return b
+        count = len(values[0])
+        own = count == b.size and np.array_equal(which, np.arange(count))
+        models = b if own else _Batch(self.mj, count, fields)
+        for name, rows in zip(fields, values, strict=True):
+            models.batch.expand(name)[...] = rows
+        models.failed[:] = False
+        if any(name in _SET_CONST or name.startswith("opt.") for name in fields):
+            try:
+                models.batch.set_const()
+            except mujoco_batch.SimulationError as error:
+                models.failed[error.ids] = True
+        if not own:
+            for name in self._expanded(fields, models):
+                rows = models.batch.expanded(name)
+                b.batch.expand(name)[...] = rows[which]
+            b.failed = models.failed[which]
+        b.written = key
+        return b
+
+    def _expanded(self, fields: tuple[str, ...], models: _Batch) -> tuple[str, ...]:
+        """Fields that have values of their own, those derived from others included."""
+        if fields not in self._derived:
+            every = mujoco_batch.MODEL_FIELDS
+            found = (n for n in every if models.batch.expanded(n) is not None)
+            self._derived[fields] = tuple(found)
+        return self._derived[fields]
+
+    # Simulation --------------------------------------------------------------
+
+    def steps(
+        self,
+        b: _Batch,
+        state: "_State",
+        ctrl: np.ndarray,
+        qfrc: np.ndarray | None,
+        xfrc: np.ndarray | None,
+        every: int,
+    ) -> tuple["_State", np.ndarray, np.ndarray]:
+        """Physics steps with commands ``ctrl (N, T, nu)``, other forces held.
+
+        Returns:
+            The state after the last, and positions and velocities after each
+            ``every``, ``(N, T / every, ...)``; not a number from where a simulation
+            failed.
+        """
+        batch, n = b.batch, b.size
+        self._load(b, state)
+        if qfrc is not None:
+            batch.bind("qfrc_applied")[:] = qfrc
+        if xfrc is not None:
+            batch.bind("xfrc_applied")[:] = xfrc.reshape(n, self.mj.nbody, 6)
+        warned = batch.warning.copy()
+        steps, seen = ctrl.shape[1], ctrl.shape[1] // every
+        qpos = np.empty((n, seen, self.mj.nq))
+        qvel = np.empty((n, seen, self.mj.nv))
+        wrong = b.failed.copy()
+        try:
+            if seen == 1 and (steps == 1 or not np.ptp(ctrl, axis=1).any()):
+                batch.bind("ctrl")[:] = ctrl[:, 0]
+                batch.step(nstep=steps)
+                qpos[:, 0], qvel[:, 0] = batch.bind("qpos"), batch.bind("qvel")
+            else:
+                self._roll(b, ctrl, every, qpos, qvel)
+        except mujoco_batch.SimulationError as error:
+            wrong[error.ids] = True
+        wrong |= (batch.warning[:, _BAD] != warned[:, _BAD]).any((1, 2))
+        after = self._read(b, state)
+        for x in (after.qpos, after.qvel, after.act, after.warmstart, qpos, qvel):
+            x[wrong] = np.nan
+        return after, qpos, qvel
+
+    def seen(
+        self, b: _Batch, state: "_State"
+    ) -> tuple["_State", np.ndarray, np.ndarray]:
+        """Nothing moves; what follows from positions and velocities is computed."""
+        self._load(b, state)
+        b.batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_VEL))
+        return state, state.qpos[:, None], state.qvel[:, None]
+
+    def one_by_one(
+        self,
+        b: _Batch,
+        state: "_State",
+        ctrl: np.ndarray,
+        qfrc: np.ndarray | None,
+        xfrc: np.ndarray | None,
+        pairs: np.ndarray,
+    ) -> tuple["_State", np.ndarray, np.ndarray]:
+        """One physics step whose contacts are changed where they are made."""
+        self._load(b, state)
+        b.batch.bind("ctrl")[:] = ctrl
+        if qfrc is not None:
+            b.batch.bind("qfrc_applied")[:] = qfrc
+        if xfrc is not None:
+            b.batch.bind("xfrc_applied")[:] = xfrc
+        number = {frozenset(p): k for k, p in enumerate(pair_ids(self.mj))}
+        d = mujoco.MjData(self.mj)
+        wrong = b.failed.copy()
+        row = np.empty(b.batch.nstate)
+        for i in range(b.size):
+            if wrong[i]:
+                continue
+            m = b.batch.get_model(i)
+            mujoco.mj_setState(m, d, b.batch.state[i], _ALL)
+            mujoco.mj_step1(m, d)
+            _change_contacts(m, d, pairs[i], number)
+            mujoco.mj_step2(m, d)
+            mujoco.mj_getState(m, d, row, _ALL)
+            b.batch.state[i] = row
+            wrong[i] = not np.isfinite(d.qacc).all()
+        after = self._read(b, state)
+        for x in after:
+            x[wrong] = np.nan
+        return after, after.qpos[:, None], after.qvel[:, None]
+
+    def _roll(
+        self,
+        b: _Batch,
+        ctrl: np.ndarray,
+        every: int,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+    ) -> None:
+        """In parts, so that what is recorded of all simulations fits in memory."""
+        width = max(1, b.size * (self.mj.nq + self.mj.nv) * every)
+        part = every * max(1, _RECORDED // width)
+        for at in range(0, ctrl.shape[1], part):
+            some = ctrl[:, at : at + part]
+            got = b.batch.rollout(some.shape[1], some, _CTRL, record=("qpos", "qvel"))
+            rows = slice(at // every, at // every + some.shape[1] // every)
+            qpos[:, rows] = got["qpos"][:, every - 1 :: every]
+            qvel[:, rows] = got["qvel"][:, every - 1 :: every]
+
+    def _load(self, b: _Batch, state: "_State") -> None:
+        b.batch.state[:] = b.first
+        b.batch.bind("qpos")[:] = state.qpos
+        b.batch.bind("qvel")[:] = state.qvel
+        b.batch.bind("act")[:] = state.act
+        b.batch.bind("qacc_warmstart")[:] = state.warmstart
+        at = 0
+        for part in _REST if state.rest.shape[1] else ():
+            rows = b.component(part)
+            rows[:] = state.rest[:, at : at + rows.shape[1]]
+            at += rows.shape[1]
+
+    def _read(self, b: _Batch, before: "_State") -> "_State":
+        rest = before.rest
+        if rest.shape[1]:
+            rest = np.concatenate([b.component(part) for part in _REST], 1)
+        bind = b.batch.bind
+        return _State(
+            bind("qpos").copy(),
+            bind("qvel").copy(),
+            bind("act").copy(),
+            bind("qacc_warmstart").copy(),
+            rest,
+        )
+
+
+class Reading(Protocol):
+    """What an environment reads of the last physics step.
+
+    Attributes:
+        fields: names of fields of `mujoco.MjData`.
+        size: how many numbers it makes of them.
+    """
+
+    fields: tuple[str, ...]
+    size: int
+
+    def __call__(self, *given: np.ndarray) -> np.ndarray:
+        """Numbers ``(N, size)`` of fields ``(N, ...)``; numpy only."""
+        ...
+
+
+class _State:
+    """Arrays of many simulations, a row each."""
+
+    def __init__(self, *parts: np.ndarray) -> None:
+        self.qpos, self.qvel, self.act, self.warmstart, self.rest = parts
+
+    def __iter__(self) -> Any:
+        return iter((self.qpos, self.qvel, self.act, self.warmstart, self.rest))
+
+
+def _change_contacts(
+    m: mujoco.MjModel, d: mujoco.MjData, factors: np.ndarray, number: dict
+) -> None:
+    """As `easi_jax.model.effects.pair_contacts`, between both halves of a step."""
+    if not d.ncon:
+        return
+    for i in range(d.ncon):
+        contact = d.contact[i]
+        k = number.get(frozenset(contact.geom.tolist()))
+        if k is None:
+            continue
+        contact.friction[:2] *= factors[k, 0]
+        direct = -np.asarray(direct_solref(m, contact.solref))
+        contact.solref[:] = direct * factors[k, 1:]
+    mujoco.mj_makeConstraint(m, d)
+    mujoco.mj_projectConstraint(m, d)
+    mujoco.mj_referenceConstraint(m, d)
+
+
+PLACES = ("xipos", "subtree_com", "cvel")
+
+
+def bodies(model: NativeModel, state: Any) -> tuple[jax.Array, ...]:
+    """`PLACES` of a state: where bodies and subtrees are, ``(nbody, 3)`` each, and how
+    fast bodies move, ``(nbody, 6)``."""
+    at_rest = jnp.zeros((1, model.template.mj.nu), state.qpos.dtype)
+    flat = run(model, state, at_rest, read=_Places(model.template.mj), stage="velocity")
+    n = model.template.mj.nbody
+    return tuple(x.reshape(n, -1) for x in jnp.split(flat[2], [3 * n, 6 * n]))
+
+
+class _Places:
+    """Reads `PLACES`."""
+
+    fields = PLACES
+
+    def __init__(self, m: mujoco.MjModel) -> None:
+        self.size = 12 * m.nbody
+
+    def __call__(self, *given: np.ndarray) -> np.ndarray:
+        return np.concatenate([x.reshape(len(x), -1) for x in given], 1)
+
+
+# Warnings after which a state means nothing.
+_BAD = [
+    int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}"))
+    for what in ("QPOS", "QVEL", "QACC")
+]
+_SET_CONST = frozenset(mujoco.MjModel._setconst_inputs)
+_hosts: "weakref.WeakKeyDictionary[Template, _Host]" = weakref.WeakKeyDictionary()
+_hosts_lock = threading.Lock()
+
+
+def _host(template: Template) -> _Host:
+    with _hosts_lock:
+        if template not in _hosts:
+            _hosts[template] = _Host(template)
+        return _hosts[template]
+
+
+def _rows(x: np.ndarray, own: int, lead: tuple[int, ...]) -> np.ndarray:
+    """``(N, ...)`` of what has ``own`` axes of its own behind those of a batch."""
+    x = np.asarray(x)
+    shape = x.shape[x.ndim - own :] if own else ()
+    count = int(np.prod(lead, dtype=int))
+    return np.broadcast_to(x, (*lead, *shape)).reshape(count, *shape)
+
+
+def _lead(x: Any, own: int) -> tuple[int, ...]:
+    return np.shape(x)[: np.ndim(x) - own]
+
+
+def run(
+    model: NativeModel,
+    state: Any,
+    ctrl: jax.Array,
+    qfrc: jax.Array | None = None,
+    xfrc: jax.Array | None = None,
+    every: int | None = None,
+    read: Any = None,
+    pairs: jax.Array | None = None,
+    stage: str = "step",
+) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, jax.Array], jax.Array]:
+    """Physics steps of MuJoCo C; may be traced, and mapped over any argument.
+
+    Args:
+        state: `easi_jax.simulation.step.Physics`.
+        ctrl: what reaches the actuators in each physics step, ``(T, nu)``.
+        qfrc, xfrc: forces on joints ``(nv,)`` and bodies ``(nbody, 6)``, held.
+        every: physics steps between what is returned of the motion; T where None.
+        read: see `Reading`; None for nothing.
+        pairs: factors on friction, stiffness and damping of the contacts of pairs of
+            geoms (`easi_jax.model.contact_pairs`), ``(K, 3)``; one step then, and
+            simulations one by one, since MuJoCo has no number to write them into.
+        stage: "step"; "velocity": nothing moves, and ``read`` sees the state itself.
+
+    Returns:
+        qpos, qvel, act, warm start and rest after the last step; qpos and qvel after
+        each ``every``, ``(T / every, ...)``; what ``read`` made of the last step.
+        Not a number where a simulation failed.
+    """
+    template, m = model.template, model.template.mj
+    fields = tuple(sorted(model.changed))
+    own = [np.ndim(nominal_field(m, name)) for name in fields]
+    dtype = state.qpos.dtype
+    span = every or ctrl.shape[0]
+    seen = ctrl.shape[0] // span
+    physics = (state.qpos, state.qvel, state.act, state.warmstart, state.rest)
+    forces = [f for f in (qfrc, xfrc, pairs) if f is not None]
+    has_q, has_x, has_pairs = (f is not None for f in (qfrc, xfrc, pairs))
+    size = read.size if read is not None else 0
+
+    def shape(*s: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct(s, dtype)
+
+    out = (
+        *(shape(*x.shape) for x in physics),
+        shape(seen, m.nq),
+        shape(seen, m.nv),
+        shape(size),
+    )
+
+    def called(*args: np.ndarray) -> tuple[np.ndarray, ...]:
+        args = tuple(np.asarray(a) for a in args)
+        values, given = args[: len(fields)], args[len(fields) :]
+        axes = [*own, *(1 for _ in physics), 2, *([1] * has_q), *([2] * has_x)]
+        axes += [2] * has_pairs
+        lead = np.broadcast_shapes(
+            *(_lead(a, k) for a, k in zip(args, axes, strict=True))
+        )
+        of_models = np.broadcast_shapes(
+            *(_lead(v, k) for v, k in zip(values, own, strict=True))
+        )
+        padded = (1,) * (len(lead) - len(of_models)) + of_models
+        number = np.arange(int(np.prod(padded, dtype=int))).reshape(padded)
+        which = np.broadcast_to(number, lead).reshape(-1)
+        host = _host(template)
+        models = [
+            _rows(v, k, padded).astype(np.float64)
+            for v, k in zip(values, own, strict=True)
+        ]
+        rows = [_rows(a, 1, lead) for a in given[:5]]
+        u = _rows(given[5], 2, lead).astype(np.float64)
+        more = list(given[6:])
+        q = _rows(more.pop(0), 1, lead) if has_q else None
+        x = _rows(more.pop(0), 2, lead) if has_x else None
+        b = host.ready(fields, models, which)
+        if read is not None:
+            bound = [b.batch.bind(name) for name in read.fields]
+        if stage == "velocity":
+            after, qpos, qvel = host.seen(b, _State(*rows))
+        elif has_pairs:
+            k = _rows(more.pop(0), 2, lead)
+            after, qpos, qvel = host.one_by_one(b, _State(*rows), u[:, 0], q, x, k)
+        else:
+            after, qpos, qvel = host.steps(b, _State(*rows), u, q, x, span)
+        sensed = np.zeros((b.size, 0))
+        if read is not None:
+            sensed = read(*bound)
+        host._back(b)
+        results = (*after, qpos, qvel, sensed)
+        return tuple(r.reshape(*lead, *r.shape[1:]).astype(dtype) for r in results)
+
+    *physics_out, qpos, qvel, sensed = jax.pure_callback(
+        called,
+        out,
+        *(model.changed[name] for name in fields),
+        *physics,
+        ctrl,
+        *forces,
+        vmap_method="expand_dims",
+    )
+    return tuple(physics_out), (qpos, qvel), sensed

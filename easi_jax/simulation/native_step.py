@@ -1,0 +1,173 @@
+"""A control step on native MuJoCo, with what this package adds to a model.
+
+Effects are those of `easi_jax.model.effects`, by the same functions: what never changes
+within a control step is written into the model's fields and into held forces, and
+MuJoCo is called once; where something depends on the state it is called once a physics
+step.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from easi_jax.errors import UserError
+from easi_jax.model import effects
+from easi_jax.model.effect_numbers import fields_that_act
+from easi_jax.model.joint_space import scalar_places
+from easi_jax.simulation import native
+
+# Effects in the step that are the same at every state.
+_STEADY = ("coulomb", "damping", "stiffness", "spring", "constant", "force")
+_IN_STEPS = (*fields_that_act("step"), *fields_that_act("drive"), "slip", "give")
+
+
+@flax.struct.dataclass
+class StepData:
+    """What effects read and change of a step; names are those of `mjx.Data`."""
+
+    qpos: jax.Array
+    qvel: jax.Array
+    act: jax.Array
+    ctrl: jax.Array
+    qfrc_applied: jax.Array
+    xfrc_applied: jax.Array
+    xipos: Any = ()
+    subtree_com: Any = ()
+    cvel: Any = ()
+
+    if TYPE_CHECKING:  # made by flax
+
+        def replace(self, **changes: Any) -> "StepData": ...
+
+
+def _acting(model: Any) -> tuple[str, ...]:
+    """Fields of effects that act in the steps themselves."""
+    if model.effects is None:
+        return ()
+    present = model.present
+    return tuple(f for f in _IN_STEPS if present is None or f in present)
+
+
+def _varies(model: Any) -> bool:
+    """Whether something must be done between physics steps."""
+    m = model.mjx.template
+    sprung = not m.mj.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SPRING
+    steady = [f for f in _STEADY if f != "stiffness" or sprung]
+    return (
+        model.torque_speed is not None
+        or m.limits_speed
+        or any(f not in steady for f in _acting(model))
+    )
+
+
+def _reading(model: Any) -> Any:
+    if model.sense is None:
+        return None
+    read = getattr(model.sense, "native", None)
+    if read is None:
+        raise UserError(
+            "this environment reads its simulation from MJX: use --engine mjx, or give "
+            "its sense a `native` (easi_jax.simulation.native.Reading)"
+        )
+    return read
+
+
+def steps(model: Any, state: Any, arrived: jax.Array) -> Any:
+    """The state after physics steps in which ``arrived (T, nu)`` reaches the
+    actuators."""
+    if _varies(model):
+        return jax.lax.scan(lambda s, u: (_one(model, s, u), None), state, arrived)[0]
+    changed, qfrc, xfrc = _steady(model)
+    out, _, sensed = native.run(
+        changed, state, arrived, qfrc, xfrc, read=_reading(model)
+    )
+    return _after(model, state, out, sensed)
+
+
+def replay(
+    model: Any, state: Any, arrived: jax.Array
+) -> tuple[jax.Array, jax.Array] | None:
+    """Positions and velocities ``(H, ...)`` after each of H control steps in which
+    ``arrived (H, substeps, nu)`` reaches the actuators, by one call of MuJoCo; None
+    where it takes more."""
+    if _varies(model):
+        return None
+    h, substeps, nu = arrived.shape
+    changed, qfrc, xfrc = _steady(model)
+    ctrl = arrived.reshape(h * substeps, nu)
+    return native.run(changed, state, ctrl, qfrc, xfrc, every=substeps)[1]
+
+
+def _after(model: Any, state: Any, out: tuple[jax.Array, ...], sensed: Any) -> Any:
+    qpos, qvel, act, warmstart, rest = out
+    return state.replace(
+        qpos=qpos,
+        qvel=qvel,
+        act=act,
+        warmstart=warmstart,
+        rest=rest,
+        sensed=sensed if model.sense is not None else (),
+    )
+
+
+def _steady(model: Any) -> tuple[Any, Any, Any]:
+    """The model, and forces on joints and bodies, where all stay as they are."""
+    m, e, acting = model.mjx, model.effects, _acting(model)
+    if not acting:
+        return m, None, None
+    at, dof = scalar_places(m).T
+    new: dict[str, Any] = {}
+    torque = e.constant + e.spring
+    if "coulomb" in acting:
+        new["dof_frictionloss"] = m.dof_frictionloss + e.coulomb
+    if "damping" in acting:
+        new["dof_damping"] = m.dof_damping + e.damping
+    if "stiffness" in acting:
+        # MuJoCo's spring rests at `qpos_spring`, the effect's at zero.
+        joint = np.asarray(m.dof_jntid)[dof]
+        new["jnt_stiffness"] = m.jnt_stiffness.at[joint].add(e.stiffness[dof])
+        rest = m.qpos_spring[at]
+        torque = torque.at[dof].add(-e.stiffness[dof] * rest)
+    xfrc = None
+    if "force" in acting:
+        xfrc = jnp.concatenate([e.force, jnp.zeros_like(e.force)], 1)
+    return m.tree_replace(new), torque, xfrc
+
+
+def _one(model: Any, state: Any, ctrl: jax.Array) -> Any:
+    """One physics step; a joint's speed limit clips after it."""
+    m, e, rotor = model.mjx, model.effects, state.rotor
+    acting = _acting(model)
+    if model.torque_speed is not None:
+        limits = model.torque_speed.limits(state.qvel)
+        own = m.actuator_forcerange
+        low = jnp.maximum(own[:, 0], limits[:, 0])
+        high = jnp.minimum(own[:, 1], limits[:, 1])
+        m = m.replace(actuator_forcerange=jnp.stack([low, high], axis=1))
+    zero = jnp.zeros((m.nbody, 6), state.qpos.dtype)
+    d = StepData(
+        *(state.qpos, state.qvel, state.act, ctrl), jnp.zeros_like(state.qvel), zero
+    )
+    pairs = None
+    if acting:
+        m, d, rotor = effects.in_step(m, d, e, rotor)  # type: ignore[arg-type]
+        if "resistance" in acting:
+            places = native.bodies(m, state)
+            d = d.replace(**dict(zip(native.PLACES, places, strict=True)))
+            d = effects.body_resistance(m, d, e)  # type: ignore[arg-type]
+        if "slip" in acting or "give" in acting:
+            pairs = jnp.concatenate([e.slip[:, None], e.give], 1)
+    out, _, sensed = native.run(
+        *(m, state, ctrl[None], d.qfrc_applied, d.xfrc_applied),
+        read=_reading(model),
+        pairs=pairs,
+    )
+    new = _after(model, state, out, sensed).replace(rotor=rotor)
+    if model.mjx.template.limits_speed:
+        edge = model.speed_limit
+        new = new.replace(qvel=jnp.clip(new.qvel, -edge, edge))
+    return new
