@@ -227,4 +227,3 @@ class NativeFootLoads:
         frame = mat[:, rows].reshape(len(mat), len(rows), 3, 3)
         loads = np.stack([force, torque], 2)
         return np.einsum("nbji,nbkj->nbki", frame, loads).reshape(len(mat), self.size)
-

@@ -72,7 +72,7 @@ def main(
         from easi_jax.errors import UserError
 
         try:
-            with _interrupt.remembered():
+            with _interrupt.remembered(), _engine(config):
                 if getattr(config, "distributed", False):
                     distributed.start()
                 run(config)
@@ -92,6 +92,21 @@ def main(
             raise
         out = getattr(config, "out", None)
         _stop(_interrupted(out, hasattr(config, "resume")), INTERRUPTED, args is None)
+
+
+@contextlib.contextmanager
+def _engine(config: Any) -> Iterator[None]:
+    """Simulators made inside are of the engine that a command was told to take."""
+    asked = getattr(config, "engine", None)
+    if asked is None:
+        yield
+        return
+    from easi_jax.io.runs.folder import engine_of
+    from easi_jax.simulation import engine
+
+    kept = engine_of(config.out) if getattr(config, "resume", False) else None
+    with engine.using(kept or asked, say):
+        yield
 
 
 def _unheard() -> NoReturn:

@@ -6,6 +6,7 @@ from pathlib import Path
 from train._options import (
     BaseOptions,
     ChainOptions,
+    EngineOptions,
     RunOptions,
     SearchOptions,
     TargetOptions,
@@ -41,7 +42,13 @@ class _Sources:
 
 @dataclasses.dataclass(frozen=True)
 class Config(
-    RunOptions, ChainOptions, SearchOptions, TargetOptions, BaseOptions, _Sources
+    RunOptions,
+    EngineOptions,
+    ChainOptions,
+    SearchOptions,
+    TargetOptions,
+    BaseOptions,
+    _Sources,
 ):
     """Finds the distribution of physical parameters under which simulation looks like
     the measured motion (EASI), and trains the final policy under it.

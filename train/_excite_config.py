@@ -4,11 +4,11 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from train._options import BaseOptions
+from train._options import BaseOptions, EngineOptions
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(BaseOptions):
+class Config(EngineOptions, BaseOptions):
     """Writes commands to play on the machine, so that its log says the most.
 
     Multisines, chirps, pulses and steps of several sizes are simulated in the model,

@@ -3,13 +3,13 @@
 import dataclasses
 from pathlib import Path
 
-from train._options import BaseOptions
+from train._options import BaseOptions, EngineOptions
 
 _HORIZON = 0.2  # s
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(BaseOptions):
+class Config(EngineOptions, BaseOptions):
     """Finds where a simulation and measured logs disagree, and names what is missing.
 
     The model predicts short windows of the logs from their measured starts. Every

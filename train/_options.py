@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Literal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,6 +17,16 @@ class RobotOptions:
     env: Path | None = None
     """An environment of your own, a Python file, in place of --robot (template:
     examples/my_robot/env.py)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EngineOptions:
+    """What simulates."""
+
+    engine: Literal["auto", "mjx", "mujoco"] = "auto"
+    """mjx: compiled, on CPU or accelerator. mujoco: native MuJoCo on all cores, which
+    compiles nothing and simulates every model. auto: mjx on an accelerator and for
+    small robots, else mujoco; the choice is said, and kept by --resume."""
 
 
 @dataclasses.dataclass(frozen=True)

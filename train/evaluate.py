@@ -4,12 +4,13 @@ import dataclasses
 from pathlib import Path
 
 from train._command import main, say, show_table
+from train._options import EngineOptions
 
 _FPS = 25  # frames per second of a video, about
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(EngineOptions):
     """Tests the policies of a run in a target of your choice.
 
     Prints the return of every seed and, with --out, writes all episodes as JSON.

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from train._command import main, say
 from train._options import (
     ChainOptions,
+    EngineOptions,
     RobotOptions,
     RunOptions,
     SearchOptions,
@@ -27,6 +28,7 @@ _METHODS = {"udr": "UDR", "easi": "EASI"}
 @dataclasses.dataclass(frozen=True)
 class Config(
     RunOptions,
+    EngineOptions,
     ChainOptions,
     SearchOptions,
     TrainingOptions,

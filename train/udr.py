@@ -4,11 +4,11 @@ import dataclasses
 from pathlib import Path
 
 from train._command import main, say, show_table
-from train._options import RobotOptions, RunOptions, TrainingOptions
+from train._options import EngineOptions, RobotOptions, RunOptions, TrainingOptions
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(RunOptions, TrainingOptions, RobotOptions):
+class Config(RunOptions, EngineOptions, TrainingOptions, RobotOptions):
     """Trains a policy under uniformly random physics (UDR), the rough start of EASI.
 
     Each episode draws the robot's parameters from [nominal / k, k nominal]. The policy

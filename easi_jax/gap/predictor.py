@@ -30,7 +30,7 @@ from easi_jax.model.contact_pairs import pair_ids
 from easi_jax.model.effect_numbers import EFFECT_TABLE, fields_that_act
 from easi_jax.model.effects import Effects
 from easi_jax.model.joint_space import dofs, scalar_places, turns_fully
-from easi_jax.model.mjx_model import Model, full_structure
+from easi_jax.model.mjx_model import Model, for_every_effect
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.step import Physics, arrived_step
@@ -95,7 +95,7 @@ class Predictor:
         self.simulator = Simulator(opened(mj_model), space, dt, fixed=fixed)
         # Centers of mass move.
         base = self.simulator.base
-        self.simulator.base = base.replace(mjx=full_structure(base.mjx))
+        self.simulator.base = base.replace(mjx=for_every_effect(base.mjx))
         self.layout, self.windows = layout, windows
         self.own = len(space.nominal)
         self.neutral = np.concatenate([np.asarray(space.nominal), layout.neutral])

@@ -104,6 +104,11 @@ def _stepwise(m: Any, _: int) -> str | None:
 def _direct_contacts(m: Any, _: int) -> None:
     if _stepwise(m, 0) is None:
         return  # done in the step
+    direct_contacts(m)
+
+
+def direct_contacts(m: mujoco.MjModel) -> None:
+    """Writes stiffness and damping of all contacts in their direct form."""
     for solref in (*m.geom_solref, *m.pair_solref):
         if solref[0] > 0:
             solref[:] = -np.asarray(direct_solref(m, solref))

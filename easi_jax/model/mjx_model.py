@@ -1,6 +1,7 @@
 """An MJX model whose physical parameters are an argument."""
 
 import contextlib
+import copy
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ from easi_jax.devices.mesh import own_device
 from easi_jax.errors import UserError
 from easi_jax.model import effects as physical
 from easi_jax.model.addresses import Writer, open_gates, resolve
+from easi_jax.model.effect_numbers import EFFECT_TABLE, direct_contacts
 from easi_jax.model.effects import Effects
 from easi_jax.model.mjx_data import make_data, without_idle_cone
 from easi_jax.model.native_model import NativeModel, Template
@@ -103,6 +105,21 @@ def _unsupported(m: mujoco.MjModel) -> tuple[str, str] | None:
         ),
     )
     return next(((what, do) for found, what, do in checks if found), None)
+
+
+def refusal(m: mujoco.MjModel) -> str | None:
+    """What MJX would refuse in a model or ignore without a word; None for nothing."""
+    ignored = _unsupported(m)
+    if ignored is not None:
+        return ignored[0]
+    quiet = copy.copy(m)
+    quiet.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
+    quiet.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK  # known to MJX
+    try:
+        make_data(mjx.put_model(without_idle_cone(quiet), own_device(), impl="jax"))
+    except Exception as error:  # MJX refuses by many types
+        return " ".join(str(error).split()) or type(error).__name__
+    return None
 
 
 # Words in what MJX says, and what to do then; the first that fits counts.
@@ -221,11 +238,55 @@ def _put_native(
     """The model for MuJoCo C, which must not take shortcuts that a parameter undoes."""
     # What diverges is told, not put back to its start.
     opened.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    bodies = {w.id for w in writers if (w.kind, w.row.moves_center) == ("body", True)}
+    bodies |= {
+        w.id if EFFECT_TABLE[w.quantity].on == "body" else 0
+        for w in writers
+        if w.kind == "effect" and w.row.moves_center
+    }
     if moves_center:
-        opened.body_sameframe[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-        opened.geom_sameframe[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+        for b in sorted(bodies):
+            if not _full_rows(opened, b):
+                raise UserError(
+                    f'the center of mass of body "{opened.body(b).name}" cannot vary '
+                    "on the engine mujoco, which leaves out what is zero in its "
+                    "inertia: use --engine mjx"
+                )
+        _without_shortcuts(opened)
+    if any(w.quantity.startswith("softness") for w in writers):
+        direct_contacts(opened)
     limits = any(e.field == "speed_limit" for w in writers for e in w.entries)
     return NativeModel(Template(opened, limits))
+
+
+def _full_rows(m: mujoco.MjModel, body: int) -> bool:
+    """Whether MuJoCo C keeps every entry of the inertia of a body's joints."""
+    rows = slice(m.body_dofadr[body], m.body_dofadr[body] + m.body_dofnum[body])
+    for i in range(*rows.indices(m.nv)):
+        count, j = 0, i
+        while j >= 0:
+            count, j = count + 1, int(m.dof_parentid[j])
+        if m.M_rownnz[i] < count:
+            return False
+    return True
+
+
+def _without_shortcuts(m: mujoco.MjModel) -> None:
+    """Centers of mass are read, not taken to be where the model file has them."""
+    m.body_sameframe[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    m.geom_sameframe[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+    m.body_simple[:] = 0
+    m.dof_simplenum[:] = 0
+
+
+def for_every_effect(m: Any) -> Any:
+    """A model that was put without effects, ready for all of them."""
+    if not isinstance(m, NativeModel):
+        return full_structure(m)
+    opened = copy.deepcopy(m.template.mj)
+    _without_shortcuts(opened)
+    direct_contacts(opened)
+    return NativeModel(Template(opened, m.template.limits_speed), m.changed)
 
 
 def full_structure(m: mjx.Model) -> mjx.Model:

@@ -1,25 +1,57 @@
 """Which program simulates: MJX, compiled, or native MuJoCo on all cores.
 
-A command chooses once, by `use`; simulators that are made without an engine of their
-own take that choice. ``auto`` decides from the model and the devices, never by timing,
-so that a run that is resumed decides alike.
+A command chooses once, by `using`; simulators that are made inside, without an engine
+of their own, take that choice. ``auto`` decides from the model and the devices, never
+by timing, so that a run that is resumed decides alike.
 """
 
-from typing import Literal, get_args
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Literal
 
 import mujoco
 
 from easi_jax.devices.runtime import on_cpu
 from easi_jax.errors import UserError, nearest
+from easi_jax.model.contact_pairs import pair_ids
+from easi_jax.model.mjx_model import refusal
 
 Engine = Literal["mjx", "mujoco"]
-CHOICES = ("auto", *get_args(Engine))
+CHOICES = ("auto", "mjx", "mujoco")
 
-_chosen: list[str] = ["auto"]
+# On CPU, where MJX compiles for more than half a minute or steps more slowly than
+# MuJoCo C (benchmarks/results/engines.json): more degrees of freedom than are written
+# out by entries, or more pairs of geoms that may touch.
+LARGEST = 8
+MOST_PAIRS = 4
 
 
-def use(name: str) -> None:
-    """Sets the engine of simulators that are made from now on.
+@dataclass
+class _Choice:
+    """What simulators take that are made without an engine.
+
+    Attributes:
+        name: one of `CHOICES`.
+        tell: called with why ``auto`` took what it took.
+        taken: engines that ``auto`` took, with the reasons.
+    """
+
+    name: str = "mjx"
+    tell: Callable[[str], None] | None = None
+    taken: dict[str, str] = field(default_factory=dict)
+
+
+_stack = [_Choice()]
+
+
+@contextlib.contextmanager
+def using(name: str, tell: Callable[[str], None] | None = None) -> Iterator[None]:
+    """Simulators made inside are of an engine.
+
+    Args:
+        name: one of `CHOICES`.
+        tell: called once with each choice of ``auto`` other than MJX, and why.
 
     Raises:
         UserError: not one of `CHOICES`.
@@ -28,19 +60,45 @@ def use(name: str) -> None:
         raise UserError(
             f'engine "{name}": give one of {", ".join(CHOICES)}{nearest(name, CHOICES)}'
         )
-    _chosen[0] = name
+    _stack.append(_Choice(name, tell))
+    try:
+        yield
+    finally:
+        _stack.pop()
+
+
+def taken() -> str | None:
+    """The engine that is in use: given, or what ``auto`` took; None where no simulator
+    was made, or of both engines."""
+    choice = _stack[-1]
+    if choice.name != "auto":
+        return choice.name
+    return next(iter(choice.taken)) if len(choice.taken) == 1 else None
 
 
 def resolved(engine: str | None, m: mujoco.MjModel) -> Engine:
-    """The engine for a model: the given one, else the chosen one."""
-    name = engine or _chosen[0]
-    if name == "auto":
-        return automatic(m)[0]
-    return name  # type: ignore[return-value]
+    """The engine for a model: the given one, else the one in use."""
+    choice = _stack[-1]
+    name = engine or choice.name
+    if name == "mjx" or name == "mujoco":
+        return name
+    found, why = automatic(m)
+    if choice.tell is not None and found == "mujoco" and found not in choice.taken:
+        choice.tell(f"engine: mujoco, native on all cores ({why})")
+    choice.taken.setdefault(found, why)
+    return found
 
 
 def automatic(m: mujoco.MjModel) -> tuple[Engine, str]:
     """The engine that ``auto`` takes for a model, and why."""
+    lacks = refusal(m)
+    if lacks is not None:
+        return "mujoco", f"MJX does not simulate {lacks}"
     if not on_cpu():
-        return "mjx", "an accelerator is used"
-    return "mjx", "nothing speaks against it"
+        return "mjx", "there is an accelerator"
+    if m.nv > LARGEST:
+        return "mujoco", f"{m.nv} degrees of freedom on a CPU"
+    pairs = len(pair_ids(m))
+    if pairs > MOST_PAIRS:
+        return "mujoco", f"{pairs} pairs of geoms that may touch, on a CPU"
+    return "mjx", "a small robot"

@@ -22,12 +22,14 @@ from easi_jax.io.files import (
 from easi_jax.io.runs.metrics import MetricsLog
 from easi_jax.io.runs.schemas import CONFIG, checked
 from easi_jax.io.runs.versions import versions
+from easi_jax.simulation import engine
 
 FORMAT = 1
 # Where and how a run is started; these do not change what it computes.
 VOLATILE = ("out", "resume", "overwrite", "distributed", "allow_assets")
 
 _CONFIG = "config.json"
+_ENGINE = "engine.json"
 _LOCK = ".lock"
 
 
@@ -123,6 +125,8 @@ class RunFolder:
             if not resumed:
                 head = {"format": FORMAT, "command": command, "config": plain}
                 run.write_json(_CONFIG, head)  # first: from now on it holds a run
+                if engine.taken() is not None:
+                    run.write_json(_ENGINE, {"engine": engine.taken()})
             if not (folder / "versions.json").exists():
                 run.write_json("versions.json", versions())
         except BaseException:
@@ -192,6 +196,22 @@ def read_config(folder: Path) -> dict[str, Any]:
     if not (folder / _CONFIG).exists():
         raise UserError(f"{folder} holds no run ({_CONFIG} is missing)")
     return _read_head(folder)["config"]
+
+
+def engine_of(folder: Path) -> str | None:
+    """The engine that the run in a folder simulates with; None where it does not say.
+
+    Raises:
+        UserError: a file that says something else.
+    """
+    path = folder / _ENGINE
+    if not path.is_file():
+        return None
+    found = read_json(path)
+    name = found.get("engine") if isinstance(found, dict) else None
+    if name not in engine.CHOICES:
+        raise UserError(f"{path} names no engine: --overwrite deletes the run")
+    return str(name)
 
 
 def _as_mapping(config: Any) -> dict[str, Any]:
