@@ -5,21 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from train._command import main, say, show_table
-<<<<<<< HEAD
-from train._options import BaseOptions
-=======
-from train._options import EngineOptions
->>>>>>> c236f76 (--engine auto|mjx|mujoco in the commands; the choice is said, stored in the run and kept on resume)
+from train._options import BaseOptions, EngineOptions
 
 _HORIZON = 0.2  # s, of the pieces that say what logs determine
 
 
-@dataclasses.dataclass(frozen=True)
-<<<<<<< HEAD
-class Config(BaseOptions):
-=======
-class Config(EngineOptions):
->>>>>>> c236f76 (--engine auto|mjx|mujoco in the commands; the choice is said, stored in the run and kept on resume)
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config(EngineOptions, BaseOptions):
     """Proposes what may vary in a model: a parameter file for train.easi to start from.
 
     Damping, friction and inertia of joints, gains and limits of drives, masses, ground
