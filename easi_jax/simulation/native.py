@@ -44,15 +44,16 @@ def rest_size(m: mujoco.MjModel) -> int:
 
 
 def first_rest(m: mujoco.MjModel) -> np.ndarray:
-    """Those numbers at the start of a simulation."""
+    """Those numbers at the start of a simulation, each as two 32-bit words: a time that
+    is rounded finds another delayed command."""
     if not rest_size(m):
-        return np.zeros(0)
+        return np.zeros(0, np.uint32)
     d, found = mujoco.MjData(m), []
     for part in _REST:
         row = np.zeros(mujoco.mj_stateSize(m, int(part)))
         mujoco.mj_getState(m, d, row, int(part))
         found.append(row)
-    return np.concatenate(found)
+    return np.concatenate(found).view(np.uint32)
 
 
 class _Batch:
@@ -229,7 +230,7 @@ class _Host:
             b.batch.state[i] = row
             wrong[i] = not np.isfinite(d.qacc).all()
         after = self._read(b, state)
-        for x in after:
+        for x in (after.qpos, after.qvel, after.act, after.warmstart):
             x[wrong] = np.nan
         return after, after.qpos[:, None], after.qvel[:, None]
 
@@ -258,15 +259,18 @@ class _Host:
         b.batch.bind("act")[:] = state.act
         b.batch.bind("qacc_warmstart")[:] = state.warmstart
         at = 0
-        for part in _REST if state.rest.shape[1] else ():
+        words = np.ascontiguousarray(state.rest)
+        rest = words.view(np.float64) if words.shape[1] else words
+        for part in _REST if words.shape[1] else ():
             rows = b.component(part)
-            rows[:] = state.rest[:, at : at + rows.shape[1]]
+            rows[:] = rest[:, at : at + rows.shape[1]]
             at += rows.shape[1]
 
     def _read(self, b: _Batch, before: "_State") -> "_State":
         rest = before.rest
         if rest.shape[1]:
-            rest = np.concatenate([b.component(part) for part in _REST], 1)
+            parts = [b.component(part) for part in _REST]
+            rest = np.concatenate(parts, 1).view(np.uint32)
         bind = b.batch.bind
         return _State(
             bind("qpos").copy(),
@@ -419,7 +423,7 @@ def run(
         return jax.ShapeDtypeStruct(s, dtype)
 
     out = (
-        *(shape(*x.shape) for x in physics),
+        *(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in physics),
         shape(seen, m.nq),
         shape(seen, m.nv),
         shape(size),
@@ -464,7 +468,10 @@ def run(
             sensed = read(*bound)
         host._back(b)
         results = (*after, qpos, qvel, sensed)
-        return tuple(r.reshape(*lead, *r.shape[1:]).astype(dtype) for r in results)
+        return tuple(
+            r.reshape(*lead, *r.shape[1:]).astype(like.dtype)
+            for r, like in zip(results, out, strict=True)
+        )
 
     *physics_out, qpos, qvel, sensed = jax.pure_callback(
         called,

@@ -44,7 +44,7 @@ class Physics:
         memory: what the way of a command remembers, where effects lie on it.
         rotor: drives with play, where there are any.
         rest: on the engine ``mujoco`` what else its state has (delayed commands and
-            readings, plugins, plastic deformation), ``(k,)``.
+            readings, plugins, plastic deformation), as words, ``(k,)`` uint32.
     """
 
     qpos: jax.Array
@@ -72,7 +72,7 @@ def at_rest(model: Any, qpos: jax.Array, qvel: jax.Array) -> Physics:
     if e is not None and effects.has_command_memory(model.present):
         memory = effects.first_memory(model.delay_steps, m.nu)
     native = isinstance(m, NativeModel)
-    rest = jnp.asarray(first_rest(m.template.mj), qpos.dtype) if native else ()
+    rest = jnp.asarray(first_rest(m.template.mj)) if native else ()
     return Physics(qpos, qvel, act, warm, sensed, memory, rotor, rest)
 
 

@@ -1,0 +1,255 @@
+"""The engine `mujoco`: native MuJoCo, called from compiled programs."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from easi_jax.data.segments import Segments
+from easi_jax.errors import UserError
+from easi_jax.io.runs.folder import RunFolder, engine_of
+from easi_jax.model.addresses import describe, split
+from easi_jax.model.effect_numbers import EFFECT_TABLE
+from easi_jax.model.parameters import ParameterSpace, declare
+from easi_jax.simulation import engine, native, open_loop
+from easi_jax.simulation.simulator import Simulator
+
+_ARM = """<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="0.005" integrator="{integrator}"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="3 3 .1" pos="0 0 -.4"/>
+    <body name="upper">
+      <joint name="shoulder" axis="0 1 0" damping=".05" frictionloss=".02"
+             armature=".01" stiffness=".3" springref=".2"/>
+      <geom name="bar" type="capsule" size=".03" fromto="0 0 0 .4 0 0" mass="1"
+            contype="0" conaffinity="0"/>
+      <body name="fore" pos=".4 0 0">
+        <joint name="elbow" axis="0 1 0" damping=".05" armature=".01"/>
+        <geom name="rod" type="capsule" size=".02" fromto="0 0 0 .3 .05 0" mass=".4"
+              contype="0" conaffinity="0"/>
+        <geom name="tip" type="sphere" size=".05" pos=".3 0 0" mass=".1"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="shoulder" joint="shoulder" gear="2" ctrlrange="-3 3"/>
+    <position name="elbow" joint="elbow" kp="4" kv=".3"/>
+  </actuator>
+</mujoco>"""
+# A strength that changes the motion, of each number that one effect consists of.
+_EFFECTS: dict[str, dict[str, float]] = {
+    "none": {},
+    "coulomb": {"effect.coulomb.shoulder": 0.2},
+    "stribeck": {"effect.static.shoulder": 0.3, "effect.stribeck.shoulder": 0.5},
+    "damping": {"effect.damping.elbow": 0.2},
+    "drag": {"effect.drag.elbow": 0.05},
+    "spring": {"effect.stiffness.shoulder": 2.0, "effect.spring.shoulder": 0.5},
+    "constant": {"effect.constant.elbow": 0.3},
+    "ripple": {"effect.ripple.elbow": 0.2, "effect.cycles.elbow": 8.0},
+    "armature": {"effect.armature.elbow": 0.02},
+    "gain": {"effect.gain.shoulder": 0.6},
+    "delay": {"effect.delay.shoulder": 0.03},
+    "lag": {"effect.lag.elbow": 0.04},
+    "limit": {"effect.limit.shoulder": 0.8},
+    "deadband": {"effect.deadband.shoulder": 0.4},
+    "payload": {"effect.mass.fore": 0.3},
+    "center": {"effect.com.fore.0": 0.05},
+    "force": {"effect.force.fore.0": 2.0},
+    "resistance": {"effect.resistance.fore": 1.0},
+    "tilt": {"effect.tilt.1": 0.2},
+    "backlash": {"effect.width.elbow": 0.05, "effect.rotor.elbow": 0.005},
+    "friction": {"effect.friction": 0.3},
+    "softness": {"effect.softness.0": 0.3},
+    "slip": {"effect.slip.floor/tip": 0.3},
+    "give": {"effect.give.floor/tip.0": 0.3},
+    "several": {
+        "effect.coulomb.elbow": 0.1,
+        "effect.drag.shoulder": 0.1,
+        "effect.mass.fore": 0.2,
+        "effect.delay.elbow": 0.02,
+        "effect.slip.floor/tip": 0.5,
+    },
+}
+
+
+def _model(integrator: str = "implicitfast", xml: str = _ARM) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(xml.format(integrator=integrator))
+
+
+def _segments(m: mujoco.MjModel, count: int, steps: int) -> Segments:
+    rng = np.random.default_rng(0)
+    qpos = rng.uniform(0.2, 0.9, (count, m.nq))
+    qvel = rng.normal(0.0, 1.0, (count, m.nv))
+    ctrl = rng.uniform(-1.5, 1.5, (count, steps, m.nu))
+    return Segments(
+        *(jnp.asarray(x, jnp.float32) for x in (qpos, qvel, ctrl)),
+        jnp.zeros((count, steps, m.nq)),
+        jnp.zeros((count, steps, m.nv)),
+        jnp.ones(count),
+        (),
+    )
+
+
+def _predicted(simulator: Simulator, seg: Segments, theta: np.ndarray) -> Any:
+    """Positions and velocities of every row of parameters, ``(P, M, H, ...)``."""
+
+    def one(t: jax.Array) -> Any:
+        return open_loop.predict(simulator, simulator.model(t), seg)
+
+    found = jax.jit(jax.vmap(one))(jnp.asarray(theta, jnp.float32))
+    return tuple(np.asarray(x) for x in found)
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
+def test_a_replay_is_a_loop_of_steps(integrator: str) -> None:
+    m = _model(integrator)
+    space = ParameterSpace((declare(m, "mass", "body.fore.mass"),))
+    simulator = Simulator(m, space, 0.02, engine="mujoco")
+    seg = _segments(m, 3, 10)
+    masses = np.array([0.3, 0.5, 1.2])
+    qpos, qvel = _predicted(simulator, seg, masses[:, None])
+    for p, mass in enumerate(masses):
+        own = _model(integrator)
+        ratio = mass / own.body("fore").mass[0]
+        own.body("fore").inertia[:] *= ratio
+        own.body("fore").mass[:] = mass
+        mujoco.mj_setConst(own, mujoco.MjData(own))
+        for i in range(3):
+            d = mujoco.MjData(own)
+            d.qpos[:], d.qvel[:] = seg.qpos[i], seg.qvel[i]
+            for k in range(10):
+                d.ctrl[:] = seg.ctrl[i, k]
+                mujoco.mj_step(own, d, 4)
+                np.testing.assert_allclose(qpos[p, i, k], d.qpos, rtol=1e-5, atol=1e-6)
+                np.testing.assert_allclose(qvel[p, i, k], d.qvel, rtol=1e-4, atol=1e-5)
+
+
+def test_steps_agree_with_the_replay_and_any_number_of_threads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    m = _model()
+    space = ParameterSpace((declare(m, "kp", "actuator.elbow.kp"),))
+    seg = _segments(m, 4, 8)
+    theta = np.array([[3.0], [5.0]])
+    found = []
+    for threads in (1, 3):
+        monkeypatch.setattr(native, "_threads", lambda n=threads: n)
+        simulator = Simulator(m, space, 0.01, engine="mujoco")
+        found.append(_predicted(simulator, seg, theta))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    np.testing.assert_array_equal(found[0][1], found[1][1])
+
+    def stepped(t: jax.Array, q: jax.Array, v: jax.Array, u: jax.Array) -> Any:
+        model = simulator.model(t)
+
+        def step(s: Any, u: jax.Array) -> Any:
+            s = simulator.step(model, s, u)
+            return s, (s.qpos, s.qvel)
+
+        return jax.lax.scan(step, simulator.start(q, v), u)[1]
+
+    each = jax.vmap(jax.vmap(stepped, (None, 0, 0, 0)), (0, None, None, None))
+    qpos, qvel = jax.jit(each)(jnp.asarray(theta), seg.qpos, seg.qvel, seg.ctrl)
+    # States are rounded to float32 after each control step.
+    np.testing.assert_allclose(qpos, found[0][0], atol=1e-5)
+    np.testing.assert_allclose(qvel, found[0][1], atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def effects_on_both() -> dict[str, Any]:
+    """Predictions by engine, a row for each of `_EFFECTS`."""
+    m = _model()
+    places = sorted({a for numbers in _EFFECTS.values() for a in numbers})
+    spread = [f"effect.spread.{a.split('.')[2]}" for a in places if ".mass." in a]
+    places += [a for a in sorted(set(spread)) if a not in places]
+
+    def neutral(a: str) -> float:
+        # A limit that is off is beyond all bounds; a rotor's inertia is above zero.
+        low = describe(m, (a,))[1][0]
+        return max(low, min(EFFECT_TABLE[split(a)[2]].neutral, 50.0))
+
+    parameters = tuple(
+        declare(
+            *(m, a.replace(".", "_").replace("/", "_"), a),
+            nominal=neutral(a),
+            initial=(0.01, 0.4),
+        )
+        for a in places
+    )
+    space = ParameterSpace(parameters)
+    rows = np.tile(np.asarray(space.nominal, float), (len(_EFFECTS), 1))
+    for row, numbers in zip(rows, _EFFECTS.values(), strict=True):
+        for address, value in numbers.items():
+            row[places.index(address)] = value
+    seg = _segments(m, 4, 6)
+    out: dict[str, Any] = {}
+    for name in ("mjx", "mujoco"):
+        simulator = Simulator(m, space, 0.02, engine=name)  # type: ignore[arg-type]
+        out[name] = _predicted(simulator, seg, rows)
+    return out
+
+
+@pytest.mark.parametrize("effect", [e for e in _EFFECTS if e != "none"])
+def test_every_effect_is_the_same_on_both(
+    effects_on_both: dict[str, Any], effect: str
+) -> None:
+    row = list(_EFFECTS).index(effect)
+    (q, v), (q_c, v_c) = effects_on_both["mjx"], effects_on_both["mujoco"]
+    moved = np.abs(v_c[row] - v_c[0]).max()
+    assert moved > 0.01, "the effect changes too little to be compared"
+    assert np.abs(v[row] - v_c[row]).max() < 0.02 * moved + 2e-3
+    assert np.abs(q[row] - q_c[row]).max() < 5e-4
+
+
+def test_what_diverges_is_not_a_number_and_alone() -> None:
+    m = _model()
+    space = ParameterSpace((declare(m, "kv", "actuator.elbow.kv"),))
+    simulator = Simulator(m, space, 0.02, engine="mujoco")
+    seg = _segments(m, 2, 10)
+    seg = seg.replace(qvel=seg.qvel.at[1].set(jnp.nan))
+    qpos, _ = _predicted(simulator, seg, np.array([[0.3]]))
+    assert np.isfinite(qpos[0, 0]).all()
+    assert np.isnan(qpos[0, 1]).all()
+
+
+def test_auto_takes_mujoco_where_mjx_lacks_something(tmp_path: Path) -> None:
+    small = _model()
+    lacking = _model(xml=_ARM.replace("<motor ", '<motor delay="0.02" nsample="8" '))
+    said: list[str] = []
+    with engine.using("auto", said.append):
+        assert Simulator(small, ParameterSpace(())).engine == "mjx"
+        assert not said
+    with engine.using("auto", said.append):
+        assert Simulator(lacking, ParameterSpace(())).engine == "mujoco"
+        assert "delay" in said[0]
+        with RunFolder.open(tmp_path / "run", {"a": 1}, command="x"):
+            pass
+    assert engine_of(tmp_path / "run") == "mujoco"
+    assert engine_of(tmp_path) is None
+    assert Simulator(small, ParameterSpace(())).engine == "mjx"
+
+
+def test_a_delay_of_mujoco_is_simulated_over_steps() -> None:
+    """What is under way is part of the state."""
+    m = _model(xml=_ARM.replace("<motor ", '<motor delay="0.02" nsample="8" '))
+    simulator = Simulator(m, ParameterSpace(()), 0.01, engine="mujoco")
+    seg = _segments(m, 1, 8)
+    model = simulator.model(jnp.zeros(0))
+    state = simulator.start(seg.qpos[0], seg.qvel[0])
+    d = mujoco.MjData(m)
+    d.qpos[:], d.qvel[:] = seg.qpos[0], seg.qvel[0]
+    for u in seg.ctrl[0]:
+        state = simulator.step(model, state, u)
+        d.ctrl[:] = u
+        mujoco.mj_step(m, d, 2)
+    np.testing.assert_allclose(state.qvel, d.qvel, atol=1e-4)
+
+
+def test_unknown_engine_is_refused() -> None:
+    with pytest.raises(UserError, match="one of auto, mjx, mujoco"), engine.using("c"):
+        pass
