@@ -322,6 +322,7 @@ def _change_contacts(
         direct = -np.asarray(direct_solref(m, contact.solref))
         contact.solref[:] = direct * factors[k, 1:]
     mujoco.mj_makeConstraint(m, d)
+    mujoco.mj_island(m, d)
     mujoco.mj_projectConstraint(m, d)
     mujoco.mj_referenceConstraint(m, d)
 

@@ -66,7 +66,7 @@ class Simulator:
         fixed: Mapping[str, float] | None = None,
         engine: Engine | None = None,
     ) -> None:
-        self.engine = resolved(engine, mj_model)
+        self.engine: Engine = resolved(engine, mj_model)
         step = float(mj_model.opt.timestep)
         self.dt = float(dt) if dt is not None else step
         if not 0 < self.dt < 10:

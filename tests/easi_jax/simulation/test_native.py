@@ -1,5 +1,6 @@
 """The engine `mujoco`: native MuJoCo, called from compiled programs."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +88,9 @@ def _segments(m: mujoco.MjModel, count: int, steps: int) -> Segments:
     qvel = rng.normal(0.0, 1.0, (count, m.nv))
     ctrl = rng.uniform(-1.5, 1.5, (count, steps, m.nu))
     return Segments(
-        *(jnp.asarray(x, jnp.float32) for x in (qpos, qvel, ctrl)),
+        jnp.asarray(qpos, jnp.float32),
+        jnp.asarray(qvel, jnp.float32),
+        jnp.asarray(ctrl, jnp.float32),
         jnp.zeros((count, steps, m.nq)),
         jnp.zeros((count, steps, m.nv)),
         jnp.ones(count),
@@ -211,7 +214,7 @@ def test_what_diverges_is_not_a_number_and_alone() -> None:
     space = ParameterSpace((declare(m, "kv", "actuator.elbow.kv"),))
     simulator = Simulator(m, space, 0.02, engine="mujoco")
     seg = _segments(m, 2, 10)
-    seg = seg.replace(qvel=seg.qvel.at[1].set(jnp.nan))
+    seg = dataclasses.replace(seg, qvel=seg.qvel.at[1].set(jnp.nan))
     qpos, _ = _predicted(simulator, seg, np.array([[0.3]]))
     assert np.isfinite(qpos[0, 0]).all()
     assert np.isnan(qpos[0, 1]).all()
