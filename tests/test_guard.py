@@ -6,7 +6,10 @@ import pytest
 
 from benchmarks.parity import load_plugins, paragraphs
 from benchmarks.parity_models import feature_models
-from easi_jax.simulation import guard
+from easi_jax.errors import UserError
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation import engine, guard
+from easi_jax.simulation.simulator import Simulator
 
 ARM = """
 <mujoco>
@@ -113,6 +116,7 @@ def test_every_feature_of_the_table_is_a_model() -> None:
 
 def test_the_table_says_what_deviates_and_what_is_refused() -> None:
     row = {"engine": "mjx", "error": 1e-14, "causes": [], "refusal": "", "seconds": 1.0}
+    row |= {"native_error": 0.0, "native_refusal": ""}
     deviates = {"engine": "mujoco", "error": 0.2, "causes": ["weld constraints"]}
     refused = {"engine": "mujoco", "error": None, "refusal": "no flex"}
     text = "\n".join(
@@ -124,5 +128,28 @@ def test_the_table_says_what_deviates_and_what_is_refused() -> None:
         )
     )
     assert "agrees on 1, deviates on 1, refuses 1" in text
-    assert "| b | mujoco | 2.0e-01 | weld constraints |" in text
-    assert "| c | mujoco |  | refused: no flex |" in text
+    assert "| b | mujoco | 2.0e-01 | 0 | weld constraints |" in text
+    assert "| c | mujoco |  | 0 | refused: no flex |" in text
+
+
+def _model(flags: str = "", rest: str = "") -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(ARM.format(flags=flags, rest=rest))
+
+
+def test_auto_takes_native_where_mjx_deviates_and_mjx_is_refused() -> None:
+    weld = _model(rest='<equality><weld body1="lower"/></equality>')
+    found, why = engine.automatic(weld)
+    assert found == "mujoco" and "weld constraints" in why
+    with engine.using("mjx"), pytest.raises(UserError, match="weld constraints"):
+        engine.resolved(None, weld)
+    assert engine.automatic(_model())[0] == "mjx"
+    with engine.using("mjx"):
+        assert engine.resolved(None, _model()) == "mjx"
+
+
+def test_sleeping_bodies_are_refused_by_both_engines() -> None:
+    asleep = _model('<flag sleep="enable"/>')
+    with pytest.raises(UserError, match="sleep"):
+        Simulator(asleep, ParameterSpace(()), engine="mujoco")
+    with engine.using("mjx"), pytest.raises(UserError, match="sleep"):
+        Simulator(asleep, ParameterSpace(()))

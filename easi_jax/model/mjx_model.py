@@ -107,21 +107,6 @@ def _unsupported(m: mujoco.MjModel) -> tuple[str, str] | None:
     return next(((what, do) for found, what, do in checks if found), None)
 
 
-def refusal(m: mujoco.MjModel) -> str | None:
-    """What MJX would refuse in a model or ignore without a word; None for nothing."""
-    ignored = _unsupported(m)
-    if ignored is not None:
-        return ignored[0]
-    quiet = copy.copy(m)
-    quiet.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
-    quiet.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK  # known to MJX
-    try:
-        make_data(mjx.put_model(without_idle_cone(quiet), own_device(), impl="jax"))
-    except Exception as error:  # MJX refuses by many types
-        return " ".join(str(error).split()) or type(error).__name__
-    return None
-
-
 # Words in what MJX says, and what to do then; the first that fits counts.
 _CURES = (
     ("mjINT_", 'set integrator="implicitfast" or "Euler"'),
@@ -236,6 +221,12 @@ def _put_native(
     opened: mujoco.MjModel, writers: Iterable[Writer], moves_center: bool
 ) -> NativeModel:
     """The model for MuJoCo C, which must not take shortcuts that a parameter undoes."""
+    shared = mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_IPC
+    if opened.opt.enableflags & shared:
+        raise UserError(
+            "the model enables sleep or ipc, whose state no engine here carries: take "
+            "this flag out of <option> in the model file"
+        )
     # What diverges is told, not put back to its start.
     opened.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     bodies = {w.id for w in writers if (w.kind, w.row.moves_center) == ("body", True)}

@@ -6,16 +6,18 @@ by timing, so that a run that is resumed decides alike.
 """
 
 import contextlib
+import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
 import mujoco
+import numpy as np
 
 from easi_jax.devices.runtime import on_cpu
 from easi_jax.errors import UserError, nearest
 from easi_jax.model.contact_pairs import pair_ids
-from easi_jax.model.mjx_model import refusal
+from easi_jax.simulation.guard import Deviation, compare, random_states
 
 Engine = Literal["mjx", "mujoco"]
 CHOICES = ("auto", "mjx", "mujoco")
@@ -80,6 +82,10 @@ def resolved(engine: str | None, m: mujoco.MjModel) -> Engine:
     """The engine for a model: the given one, else the one in use."""
     choice = _stack[-1]
     name = engine or choice.name
+    if name == "mjx" and choice is not _stack[0] and engine is None:
+        wrong = checked(m)
+        if wrong.deviates:
+            raise UserError(f"{wrong}: use --engine mujoco or --engine auto")
     if name == "mjx" or name == "mujoco":
         return name
     found, why = automatic(m)
@@ -91,14 +97,26 @@ def resolved(engine: str | None, m: mujoco.MjModel) -> Engine:
 
 def automatic(m: mujoco.MjModel) -> tuple[Engine, str]:
     """The engine that ``auto`` takes for a model, and why."""
-    lacks = refusal(m)
-    if lacks is not None:
-        return "mujoco", f"MJX does not simulate {lacks}"
-    if not on_cpu():
-        return "mjx", "there is an accelerator"
-    if m.nv > LARGEST:
-        return "mujoco", f"{m.nv} degrees of freedom on a CPU"
-    pairs = len(pair_ids(m))
-    if pairs > MOST_PAIRS:
-        return "mujoco", f"{pairs} pairs of geoms that may touch, on a CPU"
-    return "mjx", "a small robot"
+    why = "there is an accelerator"
+    if on_cpu():
+        if m.nv > LARGEST:
+            return "mujoco", f"{m.nv} degrees of freedom on a CPU"
+        pairs = len(pair_ids(m))
+        if pairs > MOST_PAIRS:
+            return "mujoco", f"{pairs} pairs of geoms that may touch, on a CPU"
+        why = "a small robot"
+    found = checked(m)
+    return ("mujoco", str(found)) if found.deviates else ("mjx", why)
+
+
+_checks: dict[bytes, Deviation] = {}  # by the model's content
+
+
+def checked(m: mujoco.MjModel) -> Deviation:
+    """MJX beside MuJoCo C at random states; once a process and model."""
+    content = np.empty(mujoco.mj_sizeModel(m), np.uint8)
+    mujoco.mj_saveModel(m, None, content)
+    key = hashlib.sha256(content.tobytes()).digest()
+    if key not in _checks:
+        _checks[key] = compare(m, *random_states(m))
+    return _checks[key]
