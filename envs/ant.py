@@ -89,7 +89,10 @@ class Ant(Robot):
     def __init__(self) -> None:
         super().__init__(ADDRESSES)
         loads = FootLoads.of(self.mj_model)
-        self.simulator = Simulator(self.mj_model, self.space, self.dt, loads, 24)
+        self.simulator = Simulator(
+            *(self.mj_model, self.space, self.dt, loads, 24),
+            engine=self.simulator.engine,
+        )
         m = self.mj_model
         low, high = m.jnt_range[1:].T
         self._middle, self._half = (low + high) / 2, (high - low) / 2

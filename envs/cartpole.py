@@ -12,6 +12,7 @@ import mujoco
 from easi_jax.model.mjx_model import Model
 from easi_jax.model.parameters import Parameter, ParameterSpace
 from easi_jax.simulation.action_map import ActionMap
+from easi_jax.simulation.engine import of_built_in
 from easi_jax.simulation.env import EnvState, advance, start
 from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.step import Physics
@@ -77,7 +78,9 @@ class Cartpole:
         text = model_file("cartpole").read_text()
         self.mj_model = mujoco.MjModel.from_xml_string(text)
         self.space = space()
-        self.simulator = Simulator(self.mj_model, self.space, self.dt)
+        self.simulator = Simulator(
+            *(self.mj_model, self.space, self.dt), engine=of_built_in(self.mj_model)
+        )
 
     def model(self, theta: jax.Array | None = None) -> Model:
         """The model at ``theta`` ``(11,)`` in SI units; nominal without it."""

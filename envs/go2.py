@@ -163,7 +163,9 @@ class Go2(Robot):
         self._limit = m.actuator_forcerange[:, 1]
         if torque_speed:
             self.simulator = Simulator(
-                m, self.space, self.dt, torque_speed=motor_curve()
+                *(m, self.space, self.dt),
+                torque_speed=motor_curve(),
+                engine=self.simulator.engine,
             )
 
     def reset(self, model: Model, key: jax.Array) -> EnvState:

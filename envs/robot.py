@@ -13,6 +13,7 @@ import mujoco
 from easi_jax.io.models.completed import as_read
 from easi_jax.model.mjx_model import Model
 from easi_jax.model.parameters import ParameterSpace, declare
+from easi_jax.simulation import engine
 from easi_jax.simulation.env import EnvState
 from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.step import Physics
@@ -54,7 +55,8 @@ class Robot:
         """
         self.mj_model = _read(self.name, model)
         self.space = parameter_space(self.mj_model, addresses, self.k)
-        self.simulator = Simulator(self.mj_model, self.space, self.dt)
+        own = engine.of_built_in(self.mj_model) if model is None else None
+        self.simulator = Simulator(self.mj_model, self.space, self.dt, engine=own)
 
     @property
     def machine(self) -> Simulator:

@@ -78,6 +78,12 @@ def taken() -> str | None:
     return next(iter(choice.taken)) if len(choice.taken) == 1 else None
 
 
+def of_built_in(m: mujoco.MjModel) -> Engine:
+    """The engine for a model of the package, which tests compare with MuJoCo C."""
+    name = _stack[-1].name
+    return _noted(*by_size(m)) if name == "auto" else name  # type: ignore[return-value]
+
+
 def resolved(engine: str | None, m: mujoco.MjModel) -> Engine:
     """The engine for a model: the given one, else the one in use."""
     choice = _stack[-1]
@@ -88,7 +94,11 @@ def resolved(engine: str | None, m: mujoco.MjModel) -> Engine:
             raise UserError(f"{wrong}: use --engine mujoco or --engine auto")
     if name == "mjx" or name == "mujoco":
         return name
-    found, why = automatic(m)
+    return _noted(*automatic(m))
+
+
+def _noted(found: Engine, why: str) -> Engine:
+    choice = _stack[-1]
     if choice.tell is not None and found == "mujoco" and found not in choice.taken:
         choice.tell(f"engine: mujoco, native on all cores ({why})")
     choice.taken.setdefault(found, why)
@@ -97,16 +107,23 @@ def resolved(engine: str | None, m: mujoco.MjModel) -> Engine:
 
 def automatic(m: mujoco.MjModel) -> tuple[Engine, str]:
     """The engine that ``auto`` takes for a model, and why."""
-    why = "there is an accelerator"
-    if on_cpu():
-        if m.nv > LARGEST:
-            return "mujoco", f"{m.nv} degrees of freedom on a CPU"
-        pairs = len(pair_ids(m))
-        if pairs > MOST_PAIRS:
-            return "mujoco", f"{pairs} pairs of geoms that may touch, on a CPU"
-        why = "a small robot"
+    name, why = by_size(m)
+    if name == "mujoco":
+        return name, why
     found = checked(m)
-    return ("mujoco", str(found)) if found.deviates else ("mjx", why)
+    return ("mujoco", str(found)) if found.deviates else (name, why)
+
+
+def by_size(m: mujoco.MjModel) -> tuple[Engine, str]:
+    """The engine that is the quicker one, whether MJX is right or not."""
+    if not on_cpu():
+        return "mjx", "there is an accelerator"
+    if m.nv > LARGEST:
+        return "mujoco", f"{m.nv} degrees of freedom on a CPU"
+    pairs = len(pair_ids(m))
+    if pairs > MOST_PAIRS:
+        return "mujoco", f"{pairs} pairs of geoms that may touch, on a CPU"
+    return "mjx", "a small robot"
 
 
 _checks: dict[bytes, Deviation] = {}  # by the model's content
