@@ -92,9 +92,9 @@ REFUSED = {
     ),
     "delay": (
         '<position joint="swing" kp="3" delay="0.01" nsample="6"/>',
-        "effect.delay.ACTUATOR",
+        "(history)",
     ),
-    "pid": ('<pid joint="swing" kp="2"/>', "mjGAIN_PID"),
+    "pid": ('<pid joint="swing" kp="2"/>', "several commands"),
     "no xml": ("<motor joint='swing' <", "MuJoCo cannot read this model"),
     "no such joint": ('<motor joint="swin"/>', "MuJoCo cannot read this model"),
     "no mesh": (
@@ -114,11 +114,23 @@ def test_a_model_that_no_command_can_use(
     tail = f"<actuator>{drive}</actuator></mujoco>"
     path.write_text(BARE.replace("</mujoco>", tail))
     with pytest.raises(SystemExit) as stop:
-        call("--model", path, "--out", out)
+        call("--model", path, "--out", out, "--engine", "mjx")
     told = capsys.readouterr().err
     assert stop.value.code == 2 and message in told
     assert told.count("\n") == 1 and "Traceback" not in told
     assert not out.exists()
+
+
+def test_native_mujoco_takes_what_mjx_lacks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive, _ = REFUSED["dcmotor"]
+    path, out = tmp_path / "robot.xml", tmp_path / "p.yaml"
+    tail = f"<actuator>{drive}</actuator></mujoco>"
+    path.write_text(BARE.replace("</mujoco>", tail))
+    call("--model", path, "--out", out)
+    assert "engine: mujoco" in capsys.readouterr().out
+    assert "damping" in out.read_text()
 
 
 def test_what_is_tied_is_shown_and_can_be_parted(

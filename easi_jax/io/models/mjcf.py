@@ -15,6 +15,7 @@ from easi_jax.errors import UserError
 from easi_jax.io.files import os_reason, regular_file
 from easi_jax.io.models.completed import as_read, held_joint, hold, names_note
 from easi_jax.model.mjx_model import put_model
+from easi_jax.simulation import engine
 
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
 _NESTED = ("include", "model")  # elements whose file is MJCF as well
@@ -67,6 +68,11 @@ def read_mjcf(
     with mujoco_warnings() as said:
         try:
             model = mujoco.MjModel.from_xml_path(str(path))
+            if len(model.actuator_trntype) != model.nu:
+                raise UserError(
+                    "an actuator has several commands (<pid>), and here each has one: "
+                    "write it as <position> or <motor>"
+                )
             note = names_note(model)
             if note or held:
                 spec = as_read(path)
@@ -269,17 +275,19 @@ def read_machine(
     tell: Callable[[str], None] = _warn,
     held: Callable[[mujoco.MjModel], np.ndarray] | None = None,
 ) -> mujoco.MjModel:
-    """`read_mjcf` of something that moves and that MJX can simulate.
+    """`read_mjcf` of something that moves and that the engine in use can simulate
+    (`easi_jax.simulation.engine`).
 
     Raises:
-        UserError: as `read_mjcf` and `easi_jax.model.mjx_model.put_model`; or the model
-            has no joint.
+        UserError: as `read_mjcf`, `easi_jax.simulation.engine.resolved` and
+            `easi_jax.model.mjx_model.put_model`; or the model has no joint.
     """
     model = read_mjcf(path, allowed, tell, held)
     if model.nv == 0:
         raise UserError(f"{path}: the model has no joint, so nothing can be identified")
     try:
-        put_model(model, sensors=False)
+        native = engine.resolved(None, model) == "mujoco"
+        put_model(model, sensors=False, native=native)
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
     return model
