@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NoReturn, Protocol, TypeVar
 
 from train import _interrupt
+from train._options import EngineOptions
 
 _Config = TypeVar("_Config")
 
@@ -97,15 +98,15 @@ def main(
 @contextlib.contextmanager
 def _engine(config: Any) -> Iterator[None]:
     """Simulators made inside are of the engine that a command was told to take."""
-    asked = getattr(config, "engine", None)
-    if asked is None:
+    if not isinstance(config, EngineOptions):
         yield
         return
     from easi_jax.io.runs.folder import engine_of
     from easi_jax.simulation import engine
 
-    kept = engine_of(config.out) if getattr(config, "resume", False) else None
-    with engine.using(kept or asked, say):
+    out = getattr(config, "out", None)
+    kept = engine_of(out) if out and getattr(config, "resume", False) else None
+    with engine.using(kept or config.engine, say):
         yield
 
 

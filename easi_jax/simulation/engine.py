@@ -70,9 +70,11 @@ def using(name: str, tell: Callable[[str], None] | None = None) -> Iterator[None
 
 
 def taken() -> str | None:
-    """The engine that is in use: given, or what ``auto`` took; None where no simulator
-    was made, or of both engines."""
+    """The engine inside `using`: given, or what ``auto`` took; None outside, and where
+    no simulator was made, or of both engines."""
     choice = _stack[-1]
+    if len(_stack) == 1:
+        return None
     if choice.name != "auto":
         return choice.name
     return next(iter(choice.taken)) if len(choice.taken) == 1 else None

@@ -13,6 +13,7 @@ import pytest
 
 from easi_jax.errors import UserError
 from easi_jax.export.mjcf import identified_model
+from easi_jax.io.models.mjcf import read_mjcf
 from easi_jax.io.models.repaired_mjcf import deviations, repaired_model
 from easi_jax.model.found_effects import EffectEntry
 from easi_jax.model.parameters import ParameterSpace, declare
@@ -232,9 +233,10 @@ def test_a_lag_before_a_filter_is_left(file: Callable[[str], Path]) -> None:
 
 
 def test_places_without_a_name(file: Callable[[str], Path]) -> None:
-    """They are called by their number."""
+    """They have the name that they are read with."""
     path = file(one(joint='<joint axis="0 1 0"/>', drive=""))
-    entry = EffectEntry("viscous_damping", "joint0", "joint", {"damping": 0.2}, {})
+    name = read_mjcf(path, tell=lambda _: None).joint(0).name
+    entry = EffectEntry("viscous_damping", name, "joint", {"damping": 0.2}, {})
     got = repaired_model(path, [entry])
     assert got.left == []
     assert mujoco.MjModel.from_xml_string(got.xml).dof_damping[0] == 0.2
