@@ -232,11 +232,6 @@ def no_model(f):
     return "pendulum.xml", "no such"
 
 
-def delay(f):
-    edit(f["model"], 'joint="hinge"/>', 'joint="hinge" delay="0.02" nsample="4"/>')
-    return ("delay",)
-
-
 def foreign_folder(f):
     f["out"].mkdir()
     (f["out"] / "thesis.txt").write_text("mine")
@@ -256,7 +251,6 @@ CASES = (
     too_short,
     not_xml,
     no_model,
-    delay,
     foreign_folder,
 )
 
@@ -269,6 +263,14 @@ def test_bad_input_is_one_line(spoil, files, capsys):
     refuse(capsys, arguments(files), *said)
     after = sorted(files["out"].rglob("*")) if files["out"].exists() else None
     assert after == before
+
+
+@pytest.mark.fault("wrong options and files")
+def test_what_mjx_lacks_is_one_line_with_that_engine(files, capsys):
+    delayed = 'joint="hinge" delay="0.02" nsample="4"/>'
+    edit(files["model"], 'joint="hinge"/>', delayed)
+    refuse(capsys, arguments(files, "--engine", "mjx"), "history", "--engine mujoco")
+    assert not files["out"].exists()
 
 
 @pytest.mark.parametrize(
