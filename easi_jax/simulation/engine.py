@@ -22,10 +22,11 @@ from easi_jax.simulation.guard import Deviation, compare, random_states
 Engine = Literal["mjx", "mujoco"]
 CHOICES = ("auto", "mjx", "mujoco")
 
-# On CPU, where MJX compiles for long or steps more slowly than MuJoCo C: more degrees of
-# freedom than are written out by entries, or more pairs of geoms that may touch. Tried
-# by hand with 300 models on 2 shared cores, not yet measured by a benchmark: first call
-# 1.3 and 17.6 s (Ant), 2.2 and 21.2 s (Go2), native steps 1.1 and 1.6 times as fast.
+# On CPU, where MJX compiles for long or steps more slowly than MuJoCo C: more degrees
+# of freedom than are written out by entries, or more pairs of geoms that may touch.
+# Tried by hand with 300 models on 2 shared cores, not yet measured by a benchmark:
+# first call 1.3 and 17.6 s (Ant), 2.2 and 21.2 s (Go2), native steps 1.1 and 1.6 times
+# as fast.
 LARGEST = 8
 MOST_PAIRS = 4
 
