@@ -57,6 +57,10 @@ class Writer:
         """Its row of the table."""
         return TABLE[self.kind][self.quantity]
 
+    def body(self, m: mujoco.MjModel) -> int:
+        """The body whose center of mass it moves, where ``row.moves_center``."""
+        return int(m.geom_bodyid[self.id]) if self.kind == "geom" else self.id
+
 
 def names(m: mujoco.MjModel, kind: str) -> dict[str, int]:
     """Named objects of a kind: name -> id. The world body is not among them."""

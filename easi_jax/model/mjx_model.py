@@ -17,7 +17,7 @@ from easi_jax.devices.mesh import own_device
 from easi_jax.errors import UserError
 from easi_jax.model import effects as physical
 from easi_jax.model.addresses import Writer, open_gates, resolve
-from easi_jax.model.effect_numbers import EFFECT_TABLE, direct_contacts
+from easi_jax.model.effect_numbers import direct_contacts
 from easi_jax.model.effects import Effects
 from easi_jax.model.mjx_data import make_data, without_idle_cone
 from easi_jax.model.native_model import NativeModel, Template
@@ -190,14 +190,13 @@ def put_model(
         opened.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK  # known to MJX
     if timestep is not None:
         opened.opt.timestep = timestep
-    moves_center = any(w.row.moves_center for w in writers)
     if native:
-        put: Any = _put_native(opened, writers, moves_center)
+        put: Any = _put_native(opened, writers)
     else:
         with refusals(Exception):
             put = mjx.put_model(without_idle_cone(opened), own_device(), impl="jax")
             make_data(put)
-        if moves_center:
+        if any(w.row.moves_center for w in writers):
             put = full_structure(put)
     n = len(per_parameter)
     lasting = [replace(w, parameter=w.parameter - n) for w in writers]
@@ -217,9 +216,7 @@ def put_model(
     )
 
 
-def _put_native(
-    opened: mujoco.MjModel, writers: Iterable[Writer], moves_center: bool
-) -> NativeModel:
+def _put_native(opened: mujoco.MjModel, writers: Iterable[Writer]) -> NativeModel:
     """The model for MuJoCo C, which must not take shortcuts that a parameter undoes."""
     shared = mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_IPC
     if opened.opt.enableflags & shared:
@@ -229,14 +226,9 @@ def _put_native(
         )
     # What diverges is told, not put back to its start.
     opened.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    bodies = {w.id for w in writers if (w.kind, w.row.moves_center) == ("body", True)}
-    bodies |= {
-        w.id if EFFECT_TABLE[w.quantity].on == "body" else 0
-        for w in writers
-        if w.kind == "effect" and w.row.moves_center
-    }
-    if moves_center:
-        for b in sorted(bodies):
+    bodies = sorted({w.body(opened) for w in writers if w.row.moves_center})
+    if bodies:
+        for b in bodies:
             if not _full_rows(opened, b):
                 raise UserError(
                     f'the center of mass of body "{opened.body(b).name}" cannot vary '

@@ -1,5 +1,7 @@
 """What a motor can give at which speed."""
 
+from typing import Any
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -31,3 +33,10 @@ class TorqueSpeed:
         most = jnp.where(speed > 0, drive, self.braking)
         least = jnp.where(speed < 0, drive, self.braking)
         return jnp.stack([-least, most], axis=1)
+
+    def limited(self, m: Any, qvel: jax.Array) -> Any:
+        """The model, of either engine, whose force limits are no wider than these."""
+        own, limits = m.actuator_forcerange, self.limits(qvel)
+        low = jnp.maximum(own[:, 0], limits[:, 0])
+        high = jnp.minimum(own[:, 1], limits[:, 1])
+        return m.replace(actuator_forcerange=jnp.stack([low, high], axis=1))

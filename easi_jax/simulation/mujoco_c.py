@@ -116,6 +116,6 @@ def _set(m: mujoco.MjModel, values: dict[str, Any]) -> None:
 
 
 def _simple(m: mujoco.MjModel, w: Any) -> bool:
-    body = int(m.geom_bodyid[w.id]) if w.kind == "geom" else w.id
+    body = w.body(m)
     start, count = int(m.body_dofadr[body]), int(m.body_dofnum[body])
     return bool(count and np.any(m.dof_simplenum[start : start + count]))

@@ -9,7 +9,8 @@ each other and of the number of threads.
 import threading
 import weakref
 from collections.abc import Sequence
-from typing import Any, Protocol
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -36,23 +37,16 @@ _KEPT = 8  # batches kept for each model: chunks of a few sizes, on each device
 _RECORDED = 2**25  # numbers recorded at once, 256 MB
 
 
-def rest_size(m: mujoco.MjModel) -> int:
-    """How many numbers of the state `Physics` has no name for; 0 where nothing but the
-    time would be."""
-    sizes = [mujoco.mj_stateSize(m, int(part)) for part in _REST]
-    return sum(sizes) if sum(sizes) > 1 else 0
-
-
 def first_rest(m: mujoco.MjModel) -> np.ndarray:
-    """Those numbers at the start of a simulation, each as two 32-bit words: a time that
-    is rounded finds another delayed command."""
-    if not rest_size(m):
+    """The numbers of a first state that `Physics` has no name for, each as two 32-bit
+    words: a time that is rounded finds another delayed command. None where there is
+    nothing but the time."""
+    sizes = [mujoco.mj_stateSize(m, int(part)) for part in _REST]
+    if sum(sizes) <= 1:
         return np.zeros(0, np.uint32)
-    d, found = mujoco.MjData(m), []
-    for part in _REST:
-        row = np.zeros(mujoco.mj_stateSize(m, int(part)))
+    d, found = mujoco.MjData(m), [np.zeros(size) for size in sizes]
+    for part, row in zip(_REST, found, strict=True):
         mujoco.mj_getState(m, d, row, int(part))
-        found.append(row)
     return np.concatenate(found).view(np.uint32)
 
 
@@ -92,6 +86,11 @@ class _Host:
         self._lock = threading.Lock()
         self._free: list[_Batch] = []
         self._derived: dict[tuple[str, ...], tuple[str, ...]] = {}
+
+    @cached_property
+    def _pairs(self) -> dict[frozenset[int], int]:
+        """The number of each pair of geoms that may touch."""
+        return {frozenset(p): k for k, p in enumerate(pair_ids(self.mj))}
 
     # Models ------------------------------------------------------------------
 
@@ -165,11 +164,7 @@ class _Host:
             failed.
         """
         batch, n = b.batch, b.size
-        self._load(b, state)
-        if qfrc is not None:
-            batch.bind("qfrc_applied")[:] = qfrc
-        if xfrc is not None:
-            batch.bind("xfrc_applied")[:] = xfrc.reshape(n, self.mj.nbody, 6)
+        self._load(b, state, qfrc, xfrc)
         warned = batch.warning.copy()
         steps, seen = ctrl.shape[1], ctrl.shape[1] // every
         qpos = np.empty((n, seen, self.mj.nq))
@@ -186,8 +181,7 @@ class _Host:
             wrong[error.ids] = True
         wrong |= (batch.warning[:, _BAD] != warned[:, _BAD]).any((1, 2))
         after = self._read(b, state)
-        for x in (after.qpos, after.qvel, after.act, after.warmstart, qpos, qvel):
-            x[wrong] = np.nan
+        _lost(wrong, *after[:4], qpos, qvel)
         return after, qpos, qvel
 
     def seen(
@@ -208,13 +202,8 @@ class _Host:
         pairs: np.ndarray,
     ) -> tuple["_State", np.ndarray, np.ndarray]:
         """One physics step whose contacts are changed where they are made."""
-        self._load(b, state)
+        self._load(b, state, qfrc, xfrc)
         b.batch.bind("ctrl")[:] = ctrl
-        if qfrc is not None:
-            b.batch.bind("qfrc_applied")[:] = qfrc
-        if xfrc is not None:
-            b.batch.bind("xfrc_applied")[:] = xfrc
-        number = {frozenset(p): k for k, p in enumerate(pair_ids(self.mj))}
         d = mujoco.MjData(self.mj)
         wrong = b.failed.copy()
         row = np.empty(b.batch.nstate)
@@ -224,14 +213,13 @@ class _Host:
             m = b.batch.get_model(i)
             mujoco.mj_setState(m, d, b.batch.state[i], _ALL)
             mujoco.mj_step1(m, d)
-            _change_contacts(m, d, pairs[i], number)
+            _change_contacts(m, d, pairs[i], self._pairs)
             mujoco.mj_step2(m, d)
             mujoco.mj_getState(m, d, row, _ALL)
             b.batch.state[i] = row
             wrong[i] = not np.isfinite(d.qacc).all()
         after = self._read(b, state)
-        for x in (after.qpos, after.qvel, after.act, after.warmstart):
-            x[wrong] = np.nan
+        _lost(wrong, *after[:4])
         return after, after.qpos[:, None], after.qvel[:, None]
 
     def _roll(
@@ -252,12 +240,22 @@ class _Host:
             qpos[:, rows] = got["qpos"][:, every - 1 :: every]
             qvel[:, rows] = got["qvel"][:, every - 1 :: every]
 
-    def _load(self, b: _Batch, state: "_State") -> None:
+    def _load(
+        self,
+        b: _Batch,
+        state: "_State",
+        qfrc: np.ndarray | None = None,
+        xfrc: np.ndarray | None = None,
+    ) -> None:
         b.batch.state[:] = b.first
         b.batch.bind("qpos")[:] = state.qpos
         b.batch.bind("qvel")[:] = state.qvel
         b.batch.bind("act")[:] = state.act
         b.batch.bind("qacc_warmstart")[:] = state.warmstart
+        if qfrc is not None:
+            b.batch.bind("qfrc_applied")[:] = qfrc
+        if xfrc is not None:
+            b.batch.bind("xfrc_applied")[:] = xfrc
         at = 0
         words = np.ascontiguousarray(state.rest)
         rest = words.view(np.float64) if words.shape[1] else words
@@ -297,14 +295,20 @@ class Reading(Protocol):
         ...
 
 
-class _State:
+class _State(NamedTuple):
     """Arrays of many simulations, a row each."""
 
-    def __init__(self, *parts: np.ndarray) -> None:
-        self.qpos, self.qvel, self.act, self.warmstart, self.rest = parts
+    qpos: np.ndarray
+    qvel: np.ndarray
+    act: np.ndarray
+    warmstart: np.ndarray
+    rest: np.ndarray
 
-    def __iter__(self) -> Any:
-        return iter((self.qpos, self.qvel, self.act, self.warmstart, self.rest))
+
+def _lost(wrong: np.ndarray, *arrays: np.ndarray) -> None:
+    """Simulations that failed are not numbers."""
+    for x in arrays:
+        x[wrong] = np.nan
 
 
 def _change_contacts(

@@ -143,11 +143,7 @@ def _one(model: Any, state: Any, ctrl: jax.Array) -> Any:
     m, e, rotor = model.mjx, model.effects, state.rotor
     acting = _acting(model)
     if model.torque_speed is not None:
-        limits = model.torque_speed.limits(state.qvel)
-        own = m.actuator_forcerange
-        low = jnp.maximum(own[:, 0], limits[:, 0])
-        high = jnp.minimum(own[:, 1], limits[:, 1])
-        m = m.replace(actuator_forcerange=jnp.stack([low, high], axis=1))
+        m = model.torque_speed.limited(m, state.qvel)
     zero = jnp.zeros((m.nbody, 6), state.qpos.dtype)
     d = StepData(
         *(state.qpos, state.qvel, state.act, ctrl), jnp.zeros_like(state.qvel), zero

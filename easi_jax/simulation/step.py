@@ -192,18 +192,11 @@ def _without_clamped(m: mjx.Model, d: mjx.Data) -> mjx.Model:
     )
 
 
-def _with_torque_speed(m: mjx.Model, limits: jax.Array) -> mjx.Model:
-    own = m.actuator_forcerange
-    low = jnp.maximum(own[:, 0], limits[:, 0])
-    high = jnp.minimum(own[:, 1], limits[:, 1])
-    return m.replace(actuator_forcerange=jnp.stack([low, high], axis=1))
-
-
 def substep(model: Any, state: Physics, ctrl: jax.Array, wide: bool = False) -> Physics:
     """One physics step; the joint speed limit, which MuJoCo lacks, clips after it."""
     m = model.mjx
     if model.torque_speed is not None:
-        m = _with_torque_speed(m, model.torque_speed.limits(state.qvel))
+        m = model.torque_speed.limited(m, state.qvel)
     d = data_at(model, state, ctrl)
     e, rotor = model.effects, state.rotor
     if e is not None:
