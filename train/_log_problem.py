@@ -115,8 +115,17 @@ def load_model(
 
     def pose(m: Any) -> Any:
         logs, mapping = held or ((), None)
-        logged = first_pose(logs, m, mapping)
-        return own_pose(m, base_joint(m)) if logged is None else logged
+        found, of = first_pose(logs, m, mapping), "first in the logs"
+        joint = base_joint(m)
+        if found is None:
+            found = own_pose(m, joint)
+            of = f"of the {'first key frame' if m.nkey else 'model'}"
+        at, turn = (" ".join(f"{x:.4g}" for x in v) for v in (found[:3], found[3:]))
+        tell(
+            f'{path}: the base "{m.joint(joint).name}" is held at the pose {of}: '
+            f"{at} m, quaternion {turn}"
+        )
+        return found
 
     def tell(text: str) -> None:
         say(f"note: {text}")

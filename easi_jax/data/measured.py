@@ -53,7 +53,7 @@ def measured_runs(
     """
     for run in (*log.runs, *(held_out.runs if held_out else ())):
         check_run(run, mj_model)
-    notes = [*log.notes, *(held_out.notes if held_out else ())]
+    notes = [*log.notes, *(held_out.notes if held_out else ()), *_states(mj_model)]
     # Before interpolation, which would smooth the noise.
     noise = pooled_noise(log.runs)
     parts: list[Sequence[Run]] = []
@@ -74,3 +74,15 @@ def measured_runs(
     else:
         name = ", ".join(run.name for run in held)
     return MeasuredRuns(log.runs, noise, fit, held, name, notes)
+
+
+def _states(m: mujoco.MjModel) -> list[str]:
+    """A note on drives whose state (activation) no log holds."""
+    names = [m.actuator(a).name for a in range(m.nu) if m.actuator_actnum[a]]
+    if not names:
+        return []
+    return [
+        f"drives with a state of their own (activation): {', '.join(names)}; logs do "
+        "not hold it, and every prediction begins with it at zero, so values found at "
+        "these drives, and effects that are named, may be wrong"
+    ]

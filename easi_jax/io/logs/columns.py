@@ -1,7 +1,7 @@
 """The columns that a model gives a log, and their check."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +13,11 @@ from easi_jax.io.models.completed import held_joint
 from easi_jax.model.joint_space import FREE_WIDTH, given_name, numbered, widths
 
 _CHECKED = ("qpos.", "qvel.", "ctrl.")
-_LISTED = 5
+_LISTED = 5  # names in a message
+_AT_JOINT = (
+    int(mujoco.mjtTrn.mjTRN_JOINT),
+    int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
+)
 
 
 @dataclass(frozen=True)
@@ -112,7 +116,10 @@ def _held(model: mujoco.MjModel) -> tuple[str, ...]:
 
 
 def check_columns(
-    path: Path, names: Mapping[str, object], columns: LogColumns
+    path: Path,
+    names: Mapping[str, object],
+    columns: LogColumns,
+    model: mujoco.MjModel,
 ) -> list[str]:
     """Checks a file's column names against the model's.
 
@@ -120,8 +127,9 @@ def check_columns(
         Names that are ignored, in the file's order.
 
     Raises:
-        UserError: a column that the model needs is missing, or a position,
-            velocity or command has a name that the model does not know.
+        UserError: a column that the model needs is missing (what cannot be determined
+            without it is said), or a position, velocity or command has a name that
+            the model does not know.
     """
     missing = [
         name for name in ("time", *columns.qpos, *columns.ctrl) if name not in names
@@ -135,6 +143,7 @@ def check_columns(
         if more and len(missing) > _LISTED:
             more += f" and {len(missing) - _LISTED} more"
         near = nearest(missing[0], strangers)
+        lost = "" if near else _undetermined(model, columns, missing)
         if near:
             theirs = near.split('"')[1]
             near += f" ({cure(f'columns: {{{theirs}: {missing[0]}}}')} renames it)"
@@ -151,7 +160,7 @@ def check_columns(
                 )
         raise UserError(
             f"{path}: no column {first}, which the model needs"
-            f"{near}{more + ')' if more else ''}"
+            f"{near}{more + ')' if more else ''}{lost}"
         )
     ignored = [name for name in names if name not in columns.known]
     for name in ignored:
@@ -169,3 +178,58 @@ def check_columns(
                 "give all velocities of a joint or none"
             )
     return ignored
+
+
+def _undetermined(
+    model: mujoco.MjModel, columns: LogColumns, missing: Sequence[str]
+) -> str:
+    """What a log cannot determine that has some of ``columns``, but not ``missing``.
+
+    Nothing is said of a free joint, nor where all positions are missing, which are
+    then named otherwise.
+    """
+    lost = set(missing)
+    if "time" in lost or lost.issuperset(columns.qpos):
+        return ""
+    joints, bodies = [], set[int]()
+    for j in range(model.njnt):
+        size, _ = widths(model, j)
+        name = given_name(model, j)
+        if size < FREE_WIDTH and lost.intersection(numbered(f"qpos.{name}", size)):
+            joints.append(j)
+            bodies.add(int(model.jnt_bodyid[j]))
+    for b in range(model.nbody):
+        if int(model.body_parentid[b]) in bodies:
+            bodies.add(b)
+    drives = [
+        a
+        for a in range(model.nu)
+        if columns.ctrl[a] in lost
+        or (
+            model.actuator_trntype[a] in _AT_JOINT
+            and int(model.actuator_trnid[a, 0]) in joints
+        )
+    ]
+    said = [
+        _listed("joint", [given_name(model, j) for j in joints]),
+        _listed("drive", [model.actuator(a).name for a in drives]),
+        _listed("body", [model.body(b).name for b in sorted(bodies)]),
+    ]
+    if not any(said):
+        return ""
+    it = "it" if len(missing) == 1 else "them"
+    cure = f", or remove the joint{'s' * (len(joints) > 1)} from the model"
+    return (
+        f"; without {it} nothing can be determined of "
+        f"{', '.join(filter(None, said))}: log {it}{cure * bool(joints)}"
+    )
+
+
+def _listed(kind: str, names: Sequence[str]) -> str:
+    """``joint elbow``, ``joints elbow, wrist``, ``joints a, b, c, d, e and 3 more``."""
+    names = [name for name in names if name]
+    if len(names) < 2:
+        return " ".join([kind, *names]) if names else ""
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    plural = {"body": "bodies"}.get(kind, f"{kind}s")
+    return f"{plural} {', '.join(names[:_LISTED])}{more}"

@@ -189,7 +189,7 @@ class _Reader:
         table = self.mapping.rename(read_table(self.path))
         for text in table.notes:
             self.note(text)
-        ignored = check_columns(self.path, table.columns, self.columns)
+        ignored = check_columns(self.path, table.columns, self.columns, self.model)
         index = [name for name in ignored if table.counts_rows(name)]
         for name in index:
             self.note(f'column "{name}" counts the rows (an index): ignored')

@@ -187,6 +187,43 @@ def test_all_missing_columns_are_named(tmp_path, cart):
     assert '"time"' in failure(save(tmp_path / "b.csv", columns), cart)
 
 
+ARM = """<mujoco><option timestep=".01"/><worldbody>
+<body name="upper"><joint name="shoulder" axis="0 1 0"/><geom size=".1"/>
+  <body name="fore" pos="0 0 .5"><joint name="elbow" type="ball"/><geom size=".1"/>
+    <body name="hand" pos="0 0 .5"><joint name="wrist"/><geom size=".1"/></body>
+</body></body></worldbody>
+<actuator><motor name="lift" joint="shoulder"/><motor name="bend" joint="elbow"/>
+<motor name="turn" joint="wrist"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("dropped", "lost"),
+    [
+        (
+            "qpos.elbow",
+            "without them nothing can be determined of joint elbow, drive bend, "
+            "bodies fore, hand: log them, or remove the joint from the model",
+        ),
+        (
+            "qpos.wrist",
+            "without it nothing can be determined of joint wrist, drive turn, "
+            "body hand: log it, or remove the joint from the model",
+        ),
+        ("ctrl.lift", "without it nothing can be determined of drive lift: log it"),
+    ],
+)
+def test_what_a_missing_joint_leaves_open_is_said(tmp_path, dropped, lost):
+    m = mujoco.MjModel.from_xml_string(ARM)
+    columns = {"time": 0.01 * np.arange(ROWS), "imu": np.ones(ROWS)}
+    columns |= {f"qpos.{j}": np.zeros(ROWS) for j in ("shoulder", "wrist")}
+    columns |= {f"qpos.elbow.{i}": np.full(ROWS, float(i == 0)) for i in range(4)}
+    columns |= {f"ctrl.{a}": np.zeros(ROWS) for a in ("lift", "bend", "turn")}
+    kept = {k: v for k, v in columns.items() if not k.startswith(dropped)}
+    text = failure(save(tmp_path / "a.csv", kept), m)
+    assert text.endswith(lost)
+    assert "determined" not in failure(save(tmp_path / "b.csv", {"time": [0]}), m)
+
+
 @pytest.mark.parametrize(
     ("extra", "near"),
     [
