@@ -12,7 +12,6 @@ from easi_jax.data.segments import to_device
 from easi_jax.devices import distributed
 from easi_jax.devices.mesh import placed
 from easi_jax.devices.runtime import quick_compile
-from easi_jax.estimation.normal_equations import shift_start
 from easi_jax.estimation.pieces import effective_noise, few, segments_from_runs
 from easi_jax.estimation.posterior import Estimate, estimate, polished, widened
 from easi_jax.estimation.prediction_error import (
@@ -27,6 +26,7 @@ from easi_jax.model.results import HeldOutErrors
 from easi_jax.search.config import SearchConfig
 from easi_jax.search.easi import Search, SearchData
 from easi_jax.simulation import open_loop
+from easi_jax.simulation.slopes import shift_start
 
 Tell = Callable[[str], None]
 

@@ -1,13 +1,13 @@
 """What measured segments say about the parameters: Fisher information.
 
-Derivatives of the simulation are forward-mode or, beyond three degrees of freedom,
-central differences: derivatives of an arm of six compile for minutes, and batches of
-larger robots simulate many times faster than derivatives go through them
-(`easi_jax.simulation.cpu.batch_last`). The start state of each segment is unknown
+Derivatives are those of `easi_jax.simulation.slopes` or, on MJX beyond three degrees of
+freedom, central differences in single precision: derivatives of an arm of six compile
+for minutes, and batches of larger robots simulate many times faster than derivatives go
+through them (`easi_jax.simulation.cpu.batch_last`). The start state of each segment is unknown
 within its noise and eliminated (Schur complement). The inverse is the Cramer-Rao bound.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import flax.struct
@@ -19,7 +19,7 @@ from easi_jax.data.segments import Segments
 from easi_jax.devices.mesh import make_mesh, replicated, sharded_map
 from easi_jax.devices.runtime import on_cpu
 from easi_jax.model.parameters import ParameterSpace
-from easi_jax.simulation import open_loop
+from easi_jax.simulation import slopes
 from easi_jax.simulation.simulator import Simulator
 
 RESOLVED = 1e-5  # smallest eigenvalue of a float32 correlation matrix worth its name
@@ -49,15 +49,6 @@ class Normal:
     costs: jax.Array
     start_step: jax.Array
     start_gain: jax.Array
-
-
-def shift_start(simulator: Simulator, seg: Segments, delta: jax.Array) -> Segments:
-    """Segments with starts moved by tangent vectors ``(M, 2 nv)``."""
-    nv = simulator.mj_model.nv
-    move = simulator.move
-    return replace(
-        seg, qpos=move(seg.qpos, delta[:, :nv]), qvel=seg.qvel + delta[:, nv:]
-    )
 
 
 @dataclass(frozen=True)
@@ -98,7 +89,9 @@ class PairedFit:
             r, jac = self._pushed(unit, d, s)
             return self._equations(r, jac, d, w)
 
-        return self._summed(self._each(one, 1, delta, weight))
+        native = self.simulator.engine == "mujoco"
+        points = self.points if native else 1
+        return self._summed(self._each(one, points, delta, weight))
 
     def around(self, unit: jax.Array, delta: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Points whose `sweep` holds the derivatives at ``unit (n,)`` and ``delta
@@ -205,7 +198,8 @@ class PairedFit:
     @property
     def points(self) -> int:
         """Simulations of each piece that `normal` takes, a derivative as one."""
-        return 1 + self._directions * (2 if self.simulator.by_differences else 1)
+        derived = self.simulator.engine == "mjx" and not self.simulator.by_differences
+        return 1 + self._directions * (1 if derived else 2)
 
     @property
     def _directions(self) -> int:
@@ -219,8 +213,8 @@ class PairedFit:
         """
         mesh = self.mesh or make_mesh()
         share = -(-self.segments.count // mesh.size)
-        wide = self.simulator.wide or not on_cpu()
-        at_once = self.simulator.batch if wide else _LANES
+        one_piece = self.simulator.engine == "mjx" and not self.simulator.wide
+        at_once = _LANES if one_piece and on_cpu() else self.simulator.batch
         wanted = at_once // points
         batch = min(share, max(1, wanted))
         rounds = -(-share // batch)
@@ -238,20 +232,10 @@ class PairedFit:
         self, unit: jax.Array, d: jax.Array, s: Segments
     ) -> tuple[jax.Array, jax.Array]:
         """Residual ``(H, 2 nv)`` of one segment and its slopes ``(..., directions)``
-        along parameters and, where starts are free, along the start; forward-mode."""
-        n = self.space.size
-
-        def f(x: jax.Array) -> jax.Array:
-            shift = d + x[n:] if self.free_starts else d
-            return self._residual(unit + x[:n], shift, s)
-
-        zero = jnp.zeros(self._directions)
-        r, push = f(zero), lambda v: jax.jvp(f, (zero,), (v,))[1]
-        return r, jnp.moveaxis(jax.vmap(push)(jnp.eye(len(zero))), 0, -1)
+        along parameters and, where starts are free, along the start."""
+        given = self.simulator, self.space, unit, d, s
+        return slopes.linearized(*given, self.steps, self.free_starts)
 
     def _residual(self, unit: jax.Array, d: jax.Array, s: Segments) -> jax.Array:
         """Predicted minus measured, ``(H, 2 nv)``, of one segment; its start moved."""
-        one = jax.tree.map(lambda x: x[None], s)
-        moved = shift_start(self.simulator, one, d[None])
-        model = self.simulator.model(self.space.to_si(unit))
-        return -open_loop.errors_from(self.simulator, model, moved, one, self.steps)[0]
+        return slopes.residuals(self.simulator, self.space, unit, d, s, self.steps)

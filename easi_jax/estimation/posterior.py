@@ -21,7 +21,7 @@ from easi_jax.estimation.polish import polish
 from easi_jax.estimation.profile_score import Adjusted, adjust
 from easi_jax.model.distribution import Distribution, gaussian
 from easi_jax.model.parameters import ParameterSpace
-from easi_jax.simulation.simulator import Simulator
+from easi_jax.simulation.simulator import FORWARD_MODE, Simulator
 
 RESTARTS = 2  # of the finish on noisy data, where it has more than one minimum
 _SHARP = 1.0 / 3.0  # of a value: its standard deviation where logarithms will do
@@ -118,7 +118,7 @@ def estimate(
             near=near,
             others=_draws(mean, cov, restarts) if restarts else None,
         )
-        if adjusted and free_starts and not simulator.by_differences:
+        if adjusted and free_starts and simulator.mj_model.nv <= FORWARD_MODE:
             given = simulator, space, fit.unit, pieces, assumed, mesh, misfit
             fit = _adjusted(fit, adjust(*given))
         if rest is not None:
@@ -176,7 +176,7 @@ def polished(
     assumed = effective_noise(simulator, rest, noise)
     off = jnp.zeros_like(assumed) if misfit is None else misfit
     fit = polish(simulator, space, center, rest, assumed, mesh, off, free_starts)
-    if adjusted and free_starts and not simulator.by_differences:
+    if adjusted and free_starts and simulator.mj_model.nv <= FORWARD_MODE:
         given = simulator, space, fit.unit, rest, assumed, mesh, off
         fit = _adjusted(fit, adjust(*given))
     return _of_fit(space, fit, center, cov, assumed, informed, rest, off)

@@ -34,9 +34,10 @@ from easi_jax.estimation.levenberg_marquardt import (
     raised_to_range,
     step_weights,
 )
-from easi_jax.estimation.normal_equations import RESOLVED, PairedFit, shift_start
+from easi_jax.estimation.normal_equations import RESOLVED, PairedFit
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.simulator import Simulator
+from easi_jax.simulation.slopes import shift_start
 
 _DRAWS = 2  # of the noise, for every piece
 _ROUNDS = 20  # at most

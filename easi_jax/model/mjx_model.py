@@ -352,6 +352,7 @@ def _leaf(m: mjx.Model, field: str) -> jax.Array:
 
 def _write(leaf: jax.Array, items: list[Any], theta: jax.Array) -> jax.Array:
     index = tuple(np.array(k) for k in zip(*(i for i, _, _ in items), strict=True))
+    leaf = leaf.astype(jnp.promote_types(leaf.dtype, theta.dtype))
     sign = np.array([s for _, _, s in items], leaf.dtype)
     values = theta[np.array([p for _, p, _ in items])].astype(leaf.dtype) * sign
     if not index:  # a scalar

@@ -151,6 +151,12 @@ class ParameterSpace:
         offset = np.where(self.log, np.log(safe[0]), low)
         return offset, np.where(self.log, np.log(safe[1] / safe[0]), high - low)
 
+    def _constants(self) -> tuple[jax.Array, jax.Array]:
+        """`_affine`, anew each time: jax knows a program's constants by their identity,
+        and a part of it may be of another precision than the rest."""
+        offset, width = self._affine
+        return jnp.asarray(offset.copy()), jnp.asarray(width.copy())
+
     @property
     def log_width(self) -> np.ndarray:
         """d log(value) / d unit where logarithmic, 1 elsewhere, ``(n,)``."""
@@ -158,13 +164,13 @@ class ParameterSpace:
 
     def to_si(self, unit: jax.Array | np.ndarray) -> jax.Array:
         """SI values of unit coordinates ``(..., n)``; not clipped."""
-        offset, width = (jnp.asarray(a) for a in self._affine)
+        offset, width = self._constants()
         x = offset + width * unit
         return jnp.where(self.log, jnp.exp(jnp.where(self.log, x, 0.0)), x)
 
     def to_unit(self, si: jax.Array | np.ndarray) -> jax.Array:
         """Unit coordinates of SI values ``(..., n)``; -inf for 0 on a log scale."""
-        offset, width = (jnp.asarray(a) for a in self._affine)
+        offset, width = self._constants()
         si = jnp.asarray(si)
         positive = jnp.maximum(jnp.where(self.log, si, 1.0), 0.0)
         return (jnp.where(self.log, jnp.log(positive), si) - offset) / width

@@ -9,6 +9,7 @@ each other and of the number of threads.
 import threading
 import weakref
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
@@ -372,16 +373,127 @@ def _host(template: Template) -> _Host:
         return _hosts[template]
 
 
+# Axes of its own that each argument of a call has, behind those of a batch.
+_OWN = {
+    **dict.fromkeys(("qpos", "qvel", "act", "warmstart", "rest", "qfrc"), 1),
+    **dict.fromkeys(("ctrl", "xfrc", "pairs"), 2),
+    "count": 0,
+}
+
+
 def _rows(x: np.ndarray, own: int, lead: tuple[int, ...]) -> np.ndarray:
     """``(N, ...)`` of what has ``own`` axes of its own behind those of a batch."""
-    x = np.asarray(x)
     shape = x.shape[x.ndim - own :] if own else ()
     count = int(np.prod(lead, dtype=int))
     return np.broadcast_to(x, (*lead, *shape)).reshape(count, *shape)
 
 
-def _lead(x: Any, own: int) -> tuple[int, ...]:
-    return np.shape(x)[: np.ndim(x) - own]
+def _together(args: dict[str, np.ndarray], own: dict[str, int]) -> tuple[int, ...]:
+    """Axes of the batch that some arguments make together."""
+    leads = (x.shape[: x.ndim - own[name]] for name, x in args.items())
+    return np.broadcast_shapes(*leads)
+
+
+def _words(x: jax.Array) -> jax.Array:
+    """Doubles as pairs of 32-bit words ``(..., 2)``: where jax's doubles are off, a
+    callback would be given them in single precision."""
+    double = x.dtype == jnp.float64
+    return jax.lax.bitcast_convert_type(x, jnp.uint32) if double else x
+
+
+@dataclass(frozen=True)
+class _Call:
+    """What is the same in every call from one place of a program; called by it.
+
+    Attributes:
+        template: of the model.
+        words: names of arguments that come as `_words`.
+        out: shapes and types of the results, of one simulation; doubles go as words.
+        every, read, stage: as for `run`.
+    """
+
+    template: Template
+    words: frozenset[str]
+    out: tuple[jax.ShapeDtypeStruct, ...]
+    every: int
+    read: Any
+    stage: str
+
+    @property
+    def crossing(self) -> tuple[jax.ShapeDtypeStruct, ...]:
+        """``out`` as it comes back to the program."""
+        return tuple(jax.eval_shape(_words, like) for like in self.out)
+
+    def __call__(
+        self, values: dict[str, np.ndarray], given: dict[str, np.ndarray]
+    ) -> tuple[np.ndarray, ...]:
+        """Results ``(..., *shape)`` of arguments with axes of a batch before theirs.
+
+        Args:
+            values: fields of the model.
+            given: the others, those of `_OWN`.
+        """
+        values, given = self._numbers(values), self._numbers(given)
+        mj = self.template.mj
+        fields = {name: np.ndim(nominal_field(mj, name)) for name in values}
+        lead = _together({**values, **given}, {**fields, **_OWN})
+        of_models = _together(values, fields)
+        of_models = (1,) * (len(lead) - len(of_models)) + of_models
+        number = np.arange(int(np.prod(of_models, dtype=int))).reshape(of_models)
+        which = np.broadcast_to(number, lead).reshape(-1)
+        models = [
+            _rows(x, fields[name], of_models).astype(np.float64)
+            for name, x in values.items()
+        ]
+        host = _host(self.template)
+        b = host.ready(tuple(values), models, which)
+        bound = [b.batch.bind(name) for name in self.read.fields] if self.read else []
+        rows = {name: _rows(x, _OWN[name], lead) for name, x in given.items()}
+        after, qpos, qvel = self._simulated(host, b, rows)
+        sensed = self.read(*bound) if self.read else np.zeros((b.size, 0))
+        host._back(b)
+        results = zip((*after, qpos, qvel, sensed), self.out, strict=True)
+        return tuple(_crossing(x.reshape(*lead, *x.shape[1:]), to) for x, to in results)
+
+    def _numbers(self, args: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Arguments by name, in order, words put together again."""
+        out = {name: np.asarray(args[name]) for name in sorted(args)}
+        for name in self.words & out.keys():
+            whole = np.ascontiguousarray(out[name])
+            out[name] = whole.view(np.float64).reshape(whole.shape[:-1])
+        return out
+
+    def _simulated(
+        self, host: _Host, b: _Batch, rows: dict[str, np.ndarray]
+    ) -> tuple[_State, np.ndarray, np.ndarray]:
+        state = _State(*(rows[name] for name in _State._fields))
+        if self.stage == "velocity":
+            return host.seen(b, state)
+        ctrl = rows["ctrl"].astype(np.float64)
+        forces = rows.get("qfrc"), rows.get("xfrc")
+        if "pairs" in rows:
+            return host.one_by_one(b, state, ctrl[:, 0], *forces, rows["pairs"])
+        if "count" not in rows:
+            return host.steps(b, state, ctrl, *forces, self.every)
+        count = int(rows["count"][0])
+        if (rows["count"] != count).any():
+            raise ValueError("simulations of one call end after as many steps")
+        after, *seen = host.steps(b, state, ctrl[:, :count], *forces, self.every)
+        steps = ctrl.shape[1] // self.every
+        qpos, qvel = (
+            np.repeat(start[:, None].astype(np.float64), steps, 1)
+            for start in (state.qpos, state.qvel)
+        )
+        qpos[:, : count // self.every], qvel[:, : count // self.every] = seen
+        return after, qpos, qvel
+
+
+def _crossing(x: np.ndarray, like: jax.ShapeDtypeStruct) -> np.ndarray:
+    """As `_Call.crossing` says."""
+    x = np.ascontiguousarray(x, like.dtype)
+    if like.dtype != np.float64:
+        return x
+    return x.view(np.uint32).reshape(*x.shape, 2)
 
 
 def run(
@@ -394,8 +506,11 @@ def run(
     read: Any = None,
     pairs: jax.Array | None = None,
     stage: str = "step",
+    count: jax.Array | None = None,
 ) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, jax.Array], jax.Array]:
     """Physics steps of MuJoCo C; may be traced, and mapped over any argument.
+
+    Numbers are as precise as those of ``state``, doubles also where jax's are off.
 
     Args:
         state: `easi_jax.simulation.step.Physics`.
@@ -407,84 +522,40 @@ def run(
             geoms (`easi_jax.model.contact_pairs`), ``(K, 3)``; one step then, and
             simulations one by one, since MuJoCo has no number to write them into.
         stage: "step"; "velocity": nothing moves, and ``read`` sees the state itself.
+        count: physics steps that are taken, ``()``, the same for all that are mapped
+            over; T where None. Of later ones the motion is that of the start.
 
     Returns:
         qpos, qvel, act, warm start and rest after the last step; qpos and qvel after
         each ``every``, ``(T / every, ...)``; what ``read`` made of the last step.
         Not a number where a simulation failed.
     """
-    template, m = model.template, model.template.mj
-    fields = tuple(sorted(model.changed))
-    own = [np.ndim(nominal_field(m, name)) for name in fields]
-    dtype = state.qpos.dtype
-    span = every or ctrl.shape[0]
-    seen = ctrl.shape[0] // span
-    physics = (state.qpos, state.qvel, state.act, state.warmstart, state.rest)
-    forces = [f for f in (qfrc, xfrc, pairs) if f is not None]
-    has_q, has_x, has_pairs = (f is not None for f in (qfrc, xfrc, pairs))
-    size = read.size if read is not None else 0
-
-    def shape(*s: int) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct(s, dtype)
-
-    out = (
-        *(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in physics),
-        shape(seen, m.nq),
-        shape(seen, m.nv),
-        shape(size),
+    m = model.template.mj
+    every = every or ctrl.shape[0]
+    given = {name: getattr(state, name) for name in _State._fields} | {"ctrl": ctrl}
+    more = {"qfrc": qfrc, "xfrc": xfrc, "pairs": pairs, "count": count}
+    given |= {name: x for name, x in more.items() if x is not None}
+    seen, size = ctrl.shape[0] // every, read.size if read is not None else 0
+    shapes = (seen, m.nq), (seen, m.nv), (size,)
+    out = [jax.ShapeDtypeStruct(given[x].shape, given[x].dtype) for x in _State._fields]
+    out += [jax.ShapeDtypeStruct(shape, state.qpos.dtype) for shape in shapes]
+    args = model.changed | given
+    call = _Call(
+        model.template,
+        frozenset(name for name, x in args.items() if x.dtype == jnp.float64),
+        tuple(out),
+        every,
+        read,
+        stage,
     )
-
-    def called(*args: np.ndarray) -> tuple[np.ndarray, ...]:
-        args = tuple(np.asarray(a) for a in args)
-        values, given = args[: len(fields)], args[len(fields) :]
-        axes = [*own, *(1 for _ in physics), 2, *([1] * has_q), *([2] * has_x)]
-        axes += [2] * has_pairs
-        lead = np.broadcast_shapes(
-            *(_lead(a, k) for a, k in zip(args, axes, strict=True))
-        )
-        of_models = np.broadcast_shapes(
-            *(_lead(v, k) for v, k in zip(values, own, strict=True))
-        )
-        padded = (1,) * (len(lead) - len(of_models)) + of_models
-        number = np.arange(int(np.prod(padded, dtype=int))).reshape(padded)
-        which = np.broadcast_to(number, lead).reshape(-1)
-        host = _host(template)
-        models = [
-            _rows(v, k, padded).astype(np.float64)
-            for v, k in zip(values, own, strict=True)
-        ]
-        rows = [_rows(a, 1, lead) for a in given[:5]]
-        u = _rows(given[5], 2, lead).astype(np.float64)
-        more = list(given[6:])
-        q = _rows(more.pop(0), 1, lead) if has_q else None
-        x = _rows(more.pop(0), 2, lead) if has_x else None
-        b = host.ready(fields, models, which)
-        if read is not None:
-            bound = [b.batch.bind(name) for name in read.fields]
-        if stage == "velocity":
-            after, qpos, qvel = host.seen(b, _State(*rows))
-        elif has_pairs:
-            k = _rows(more.pop(0), 2, lead)
-            after, qpos, qvel = host.one_by_one(b, _State(*rows), u[:, 0], q, x, k)
-        else:
-            after, qpos, qvel = host.steps(b, _State(*rows), u, q, x, span)
-        sensed = np.zeros((b.size, 0))
-        if read is not None:
-            sensed = read(*bound)
-        host._back(b)
-        results = (*after, qpos, qvel, sensed)
-        return tuple(
-            r.reshape(*lead, *r.shape[1:]).astype(like.dtype)
-            for r, like in zip(results, out, strict=True)
-        )
-
-    *physics_out, qpos, qvel, sensed = jax.pure_callback(
-        called,
-        out,
-        *(model.changed[name] for name in fields),
-        *physics,
-        ctrl,
-        *forces,
+    crossed = jax.pure_callback(
+        call,
+        call.crossing,
+        *jax.tree.map(_words, (model.changed, given)),
         vmap_method="expand_dims",
     )
-    return tuple(physics_out), (qpos, qvel), sensed
+    *physics, qpos, qvel, sensed = (
+        jax.lax.bitcast_convert_type(x, to.dtype) if to.dtype == jnp.float64 else x
+        for x, to in zip(crossed, out, strict=True)
+    )
+    return tuple(physics), (qpos, qvel), sensed

@@ -89,17 +89,19 @@ def steps(model: Any, state: Any, arrived: jax.Array) -> Any:
 
 
 def replay(
-    model: Any, state: Any, arrived: jax.Array
+    model: Any, state: Any, arrived: jax.Array, steps: Any = None
 ) -> tuple[jax.Array, jax.Array] | None:
     """Positions and velocities ``(H, ...)`` after each of H control steps in which
     ``arrived (H, substeps, nu)`` reaches the actuators, by one call of MuJoCo; None
-    where it takes more."""
+    where it takes more. ``steps``: as for `easi_jax.simulation.open_loop.predict`."""
     if _varies(model):
         return None
     h, substeps, nu = arrived.shape
     changed, qfrc, xfrc = _steady(model)
     ctrl = arrived.reshape(h * substeps, nu)
-    return native.run(changed, state, ctrl, qfrc, xfrc, every=substeps)[1]
+    count = None if steps is None else jnp.asarray(steps * substeps)
+    given = changed, state, ctrl, qfrc, xfrc
+    return native.run(*given, every=substeps, count=count)[1]
 
 
 def _after(model: Any, state: Any, out: tuple[jax.Array, ...], sensed: Any) -> Any:

@@ -32,10 +32,10 @@ def predict(
         first = dataclasses.replace(simulator.start(qpos, qvel), sensed=())
         if not isinstance(past, tuple):
             first = simulator.after(model, first, past)
+        at_once = simulator.replay(model, first, ctrl, steps)
+        if at_once is not None:
+            return at_once
         if steps is None:
-            at_once = simulator.replay(model, first, ctrl)
-            if at_once is not None:
-                return at_once
             return jax.lax.scan(step, first, ctrl)[1]
         begun = jax.tree.map(
             lambda x: jnp.broadcast_to(x, (ctrl.shape[0], *x.shape)),

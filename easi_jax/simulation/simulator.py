@@ -28,7 +28,7 @@ _BATCH = 128  # benchmarks/speed.py
 _WIDE_BATCH = 32  # benchmarks/physics.py
 _ACCELERATOR_BATCH = 16_384  # benchmarks/scaling.py
 _NATIVE_BATCH = 4_096  # few calls, and 100 MB at most of models' numbers
-_FORWARD_MODE = 3  # degrees of freedom: of six, written out, it compiles for minutes
+FORWARD_MODE = 3  # degrees of freedom: of six, written out, it compiles for minutes
 _SETTLED = 4.0  # time constants after which a lag has forgotten
 
 
@@ -45,8 +45,9 @@ class Simulator:
             divided by the smallest whole number that brings it to the model's own
             timestep or below.
         wide: whether it is too large to be written out entry by entry.
-        by_differences: whether slopes of a fit are central differences, not
-            forward-mode derivatives.
+        by_differences: whether slopes of a fit are differences in single precision,
+            of simulations that are compiled once for them and for trials
+            (`easi_jax.simulation.slopes`).
         fixed: values by address that are not those of ``mj_model``, effects among them.
         past_steps: commands before a measured start that its simulation has use for;
             0 where no effect lies on the way of a command.
@@ -77,7 +78,7 @@ class Simulator:
         self.fixed = dict(fixed or {})
         native = self.engine == "mujoco"
         self.wide = mj_model.nv > WRITTEN_OUT
-        self.by_differences = native or mj_model.nv > _FORWARD_MODE
+        self.by_differences = not native and mj_model.nv > FORWARD_MODE
         self.base = self._put(sense is not None).replace(
             sense=sense,
             sense_size=sense_size,
@@ -173,10 +174,11 @@ class Simulator:
         return control_step(model, state, ctrl, self.substeps)
 
     def replay(
-        self, model: Model, state: Physics, ctrl: jax.Array
+        self, model: Model, state: Physics, ctrl: jax.Array, steps: Any = None
     ) -> tuple[jax.Array, jax.Array] | None:
         """Positions and velocities ``(H, ...)`` after each of the commands
-        ``(H, nu)``, where the engine has a call for all of them; else None."""
+        ``(H, nu)``, where the engine has a call for all of them; else None. ``steps``:
+        as for `easi_jax.simulation.open_loop.predict`."""
         if self.engine != "mujoco":
             return None
         e, substeps = model.effects, self.substeps
@@ -190,7 +192,7 @@ class Simulator:
                 return memory, arrived
 
             arrived = jax.lax.scan(sent, state.memory, ctrl)[1]
-        return native_step.replay(model, state, arrived)
+        return native_step.replay(model, state, arrived, steps)
 
     @cached_property
     def state_names(self) -> tuple[str, ...]:

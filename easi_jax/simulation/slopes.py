@@ -1,0 +1,131 @@
+"""Residuals of a measured piece and their slopes, from either engine.
+
+Slopes are forward-mode derivatives of MJX, or differences of native MuJoCo: all
+simulations of a piece in one call, in double precision from the parameters to the
+difference.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from easi_jax.data.segments import Segments
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation import open_loop
+from easi_jax.simulation.simulator import Simulator
+
+# Of an initial range, and along a start [m, rad, m/s, rad/s]: what a central difference
+# leaves out is of its square, and the constraint solver's rest, 1e-9, over it.
+_STEP = 1e-4
+_MOVE = 1e-5
+
+
+def shift_start(simulator: Simulator, seg: Segments, delta: jax.Array) -> Segments:
+    """Segments with starts moved by tangent vectors ``(M, 2 nv)``."""
+    nv = simulator.mj_model.nv
+    move = simulator.move
+    return replace(
+        seg, qpos=move(seg.qpos, delta[:, :nv]), qvel=seg.qvel + delta[:, nv:]
+    )
+
+
+def residuals(
+    simulator: Simulator,
+    space: ParameterSpace,
+    unit: jax.Array,
+    shift: jax.Array,
+    piece: Segments,
+    steps: int | jax.Array | None = None,
+) -> jax.Array:
+    """Predicted minus measured, ``(H, 2 nv)``; pure.
+
+    Args:
+        unit: parameters, unit coordinates, ``(n,)``.
+        shift: of the measured start, ``(2 nv,)``.
+        piece: one segment, without an axis for it.
+        steps: control steps that are simulated; all H where None.
+    """
+    run = partial(_residuals, simulator, space)
+    return _precisely(simulator, run, unit, shift, piece, steps)
+
+
+def linearized(
+    simulator: Simulator,
+    space: ParameterSpace,
+    unit: jax.Array,
+    shift: jax.Array,
+    piece: Segments,
+    steps: int | jax.Array | None = None,
+    free_start: bool = True,
+) -> tuple[jax.Array, jax.Array]:
+    """`residuals`, and their slopes along the parameters and, where it is free, the
+    start, ``(H, 2 nv, n + 2 nv or n)``; pure."""
+    run = partial(_linearized, simulator, space, free_start)
+    return _precisely(simulator, run, unit, shift, piece, steps)
+
+
+def _linearized(
+    simulator: Simulator,
+    space: ParameterSpace,
+    free_start: bool,
+    unit: jax.Array,
+    shift: jax.Array,
+    piece: Segments,
+    steps: int | jax.Array | None,
+) -> tuple[jax.Array, jax.Array]:
+    n, along_start = space.size, len(shift) if free_start else 0
+
+    def at(x: jax.Array) -> jax.Array:
+        moved = shift + x[n:] if free_start else shift
+        return _residuals(simulator, space, unit + x[:n], moved, piece, steps)
+
+    if simulator.engine == "mjx":
+        zero = jnp.zeros(n + along_start)
+        pushed = jax.vmap(lambda v: jax.jvp(at, (zero,), (v,))[1])(jnp.eye(len(zero)))
+        return at(zero), jnp.moveaxis(pushed, 0, -1)
+    step = jnp.concatenate([jnp.full(n, _STEP), jnp.full(along_start, _MOVE)])
+    # Between bounds a parameter may have less than its step to go.
+    far = jnp.full(along_start, jnp.inf)
+    low, high = space.unit_bounds
+    edge = jnp.concatenate([low - unit, -far]), jnp.concatenate([high - unit, far])
+    up, down = jnp.clip(step, *edge), jnp.clip(-step, *edge)
+    ways = jnp.concatenate([jnp.zeros((1, len(step))), jnp.diag(up), jnp.diag(down)])
+    every = jax.vmap(at)(ways)
+    gone = up - down
+    over, under = jnp.split(every[1:], 2)
+    slopes = jnp.moveaxis(over - under, 0, -1) / jnp.where(gone > 0, gone, 1.0)
+    return every[0], slopes
+
+
+def _residuals(
+    simulator: Simulator,
+    space: ParameterSpace,
+    unit: jax.Array,
+    shift: jax.Array,
+    piece: Segments,
+    steps: int | jax.Array | None,
+) -> jax.Array:
+    one = jax.tree.map(lambda x: x[None], piece)
+    moved = shift_start(simulator, one, shift[None])
+    model = simulator.model(space.to_si(unit))
+    return -open_loop.errors_from(simulator, model, moved, one, steps)[0]
+
+
+def _precisely(simulator: Simulator, run: Callable[..., Any], *args: Any) -> Any:
+    """``run(*args)``; of a native engine in doubles, whether jax's are on or off."""
+    if simulator.engine == "mjx":
+        return run(*args)
+    dtype = args[0].dtype
+
+    def cast(tree: Any, dtype: Any) -> Any:
+        return jax.tree.map(
+            lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x,
+            tree,
+        )
+
+    with jax.enable_x64(True):
+        return cast(run(*cast(args, jnp.float64)), dtype)
