@@ -3,8 +3,9 @@
 Derivatives are those of `easi_jax.simulation.slopes` or, on MJX beyond three degrees of
 freedom, central differences in single precision: derivatives of an arm of six compile
 for minutes, and batches of larger robots simulate many times faster than derivatives go
-through them (`easi_jax.simulation.cpu.batch_last`). The start state of each segment is unknown
-within its noise and eliminated (Schur complement). The inverse is the Cramer-Rao bound.
+through them (`easi_jax.simulation.cpu.batch_last`). The start state of each segment is
+unknown within its noise and eliminated (Schur complement). The inverse is the Cramer-
+Rao bound.
 """
 
 from dataclasses import dataclass

@@ -87,7 +87,7 @@ def _by_hand(space: ParameterSpace, unit: np.ndarray, piece: Segments) -> Any:
         return _pendulum(theta, q + x[5], v + x[6], ctrl)
 
     ways = 1e-30j * np.eye(7)
-    return at(np.zeros(7)), np.stack([at(w).imag / 1e-30 for w in ways], -1)
+    return at(np.zeros(7)), np.stack([np.imag(at(w)) / 1e-30 for w in ways], -1)
 
 
 def test_slopes_are_those_of_a_pendulum_by_hand(native: Any) -> None:
