@@ -93,7 +93,7 @@ def read_gap_problem(config: "Config") -> GapProblem:
 
     if not (math.isfinite(config.horizon) and config.horizon > 0):
         raise UserError(f"--horizon is {config.horizon:g}: give seconds above 0")
-    model = read_model(config.model, config.allow_assets, held_of(config))
+    model = read_model(config.model, config.allow_assets, held_of(config), True)
     mj_model = model.mj_model
     space = (
         own_space(mj_model)
@@ -125,7 +125,10 @@ def beyond_mjcf(space: "ParameterSpace") -> dict[str, float]:
 
 
 def read_model(
-    text: str, allowed: tuple[Path, ...] = (), held: "Held | None" = None
+    text: str,
+    allowed: tuple[Path, ...] = (),
+    held: "Held | None" = None,
+    logged: bool = False,
 ) -> GivenModel:
     """A built-in robot by its name, or an MJCF file; see `load_model`.
 
@@ -138,10 +141,10 @@ def read_model(
 
     if text in REGISTRY:
         env = make(text)
-        m = load_model(model_file(text), (), held) if held else env.mj_model
+        m = load_model(model_file(text), (), held, logged) if held else env.mj_model
         return GivenModel(text, None, m, env)
     path = Path(text)
-    mj_model = load_model(path, allowed, held)
+    mj_model = load_model(path, allowed, held, logged)
     # The first of the model's names is its own.
     name = mj_model.names.split(b"\0", 1)[0].decode()
     return GivenModel(name or path.stem, path, mj_model, None)

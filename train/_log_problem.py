@@ -76,7 +76,7 @@ def _model_and_space(config: Any) -> tuple[str, Any, Any]:
         env = make(config.robot)
         space, mj_model = env.space, env.mj_model
         if config.held_base:
-            mj_model = load_model(model_file(env.name), (), held_of(config))
+            mj_model = load_model(model_file(env.name), (), held_of(config), True)
         if config.parameters is not None:
             space = read_parameter_file(config.parameters, mj_model)
         return env.name, mj_model, space
@@ -87,7 +87,7 @@ def _model_and_space(config: Any) -> tuple[str, Any, Any]:
             "--model needs --parameters P.yaml (or --effects E.yaml): say what may "
             "vary in the model (see docs/your_own_robot.md)"
         )
-    mj_model = load_model(config.model, config.allow_assets, held_of(config))
+    mj_model = load_model(config.model, config.allow_assets, held_of(config), True)
     if config.parameters is None:
         return config.model.stem, mj_model, ParameterSpace(())
     space = read_parameter_file(config.parameters, mj_model)
@@ -100,10 +100,14 @@ def held_of(config: Any) -> "Held | None":
 
 
 def load_model(
-    path: Path, allowed: tuple[Path, ...] = (), held: "Held | None" = None
+    path: Path,
+    allowed: tuple[Path, ...] = (),
+    held: "Held | None" = None,
+    logged: bool = False,
 ) -> Any:
     """The MuJoCo model in ``path``; ``allowed`` are places outside of its folder that
-    it may read, ``held`` is as `held_of` gives it. What the user should know is said.
+    it may read, ``held`` is as `held_of` gives it, ``logged`` whether logs are read
+    next. What the user should know is said.
 
     Raises:
         UserError: as `easi_jax.io.models.mjcf.read_machine`.
@@ -130,4 +134,4 @@ def load_model(
     def tell(text: str) -> None:
         say(f"note: {text}")
 
-    return read_machine(path, allowed, tell, pose if held else None)
+    return read_machine(path, allowed, tell, pose if held else None, logged)

@@ -56,6 +56,7 @@ def run(config: Config) -> None:
         analysis.selector.journal = Journal(journal, key)
         if analysis.selector.journal.kept:
             say(f"going on after {analysis.selector.journal.kept} steps that are done")
+        problem.notes.extend(analysis.predictor.simulator.notes)
         for note in problem.notes:
             say(f"note: {note}")
         outcome = analysis.run()

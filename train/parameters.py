@@ -50,7 +50,9 @@ def run(config: Config) -> None:
             f"{config.out} is there already: name another file with --out, or replace "
             "it with --overwrite"
         )
-    m = load_model(config.model, config.allow_assets, held_of(config))
+    m = load_model(
+        config.model, config.allow_assets, held_of(config), bool(config.data)
+    )
     proposals = propose(m, config.tie)
     verdicts: dict[str, str] = {}
     notes: list[str] = []
@@ -139,6 +141,7 @@ def _information(config: Config, m: Any, proposals: list[Any]) -> Any:
     from easi_jax.estimation.pieces import effective_noise, segments_from_runs
     from easi_jax.io.logs.reader import read_logs
     from easi_jax.model.parameter_proposal import space_of
+    from easi_jax.simulation.logged import Logged
     from easi_jax.simulation.simulator import Simulator
 
     log = read_logs(list(config.data), m, config.mapping)
@@ -147,7 +150,9 @@ def _information(config: Config, m: Any, proposals: list[Any]) -> Any:
     for note in (*log.notes, *notes):
         say(f"note: {note}")
     space = space_of(proposals)
-    simulator = Simulator(m, space, runs[0].dt)
+    simulator = Simulator(m, space, runs[0].dt, logged=Logged.of(runs))
+    for note in simulator.notes:
+        say(f"note: {note}")
     steps = max(1, round(_HORIZON / simulator.dt))
     pieces = to_device(segments_from_runs(simulator, runs, steps, steps))
     noise = effective_noise(simulator, pieces, jnp.asarray(noise, jnp.float32))

@@ -14,6 +14,7 @@ from easi_jax.errors import UserError
 from easi_jax.estimation.pieces import visible_steps
 from easi_jax.model.found_effects import FoundEffects, joined
 from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation.logged import Logged
 from easi_jax.simulation.simulator import Simulator
 
 HORIZON = 0.2  # s, of the error that is reported; pieces are no longer
@@ -111,7 +112,9 @@ def problem_of(
             f"--noise is {list(noise)}: {name} needs {2 * nv} numbers, 0 or "
             "more: positions, then velocities"
         )
-    simulator = Simulator(mj_model, space, fit[0].dt, fixed=fixed)
+    logged = Logged.of([*fit, *held])
+    simulator = Simulator(mj_model, space, fit[0].dt, fixed=fixed, logged=logged)
+    notes += simulator.notes
     measured = np.array([run.qvel_measured for run in fit]).all() & np.all(
         [(trusted_velocity(run) == run.qvel).all(0) for run in fit], axis=0
     )

@@ -46,6 +46,7 @@ from easi_jax.io.runs.step_cache import key_of
 from easi_jax.model.joint_space import is_hinge, scalar_dofs
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.progress import Progress, silent
+from easi_jax.simulation.logged import Logged
 
 _FITTED = (32, 96)  # windows that fits see
 _STEPS = 9_600  # physics steps in them
@@ -123,6 +124,7 @@ class Analysis:
             join([fitted.take(chosen[repeated]), kept]),
             dt,
             fixed,
+            Logged.of(self.runs),
         )
         self.fit_blocks = np.arange(len(repeated) // BLOCK)
         self.held_blocks = np.arange(len(repeated) // BLOCK, self.predictor.blocks)

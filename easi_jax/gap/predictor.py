@@ -32,6 +32,7 @@ from easi_jax.model.effects import Effects
 from easi_jax.model.joint_space import dofs, scalar_places, turns_fully
 from easi_jax.model.mjx_model import Model, for_every_effect
 from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation.logged import Logged
 from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.step import Physics, arrived_step
 
@@ -90,9 +91,13 @@ class Predictor:
         windows: WindowSet,
         dt: float,
         fixed: Mapping[str, float] | None = None,
+        logged: Logged | None = None,
     ) -> None:
-        """``fixed``: what the machine has and MJCF cannot say, by address."""
-        self.simulator = Simulator(opened(mj_model), space, dt, fixed=fixed)
+        """``fixed``: what the machine has and MJCF cannot say, by address; ``logged``:
+        states of the log that the windows are from."""
+        self.simulator = Simulator(
+            opened(mj_model), space, dt, fixed=fixed, logged=logged
+        )
         # Centers of mass move.
         base = self.simulator.base
         self.simulator.base = base.replace(mjx=for_every_effect(base.mjx))

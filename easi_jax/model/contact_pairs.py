@@ -1,5 +1,7 @@
 """Pairs of geoms that may touch, and what MuJoCo makes of their contact numbers."""
 
+import copy
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +12,15 @@ from mujoco.mjx._src.collision_driver import geom_pairs
 from easi_jax.model.quantities import direct_solref
 
 _LEAST = mujoco.mjMINVAL
+# Of the model's extent: geoms within it count as near. Predictions start at measured
+# poses, and stay within it unless they are wrong anyway.
+_NEAR = 0.05
+_POSES = 20_000  # looked at, evenly, at most
+_TOGETHER = 500  # poses
+_BITS = 31  # of a geom's contype, the sign left out
+_ALWAYS = (mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_SDF)  # no distance
+
+Pair = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -28,7 +39,7 @@ class ContactPair:
     """
 
     name: str
-    geoms: tuple[int, int]
+    geoms: Pair
     dim: int
     friction: np.ndarray
     solref: np.ndarray
@@ -38,7 +49,7 @@ class ContactPair:
     damping: float
 
 
-def pair_ids(m: Any) -> list[tuple[int, int]]:
+def pair_ids(m: Any) -> list[Pair]:
     """Geoms of every pair that may touch; a pair's place in it is its number."""
     return [(int(a), int(b)) for a, b, _ in geom_pairs(m)]
 
@@ -97,7 +108,89 @@ def _share(mix: np.ndarray) -> np.ndarray:
     return np.array([0.5, 0.5]) if not enough.any() else enough.astype(float)
 
 
-def touching(pairs: list[tuple[int, int]], data: mujoco.MjData) -> list[bool]:
+def never_near(
+    m: mujoco.MjModel, qpos: np.ndarray, lengthened: Mapping[int, float] | None = None
+) -> frozenset[Pair]:
+    """Pairs of `pair_ids` that stay apart in all of some poses.
+
+    Near are geoms within their margin and 5 % of the model's extent. Pairs that the
+    model names (``<pair>``), with height fields or signed distance fields, and those of
+    a free body with what cannot move are never apart.
+
+    Args:
+        m: the model.
+        qpos: poses, ``(K, nq)`` [m, rad].
+        lengthened: geoms whose surface may move by so much [m], in their body.
+    """
+    more = dict(lengthened or {})
+    left = {
+        (int(a), int(b)): _NEAR * m.stat.extent
+        + float(m.geom_margin[[a, b]].sum())
+        + more.get(int(a), 0.0)
+        + more.get(int(b), 0.0)
+        for a, b, named in geom_pairs(m)
+        if named < 0 and not _always(m, int(a), int(b))
+    }
+    d = mujoco.MjData(m)
+    looked_at = np.linspace(0, len(qpos) - 1, min(len(qpos), _POSES)).astype(int)
+    for first in range(0, len(looked_at), _TOGETHER):
+        rows = qpos[looked_at[first : first + _TOGETHER]]
+        centers = np.empty((len(rows), m.ngeom, 3))
+        for i, row in enumerate(rows):
+            d.qpos[:] = row
+            mujoco.mj_kinematics(m, d)
+            centers[i] = d.geom_xpos
+        for (a, b), within in list(left.items()):
+            reach = within + m.geom_rbound[a] + m.geom_rbound[b]
+            off = np.linalg.norm(centers[:, a] - centers[:, b], axis=1)
+            flat = m.geom_rbound[[a, b]].min() == 0  # a plane has no bound
+            for i in np.flatnonzero((off < reach) | flat):
+                d.qpos[:] = rows[i]
+                mujoco.mj_kinematics(m, d)
+                if mujoco.mj_geomDistance(m, d, a, b, within, None) < within:
+                    del left[a, b]
+                    break
+    return frozenset(left)
+
+
+def _always(m: mujoco.MjModel, a: int, b: int) -> bool:
+    if m.geom_type[a] in _ALWAYS or m.geom_type[b] in _ALWAYS:
+        return True
+    bodies = m.geom_bodyid[[a, b]]
+    fixed = m.body_weldid[bodies] == 0
+    first = m.body_dofadr[m.body_rootid[bodies]]
+    types = m.jnt_type[m.dof_jntid[np.maximum(first, 0)]] if m.nv else first
+    free = (first >= 0) & (types == mujoco.mjtJoint.mjJNT_FREE)
+    return bool(fixed.any() and free.any())
+
+
+def without_pairs(m: mujoco.MjModel, apart: Collection[Pair]) -> mujoco.MjModel:
+    """A copy in which some pairs of `pair_ids` cannot touch, all others as before.
+
+    The pairs that are left are parted into stars, a bit of contype and conaffinity
+    each; where these bits do not suffice, no pair is taken out.
+    """
+    edges = {(int(a), int(b)) for a, b, named in geom_pairs(m) if named < 0}
+    edges -= set(apart)
+    contype, conaffinity = np.zeros((2, m.ngeom), m.geom_contype.dtype)
+    for bit in range(_BITS):
+        if not edges:
+            break
+        ends = [g for pair in edges for g in pair]
+        center = max(sorted(set(ends)), key=ends.count)
+        star = {pair for pair in edges if center in pair}
+        contype[center] |= 1 << bit
+        for a, b in star:
+            conaffinity[b if a == center else a] |= 1 << bit
+        edges -= star
+    if edges:
+        return m
+    out = copy.copy(m)
+    out.geom_contype[:], out.geom_conaffinity[:] = contype, conaffinity
+    return out
+
+
+def touching(pairs: list[Pair], data: mujoco.MjData) -> list[bool]:
     """Which of some pairs of geoms touch in a state after `mj_fwdPosition`."""
     met = {frozenset(g) for g in data.contact.geom[data.contact.dist < 0].tolist()}
     return [frozenset(pair) in met for pair in pairs]

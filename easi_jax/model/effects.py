@@ -21,7 +21,7 @@ from mujoco.mjx._src.types import DisableBit, IntegratorType
 
 from easi_jax.model import backlash
 from easi_jax.model.backlash import MotorState
-from easi_jax.model.contact_pairs import pair_ids
+from easi_jax.model.contact_pairs import Pair, pair_ids
 from easi_jax.model.effect_numbers import (
     NO_FORCE_LIMIT,
     NUMBERS,
@@ -324,13 +324,19 @@ def body_resistance(m: mjx.Model, d: mjx.Data, e: Effects) -> mjx.Data:
     return d.replace(xfrc_applied=d.xfrc_applied.at[:, :3].add(force))
 
 
-def pair_contacts(m: mjx.Model, d: mjx.Data, e: Effects) -> mjx.Data:
+def pair_contacts(
+    m: mjx.Model, d: mjx.Data, e: Effects, pairs: Sequence[Pair]
+) -> mjx.Data:
     """Data whose contacts have the softness of all and what their pair of geoms has,
-    after `collision`."""
+    after `collision`.
+
+    ``pairs`` are all that may touch in the model as given, by whose places effects are
+    numbered; some may be left out of ``m``.
+    """
     if not d._impl.ncon:
         return d
     number = np.zeros((m.ngeom, m.ngeom), np.int32)
-    for k, (a, b) in enumerate(pair_ids(m)):
+    for k, (a, b) in enumerate(pairs):
         number[a, b] = number[b, a] = k
     contact = d._impl.contact
     pair = jnp.asarray(number)[contact.geom1, contact.geom2]

@@ -2,7 +2,7 @@
 
 import contextlib
 import copy
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from easi_jax.devices.mesh import own_device
 from easi_jax.errors import UserError
 from easi_jax.model import effects as physical
 from easi_jax.model.addresses import Writer, open_gates, resolve
+from easi_jax.model.contact_pairs import Pair, pair_ids, without_pairs
 from easi_jax.model.effect_numbers import direct_contacts
 from easi_jax.model.effects import Effects
 from easi_jax.model.mjx_data import make_data, without_idle_cone
@@ -46,6 +47,7 @@ class Model:
         effects: what acts beyond the model; None for nothing.
         present: fields of the effects that may differ from none; None: any (static).
         delay_steps: control steps that a command can be late (static).
+        pairs: of geoms that may touch in the model as given (static).
     """
 
     mjx: mjx.Model
@@ -58,6 +60,7 @@ class Model:
     effects: Effects | None = None
     present: tuple[str, ...] | None = flax.struct.field(pytree_node=False, default=None)
     delay_steps: int = flax.struct.field(pytree_node=False, default=0)
+    pairs: tuple[Pair, ...] = flax.struct.field(pytree_node=False, default=())
 
     if TYPE_CHECKING:  # made by flax
 
@@ -157,6 +160,7 @@ def put_model(
     sensors: bool = True,
     native: bool = False,
     timestep: float | None = None,
+    apart: Collection[Pair] = (),
 ) -> Model:
     """Puts a MuJoCo model on the device, ready to have parameters written into it.
 
@@ -168,6 +172,7 @@ def put_model(
             do no harm.
         native: for the engine ``mujoco``, which simulates all that MuJoCo can.
         timestep: physics step [s]; the model's own where None.
+        apart: pairs of geoms that MJX leaves out; native MuJoCo never does.
 
     Raises:
         UserError: an address that does not fit the model; or the model uses what MJX
@@ -193,6 +198,7 @@ def put_model(
     if native:
         put: Any = _put_native(opened, writers)
     else:
+        opened = without_pairs(opened, apart) if apart else opened
         with refusals(Exception):
             put = mjx.put_model(without_idle_cone(opened), own_device(), impl="jax")
             make_data(put)
@@ -209,6 +215,7 @@ def put_model(
         long_axes=tuple(long_axis(mj_model, g) for g in range(mj_model.ngeom)),
         effects=physical.none(mj_model) if present else None,
         present=tuple(sorted(present)) if present else None,
+        pairs=tuple(pair_ids(mj_model)),
     )
     values = jnp.array(list(fixed.values()), jnp.result_type(float))
     return _written(model, values).replace(

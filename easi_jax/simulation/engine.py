@@ -16,8 +16,9 @@ import numpy as np
 
 from easi_jax.devices.runtime import on_cpu
 from easi_jax.errors import UserError, nearest
-from easi_jax.model.contact_pairs import pair_ids
+from easi_jax.model.contact_pairs import Pair, pair_ids
 from easi_jax.simulation.guard import Deviation, compare, random_states
+from easi_jax.simulation.logged import Logged
 
 Engine = Literal["mjx", "mujoco"]
 CHOICES = ("auto", "mjx", "mujoco")
@@ -88,17 +89,32 @@ def of_built_in(m: mujoco.MjModel) -> Engine:
     return _noted(*by_size(m)) if name == "auto" else name  # type: ignore[return-value]
 
 
-def resolved(engine: str | None, m: mujoco.MjModel) -> Engine:
-    """The engine for a model: the given one, else the one in use."""
+def resolved(
+    engine: str | None,
+    m: mujoco.MjModel,
+    logged: Logged | None = None,
+    apart: Callable[[], frozenset[Pair]] = frozenset,
+) -> Engine:
+    """The engine for a model: the given one, else the one in use.
+
+    Args:
+        engine: ``mjx``, ``mujoco`` or ``auto``; None: the one in use.
+        m: the model.
+        logged: states near which it is simulated; None: it may get anywhere.
+        apart: pairs of geoms that MJX would leave out.
+
+    Raises:
+        UserError: MJX was asked for, and deviates from MuJoCo C.
+    """
     choice = _stack[-1]
     name = engine or choice.name
     if name == "mjx" and choice is not _stack[0] and engine is None:
-        wrong = checked(m)
+        wrong = checked(m, logged, apart)
         if wrong.deviates:
             raise UserError(f"{wrong}: use --engine mujoco or --engine auto")
     if name == "mjx" or name == "mujoco":
         return name
-    return _noted(*automatic(m))
+    return _noted(*automatic(m, logged, apart))
 
 
 def _noted(found: Engine, why: str) -> Engine:
@@ -109,12 +125,16 @@ def _noted(found: Engine, why: str) -> Engine:
     return found
 
 
-def automatic(m: mujoco.MjModel) -> tuple[Engine, str]:
-    """The engine that ``auto`` takes for a model, and why."""
+def automatic(
+    m: mujoco.MjModel,
+    logged: Logged | None = None,
+    apart: Callable[[], frozenset[Pair]] = frozenset,
+) -> tuple[Engine, str]:
+    """The engine that ``auto`` takes for a model, and why; see `resolved`."""
     name, why = by_size(m)
     if name == "mujoco":
         return name, why
-    found = checked(m)
+    found = checked(m, logged, apart)
     return ("mujoco", str(found)) if found.deviates else (name, why)
 
 
@@ -130,14 +150,24 @@ def by_size(m: mujoco.MjModel) -> tuple[Engine, str]:
     return "mjx", "a small robot"
 
 
-_checks: dict[bytes, Deviation] = {}  # by the model's content
+_checks: dict[bytes, Deviation] = {}  # by what is compared
 
 
-def checked(m: mujoco.MjModel) -> Deviation:
-    """MJX beside MuJoCo C at random states; once a process and model."""
+def checked(
+    m: mujoco.MjModel,
+    logged: Logged | None = None,
+    apart: Callable[[], frozenset[Pair]] = frozenset,
+) -> Deviation:
+    """MJX beside MuJoCo C at states of a log, or at random ones; once a process."""
     content = np.empty(mujoco.mj_sizeModel(m), np.uint8)
     mujoco.mj_saveModel(m, None, content)
-    key = hashlib.sha256(content.tobytes()).digest()
+    left_out = apart() if logged else frozenset()
+    digest = hashlib.sha256(content.tobytes())
+    digest.update(repr(sorted(left_out)).encode())
+    states = logged.states(m) if logged else None
+    for x in states or ():
+        digest.update(np.ascontiguousarray(x).tobytes())
+    key = digest.digest()
     if key not in _checks:
-        _checks[key] = compare(m, *random_states(m))
+        _checks[key] = compare(m, *(states or random_states(m)), apart=left_out)
     return _checks[key]

@@ -9,7 +9,7 @@ step (forces, activations, rows of constraints) are compared to say what differs
 import contextlib
 import copy
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +20,7 @@ from mujoco.mjx._src import support
 
 from easi_jax.devices.mesh import own_device
 from easi_jax.errors import UserError
+from easi_jax.model.contact_pairs import Pair
 from easi_jax.model.mjx_data import make_data
 from easi_jax.model.mjx_model import put_model
 from easi_jax.simulation.step import WRITTEN_OUT, mjx_step
@@ -79,24 +80,13 @@ class Deviation:
         return f"MJX deviates from MuJoCo by {size}: {what}"
 
 
-def deviation(
-    mj_model: mujoco.MjModel,
-    qpos: np.ndarray,
-    qvel: np.ndarray,
-    act: np.ndarray | None = None,
-    ctrl: np.ndarray | None = None,
-) -> Deviation | None:
-    """`compare`, and None where MJX may be taken."""
-    found = compare(mj_model, qpos, qvel, act, ctrl)
-    return found if found.deviates else None
-
-
 def compare(
     mj_model: mujoco.MjModel,
     qpos: np.ndarray,
     qvel: np.ndarray,
     act: np.ndarray | None = None,
     ctrl: np.ndarray | None = None,
+    apart: Collection[Pair] = (),
 ) -> Deviation:
     """One physics step of this package's MJX beside `mj_step`, from the same states.
 
@@ -109,6 +99,7 @@ def compare(
         qvel: velocities, ``(K, nv)`` [m/s, rad/s].
         act: activations, ``(K, na)``; zeros where None.
         ctrl: commands, ``(K, nu)``; zeros where None.
+        apart: pairs of geoms that MJX leaves out.
 
     Returns:
         The comparison; whatever MJX raises is a refusal in it.
@@ -130,7 +121,7 @@ def compare(
     if hidden:
         return found(_REFUSED, (), hidden)
     try:
-        put, got = _mjx_outputs(m, states)
+        put, got = _mjx_outputs(m, states, apart)
     except Exception as error:  # MJX refuses in many ways, not all of them in words
         return found(_REFUSED, (), _reason(error))
     ours = [_mjx_step(m, put, g) for g in got]
@@ -374,14 +365,16 @@ _TERMS: tuple[str, ...] = (
 )
 
 
-def _mjx_outputs(m: mujoco.MjModel, states: list[State]) -> tuple[Any, list[Any]]:
+def _mjx_outputs(
+    m: mujoco.MjModel, states: list[State], apart: Collection[Pair]
+) -> tuple[Any, list[Any]]:
     """Data of the model, and what MJX's step of each state returns, as it lays it out.
 
     One simulation at a time, nothing optimized: most of the time goes into compiling.
     """
     with jax.enable_x64(True):
         device = _device()
-        put = jax.device_put(put_model(m, sensors=False).mjx, device)
+        put = jax.device_put(put_model(m, sensors=False, apart=apart).mjx, device)
         blank = jax.device_put(make_data(put), device)
 
         def step(model: Any, start: Any, qpos: Any, qvel: Any, act: Any, ctrl: Any):

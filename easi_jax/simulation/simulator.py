@@ -15,12 +15,14 @@ from easi_jax.devices.runtime import on_cpu
 from easi_jax.errors import UserError
 from easi_jax.model import effects
 from easi_jax.model.addresses import describe
+from easi_jax.model.contact_pairs import Pair
 from easi_jax.model.joint_space import Configuration, tangent_names
 from easi_jax.model.mjx_model import Model, Sense, put_model, with_parameters
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.torque_speed import TorqueSpeed
 from easi_jax.simulation import native_step
 from easi_jax.simulation.engine import Engine, resolved
+from easi_jax.simulation.logged import Logged, apart_in, apart_note
 from easi_jax.simulation.step import WRITTEN_OUT, Physics, at_rest, control_step
 
 # Small enough for XLA to run a simulation as one piece (see `runtime`).
@@ -49,6 +51,8 @@ class Simulator:
             of simulations that are compiled once for them and for trials
             (`easi_jax.simulation.slopes`).
         fixed: values by address that are not those of ``mj_model``, effects among them.
+        logged: states that it simulates from, and near them; None where it may get
+            anywhere. MJX is compared with MuJoCo C there, and leaves out `apart`.
         past_steps: commands before a measured start that its simulation has use for;
             0 where no effect lies on the way of a command.
 
@@ -66,16 +70,16 @@ class Simulator:
         torque_speed: TorqueSpeed | None = None,
         fixed: Mapping[str, float] | None = None,
         engine: Engine | None = None,
+        logged: Logged | None = None,
     ) -> None:
-        self.engine: Engine = resolved(engine, mj_model)
+        self.mj_model, self.space, self.fixed = mj_model, space, dict(fixed or {})
+        self.logged = logged
+        self.engine: Engine = resolved(engine, mj_model, logged, lambda: self._apart)
         step = float(mj_model.opt.timestep)
         self.dt = float(dt) if dt is not None else step
         if not 0 < self.dt < 10:
             raise UserError(f"control step {self.dt} s: give one above 0 and below 10")
         self.substeps = physics_steps(self.dt, step)
-        self.mj_model = mj_model
-        self.space = space
-        self.fixed = dict(fixed or {})
         native = self.engine == "mujoco"
         self.wide = mj_model.nv > WRITTEN_OUT
         self.by_differences = not native and mj_model.nv > FORWARD_MODE
@@ -112,6 +116,26 @@ class Simulator:
         ]
         return max([0.0, *fixed, *free])
 
+    @cached_property
+    def _apart(self) -> frozenset[Pair]:
+        if self.logged is None:
+            return frozenset()
+        varied = [(p.addresses, p.bounds) for p in self.space.parameters]
+        varied += [((a,), (v, v)) for a, v in self.fixed.items()]
+        return apart_in(self.logged, self.mj_model, varied)
+
+    @property
+    def apart(self) -> frozenset[Pair]:
+        """Pairs of geoms that are left out: on MJX, what never comes near each other in
+        the log."""
+        return self._apart if self.engine == "mjx" else frozenset()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know of how it simulates, a line each."""
+        note = apart_note(self.mj_model, self.apart)
+        return (note,) if note else ()
+
     def _put(self, sensors: bool) -> Model:
         # Eagerly, also where a machine is made while something is traced.
         with jax.ensure_compile_time_eval():
@@ -122,6 +146,7 @@ class Simulator:
                 sensors,
                 self.engine == "mujoco",
                 self.dt / self.substeps,
+                self.apart,
             )
 
     def rebuilt(
@@ -142,6 +167,7 @@ class Simulator:
             base.torque_speed,
             self.fixed if fixed is None else fixed,
             self.engine,
+            self.logged,
         )
 
     def model(self, theta: jax.Array) -> Model:

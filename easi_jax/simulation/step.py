@@ -18,6 +18,7 @@ from mujoco.mjx._src.types import IntegratorType
 
 from easi_jax.model import effects
 from easi_jax.model.backlash import first_rotor
+from easi_jax.model.contact_pairs import Pair
 from easi_jax.model.effects import Effects
 from easi_jax.model.joint_space import scalar_places
 from easi_jax.model.mjx_data import make_data
@@ -93,11 +94,13 @@ class Within:
 
     Attributes:
         effects: their strengths.
-        resists: whether bodies may have drag, which needs their velocities.
-        touches: whether contacts are changed where they are made.
+        pairs: that may touch in the model as given.
+        has_body_drag: whether bodies may have drag, which needs their velocities.
+        has_contact_effects: whether contacts are changed where they are made.
     """
 
     effects: Effects
+    pairs: tuple[Pair, ...]
     has_body_drag: bool
     has_contact_effects: bool
 
@@ -107,10 +110,10 @@ def _within(model: Any) -> Within | None:
     has_contact_effects = effects.has_contact_effects(model.present)
     if model.effects is None or not (has_body_drag or has_contact_effects):
         return None
-    return Within(model.effects, has_body_drag, has_contact_effects)
+    return Within(model.effects, model.pairs, has_body_drag, has_contact_effects)
 
 
-def _position(m: mjx.Model, d: mjx.Data, e: Effects) -> mjx.Data:
+def _position(m: mjx.Model, d: mjx.Data, within: Within) -> mjx.Data:
     """`fwd_position`, contacts changed where their constraints are made."""
     for part in (
         *(mjx_smooth.kinematics, mjx_smooth.com_pos, mjx_smooth.camlight),
@@ -118,7 +121,7 @@ def _position(m: mjx.Model, d: mjx.Data, e: Effects) -> mjx.Data:
         *(mjx_smooth.factor_m, collision),
     ):
         d = part(m, d)
-    d = effects.pair_contacts(m, d, e)
+    d = effects.pair_contacts(m, d, within.effects, within.pairs)
     return mjx_smooth.transmission(m, make_constraint(m, d))
 
 
@@ -134,7 +137,7 @@ def forward(
     if not own and within is None:
         return mjx.forward(m, d)
     if within is not None and within.has_contact_effects:
-        d = _position(m, d, within.effects)
+        d = _position(m, d, within)
     else:
         d = mjx_forward.fwd_position(m, d)
     d = mjx_sensor.sensor_pos(m, d)

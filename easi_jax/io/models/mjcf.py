@@ -274,9 +274,16 @@ def read_machine(
     allowed: Sequence[Path] = (),
     tell: Callable[[str], None] = _warn,
     held: Callable[[mujoco.MjModel], np.ndarray] | None = None,
+    logged: bool = False,
 ) -> mujoco.MjModel:
     """`read_mjcf` of something that moves and that the engine in use can simulate
     (`easi_jax.simulation.engine`).
+
+    Args:
+        path, allowed, tell, held: as `read_mjcf` takes them.
+        logged: whether logs are read next: the engine is then chosen at their states
+            (`easi_jax.simulation.simulator.Simulator`), and here it is only seen
+            whether there is one.
 
     Raises:
         UserError: as `read_mjcf`, `easi_jax.simulation.engine.resolved` and
@@ -286,7 +293,7 @@ def read_machine(
     if model.nv == 0:
         raise UserError(f"{path}: the model has no joint, so nothing can be identified")
     try:
-        native = engine.resolved(None, model) == "mujoco"
+        native = logged or engine.resolved(None, model) == "mujoco"
         put_model(model, sensors=False, native=native)
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
