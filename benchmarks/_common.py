@@ -101,29 +101,31 @@ def first_start(words: Sequence[str], folder: Path, limit: float) -> float:
     return time.monotonic() - begin
 
 
+def _without_home(value: Any) -> Any:
+    """Paths without the places of one machine; anything else as it is."""
+    if not isinstance(value, Path) or not value.is_absolute():
+        return value
+    root = Path(__file__).parents[1]
+    return value.relative_to(root) if value.is_relative_to(root) else value.name
+
+
 def write_result(
     name: str, command: str, config: Any, folder: Path = RESULTS, **figures: Any
 ) -> Path:
     """Writes ``FOLDER/NAME.json`` with config, versions and device.
 
     ``config`` is a dataclass, or a dict of what decides the figures; its paths are
-    written as seen from the repository's root.
+    written as seen from the repository's root, of those elsewhere the name alone.
     """
     from easi_jax.io.files import atomic_write, to_json
     from easi_jax.io.runs.versions import versions
 
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.json"
-    root = Path(__file__).parents[1]
     settings = config if isinstance(config, dict) else dataclasses.asdict(config)
     body = {
         "command": command,
-        "config": {
-            k: v.relative_to(root)
-            if isinstance(v, Path) and v.is_relative_to(root)
-            else v
-            for k, v in settings.items()
-        },
+        "config": {k: _without_home(v) for k, v in settings.items()},
         "versions": versions(),
         "finished": time.strftime("%Y-%m-%d"),
         **figures,

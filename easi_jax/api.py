@@ -38,7 +38,7 @@ from easi_jax.io.logs.reader import read_logs
 from easi_jax.io.models.completed import base_joint, own_pose
 from easi_jax.io.models.mjcf import read_machine
 from easi_jax.io.models.parameter_file import read_parameter_file
-from easi_jax.io.report.numbers import quantity
+from easi_jax.io.report.numbers import quantity, shown_unit, with_unit
 from easi_jax.model import distribution
 from easi_jax.model.checks import checked_array
 from easi_jax.model.distribution import Distribution
@@ -177,7 +177,7 @@ class Estimated:
         e = self.held_out
         width = max(map(len, (*self.names, *e.channels)))
         lines = [
-            f"{name:{width}}  {quantity(mean, std)} {unit}".rstrip()
+            f"{name:{width}}  {with_unit(quantity(mean, std), unit)}"
             + (f"  ({flag})" if flag != "determined" else "")
             for name, mean, std, unit, flag in zip(
                 *(self.names, self.mean, self.std, self.units, self.flags), strict=True
@@ -185,7 +185,7 @@ class Estimated:
         ]
         lines += [
             f"{name:{width}}  error over {e.horizon:.3g} s: {old:.3g} as given, "
-            f"{new:.3g} identified, {floor:.3g} noise floor [{unit}]"
+            f"{new:.3g} identified, {floor:.3g} noise floor [{shown_unit(unit)}]"
             for name, unit, old, new, floor in zip(
                 *(e.channels, e.units, e.before, e.after[0], e.floor[0]), strict=True
             )

@@ -42,6 +42,7 @@ def run(config: Config) -> None:
     """Writes the file and shows what is in it."""
     from easi_jax.errors import UserError
     from easi_jax.io.files import atomic_write
+    from easi_jax.io.report.numbers import shown_unit
     from easi_jax.model.parameter_proposal import as_text, propose
     from train._log_problem import held_of, load_model
 
@@ -73,7 +74,7 @@ def run(config: Config) -> None:
             p.parameter.addresses[0],
             f"{p.parameter.nominal:.4g}",
             f"{p.parameter.initial[0]:.3g} .. {p.parameter.initial[1]:.3g}",
-            p.parameter.unit,
+            shown_unit(p.parameter.unit),
             *([verdicts[p.parameter.name]] if verdicts else []),
         )
         for p in proposals

@@ -93,7 +93,7 @@ def test_the_example_finds_the_truth(
     errors = found.held_out
     assert errors.what == "moves" and errors.after[0][0] < 0.3 * errors.before[0]
     said = capsys.readouterr().out
-    assert re.search(r"damping +0\.\d+ ± [\de.-]+ N m s/rad\n", said)
+    assert re.search(r"damping +0\.\d+ ± [\de.-]+ N·m·s/rad\n", said)
     assert "hinge    error over 0.2 s" in said
     written = mujoco.MjModel.from_xml_path("results/arm/model.xml")
     assert written.dof_damping[0] == pytest.approx(found.mean[0], rel=1e-5)

@@ -149,7 +149,7 @@ def test_example_reports_held_out_error(arm):
         assert after < 0.1 * before
         assert floor < 1.1 * after
     page = (arm / "report.html").read_text()
-    for said in ("rotor_inertia", "joint.*.armature", "kg m^2", "moves", "<svg"):
+    for said in ("rotor_inertia", "joint.*.armature", "kg·m²", "moves", "<svg"):
         assert said in page
     assert not re.search(r'(src|href)="https?:', page)
 

@@ -105,7 +105,7 @@ def test_the_repaired_model_loads_and_has_it(case: Any, results: Path) -> None:
 
 def test_the_report_says_it_in_a_sentence(results: Path) -> None:
     text = (results / "report.html").read_text()
-    assert "N m of dry friction, which the model lacks" in text
+    assert "N·m of dry friction, which the model lacks" in text
     assert "times the sensor noise" in text
     assert "http://" not in text.replace("http://www.w3.org", "")
 

@@ -54,7 +54,7 @@ def test_an_effect_with_which_the_error_rises_is_marked() -> None:
     falls, rises = effect(), effect("armature", unit="kg m^2", gaps=(0.1, 0.15))
     found = result(effects=(falls, rises))
     first, second = (s for s in headline(found) if "which the model lacks" in s)
-    assert "falls from 2 to 1 times the sensor noise" in first
+    assert "falls from 2 times the sensor noise to the noise itself" in first
     assert "on held-out data rises, from 1 to 1.5 times the sensor noise" in second
     changes = [row[4] for row in effect_rows(found, "; ", "none")]
     assert changes == ["0.2 to 0.1", "0.1 to 0.15, rises"]

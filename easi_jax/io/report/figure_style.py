@@ -19,6 +19,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
+from easi_jax.io.report.numbers import number, shown_unit
+
 INK = "#24292f"
 FAINT = "#6e7781"
 GRID = "#d8dee4"
@@ -102,7 +104,7 @@ def fit(axis: Axes, values: np.ndarray, log: bool) -> None:
     axis.set_yscale("log")
     axis.set_ylim(low / factor, high * factor)
     axis.yaxis.set_major_locator(FixedLocator(_log_ticks(low / factor, high * factor)))
-    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value, 3)))
     axis.yaxis.set_minor_locator(NullLocator())
 
 
@@ -177,7 +179,7 @@ def dash(index: int) -> Any:
 
 def with_unit(name: str, unit: str) -> str:
     """``name [unit]``."""
-    return f"{name} [{unit}]" if unit else name
+    return f"{name} [{shown_unit(unit)}]" if unit else name
 
 
 def tell(axis: Axes, x: Any, y: Any, text: str, color: str = INK) -> None:

@@ -28,6 +28,7 @@ from easi_jax.io.report.figure_style import (
     tell,
     with_unit,
 )
+from easi_jax.io.report.numbers import number, quantity
 
 
 @styled
@@ -69,7 +70,7 @@ def parameters_by_generation(
         fit(axis, np.concatenate([low, high, starts[i], goals[i : i + 1]]), flags[i])
         axis.fill_between(generations, low, high, color=BLUE, alpha=0.2, lw=0)
         axis.plot(generations, mean[:, i], color=BLUE, lw=1.6)
-        end = with_unit(f"{mean[-1, i]:.4g} ± {std[-1, i]:.2g}", units[i])
+        end = with_unit(quantity(float(mean[-1, i]), float(std[-1, i])), units[i])
         tell(axis, generations, mean[:, i], f"{names[i]}: {end} at the end", BLUE)
         if np.isfinite(goals[i]):
             axis.axhline(goals[i], **DASHED)
@@ -193,7 +194,7 @@ def prediction_errors(
         axis.barh(places, finite, height=0.62, color=colors)
         for place, value in zip(places, values, strict=True):
             axis.annotate(
-                f"{value:.3g}" if math.isfinite(value) else "not finite",
+                number(value, 3) if math.isfinite(value) else "not finite",
                 (value if math.isfinite(value) else 0.0, place),
                 xytext=(4, 0),
                 textcoords="offset points",

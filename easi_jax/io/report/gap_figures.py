@@ -19,7 +19,7 @@ from easi_jax.io.report.figure_style import (
     tell,
     with_unit,
 )
-from easi_jax.io.report.numbers import compact
+from easi_jax.io.report.numbers import compact, number
 
 _DASHES: Any = {"color": VERMILION, "lw": 1.3, "ls": (0, (4, 2))}
 
@@ -53,7 +53,7 @@ def traces(
                 y = motion[w, :, c]
                 lines = axis.plot(time, y, label=label, **style)
                 handles += lines if w == c == 0 else []
-                end = with_unit(f"{y[-1]:.4g}", units[c])
+                end = with_unit(number(float(y[-1])), units[c])
                 tell(axis, time, y, f"{names[c]}, {label}: {end} at the end")
             if w == 0:
                 axis.set_ylabel(with_unit(names[c], units[c]))

@@ -6,7 +6,13 @@ from typing import Any
 
 from easi_jax.io.report.gap_figures import gap_steps, residual_maps, traces
 from easi_jax.io.report.html import Picture, Report, Table
-from easi_jax.io.report.numbers import measured, number, quantity, with_unit
+from easi_jax.io.report.numbers import (
+    measured,
+    number,
+    quantity,
+    shown_unit,
+    with_unit,
+)
 from easi_jax.model.effect_catalog import CATALOG
 from easi_jax.model.results import (
     ErrorMap,
@@ -113,17 +119,19 @@ def headline(r: GapResult) -> list[str]:
         )
     for e in r.effects:
         said = sentence(e)
-        before, after = (
-            number(r.times_floor(g), 3) for g in (e.gap_before, e.gap_after)
+        before, after = (r.times_floor(g) for g in (e.gap_before, e.gap_after))
+        first, last = number(before, 2), number(after, 2)
+        ends = (
+            f"from {first} times the sensor noise to the noise itself"
+            if round(after, 1) <= 1
+            else f"from {first} to {last} times the sensor noise"
         )
         error = f"{measured(r.horizon, 's', 3)} prediction error"
         change = (
-            f"With it the {error} on held-out data rises, from {before} to {after} "
-            "times the sensor noise: it helps only beside what follows, or in the "
-            "fitting data alone."
+            f"With it the {error} on held-out data rises, {ends}: it helps only beside "
+            "what follows, or in the fitting data alone."
             if e.rises
-            else f"With it the {error} falls from {before} to {after} times the sensor "
-            "noise."
+            else f"With it the {error} falls {ends}."
         )
         lines.append(
             f"{said[0].upper()}{said[1:]}, which the model lacks (confidence "
@@ -264,7 +272,7 @@ def _tables(r: GapResult) -> list[Table]:
         Table(
             "Error by channel",
             ["channel", "unit", "as given", "refitted", "after", "noise floor"],
-            _channels(r),
+            [(name, shown_unit(u), *sizes) for name, u, *sizes in _channels(r)],
             f"RMS over windows of {measured(r.horizon, 's', 3)}, held out: "
             f"{r.held_name}.",
         ),

@@ -11,7 +11,7 @@ import jinja2
 
 from easi_jax.io.files import atomic_write, to_plain
 from easi_jax.io.report.figure_style import BLUE, FAINT, GREEN, GRID, INK, VERMILION
-from easi_jax.io.report.numbers import cell, number, quantity
+from easi_jax.io.report.numbers import cell, number, quantity, shown_unit
 from easi_jax.model.results import Flag
 
 # `Flag`, or what follows from what the owner of the machine knows.
@@ -254,7 +254,7 @@ def _parameter_cells(row: ParameterRow) -> dict[str, Any]:
     return {
         "name": row.name,
         "addresses": row.addresses,
-        "unit": row.unit,
+        "unit": shown_unit(row.unit),
         "initial": f"{cell(row.initial[0])} to {cell(row.initial[1])}",
         "model": cell(row.nominal),
         "value": row.found,

@@ -9,7 +9,7 @@ import numpy as np
 
 from easi_jax.io.report.figures import prediction_errors
 from easi_jax.io.report.html import Diagnostic, Picture, Report, Svg, Table
-from easi_jax.io.report.numbers import number
+from easi_jax.io.report.numbers import number, shown_unit
 from easi_jax.io.report.parameters import doubtful, lost, parameter_rows, unseen_notes
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.results import HeldOutErrors, SeedResult
@@ -96,7 +96,7 @@ def error_table(errors: HeldOutErrors) -> Table:
         f"{TITLE} over {number(errors.horizon, 3)} s",
         ("joint", "unit", "model as given", "identified", "noise floor"),
         [
-            (name, unit, *(number(x, 3) for x in values))
+            (name, shown_unit(unit), *(number(x, 3) for x in values))
             for name, unit, *values in zip(
                 errors.channels, errors.units, *columns, strict=True
             )

@@ -1,11 +1,14 @@
 """Numbers as people write them, the same in every table, sentence and note."""
 
 import math
+import re
 from typing import Any
 
 import numpy as np
 
 _DIGITS = 4  # that a reader compares; a deviation seldom leaves more
+# Symbols between which a space means a product; other words of users stay as they are.
+_SYMBOLS = {*("A", "Hz", "J", "N", "V", "W", "deg", "kg", "m", "mm", "rad", "s", "1")}
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -46,13 +49,21 @@ def compact(value: float) -> str:
 
 
 def measured(value: float, unit: str, digits: int = _DIGITS) -> str:
-    """A number with its unit: ``0.2 s``; ``1`` and ``""`` stand for no unit."""
+    """A number with its unit: ``0.2 N·m``; ``1`` and ``""`` stand for no unit."""
     return with_unit(number(value, digits), unit)
 
 
 def with_unit(text: str, unit: str) -> str:
     """``text`` and its unit; ``1`` and ``""`` stand for none."""
-    return text if unit in ("", "1") else f"{text} {unit}"
+    return text if unit in ("", "1") else f"{text} {shown_unit(unit)}"
+
+
+def shown_unit(unit: str) -> str:
+    """A unit as people print it: ``kg·m²`` for ``kg m^2``, which files have."""
+    if not _SYMBOLS.issuperset(re.sub(r"\^\d+", "", unit).replace("/", " ").split()):
+        return unit
+    raised = re.sub(r"\^(\d+)", lambda m: m[1].translate(_SUPERSCRIPT), unit)
+    return raised.replace(" ", "·")
 
 
 def quantity(mean: float, std: float) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from easi_jax.io.report.html import Diagnostic, Known, ParameterRow
-from easi_jax.io.report.numbers import measured, number
+from easi_jax.io.report.numbers import measured, number, shown_unit
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.results import SeedResult
 
@@ -100,7 +100,7 @@ def parameter_table(
     cells = [
         (
             row.name,
-            row.unit or "-",
+            shown_unit(row.unit) or "-",
             number(row.nominal) if row.nominal is not None else "-",
             row.found,
             row.change,

@@ -54,7 +54,10 @@ def test_cell(value, text):
     ("text", "said"),
     [
         (measured(0.200009, "s"), "0.2 s"),
-        (measured(0.0123456, "N m", 3), "0.0123 N m"),
+        (measured(0.0123456, "N m", 3), "0.0123 N·m"),
+        (measured(2.0, "kg m^2"), "2 kg·m²"),
+        (measured(2.0, "N m s^2/rad^2"), "2 N·m·s²/rad²"),
+        (measured(2.0, "parts of a turn"), "2 parts of a turn"),
         (measured(1.0, "1"), "1"),
         (measured(math.nan, "rad"), "not a number rad"),
         (with_unit("0.20 ± 0.01", "1"), "0.20 ± 0.01"),
