@@ -133,6 +133,6 @@ def page(program: str, folder: Path) -> Iterator[Page]:
         yield Page(ours_in, ours_out)
     finally:
         process.kill()
-        process.wait(10)
+        process.wait(timeout=10)
         for end in (ours_in, ours_out):
             os.close(end)

@@ -1,11 +1,13 @@
 """Readies jax before any test imports it: quick to compile, one cache for the run.
 
 Three quarters of the default tests' time is compiling (`benchmarks.where_tests_spend`).
-So they compile without LLVM's optimizations. ``EASI_JAX_TESTS=optimized`` compiles as
-users get it; `make test-slow` sets it.
+So they compile without LLVM's optimizations, and Python looks for cycles of garbage
+seldom: a program that is traced makes millions of objects that live.
+``EASI_JAX_TESTS=optimized`` compiles as users get it; `make test-slow` sets it.
 """
 
 import atexit
+import gc
 import os
 import shutil
 import signal
@@ -18,6 +20,7 @@ if os.environ.get("EASI_JAX_TESTS") != "optimized":
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_backend_optimization_level" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_backend_optimization_level=0".strip()
+    gc.set_threshold(100_000, 20, 50)
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     # The workers of pytest-xdist and the commands that tests start inherit it.
     _cache = tempfile.mkdtemp(prefix="easi_jax_tests_")

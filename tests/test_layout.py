@@ -141,3 +141,19 @@ def test_every_test_that_the_page_of_user_files_names_is_there() -> None:
     named = set(re.findall(r"(?:`|::)(test_\w+)`", page))
     assert len(named) > 30 and named <= defined, named - defined
     assert all((ROOT / "tests" / name).is_file() for name in files)
+
+
+_WAITING = re.compile(
+    r"subprocess\.(run|call|check_call|check_output)|.*\.(communicate|wait)"
+)
+
+
+def test_every_test_that_waits_for_a_process_has_a_time_limit() -> None:
+    waits = [
+        (f"{path}:{node.lineno}", {k.arg for k in node.keywords})
+        for path, tree in _modules("tests")
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and _WAITING.fullmatch(ast.unparse(node.func))
+    ]
+    assert len(waits) > 20
+    assert [at for at, given in waits if "timeout" not in given] == []

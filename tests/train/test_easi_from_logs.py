@@ -416,7 +416,7 @@ def stopped(args, out, blow):
     try:
         deadline = time.monotonic() + 400
         while not any(out.glob("checkpoints/search/step_*")):
-            assert child.poll() is None, child.communicate()[1]
+            assert child.poll() is None, child.communicate(timeout=100)[1]
             assert time.monotonic() < deadline
             time.sleep(0.01)
         child.send_signal(blow)
