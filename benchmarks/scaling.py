@@ -142,19 +142,20 @@ def least(fun: Callable[[], Any]) -> float:
     return min(seconds[1:])
 
 
-def _generation(
-    config: Config, env: Any, mesh: Any, space: Any, **search: int
-) -> dict[str, float]:
+def first_state(
+    env: Any, mesh: Any = None, space: Any = None, **search: Any
+) -> tuple[Any, Any, Any]:
+    """A search of the preset ``default`` with changes, its first state, and its data:
+    20 episodes of random actions. ``space``: searched in place of the robot's own."""
     import jax
     import jax.numpy as jnp
 
     from easi_jax.data.segments import windows
-    from easi_jax.devices.runtime import fast_loops
     from easi_jax.search.config import preset
     from easi_jax.search.easi import Search, SearchData
     from easi_jax.simulation.rollout import collect
 
-    chosen = preset("default", generations=config.generations, **search)
+    chosen = preset("default", **search)
     made = Search(env.simulator.rebuilt(space=space), chosen, mesh=mesh)
 
     def data(key: jax.Array) -> SearchData:
@@ -163,11 +164,21 @@ def _generation(
         return SearchData(pieces, jnp.zeros(2 * env.mj_model.nv), ())
 
     logged = jax.jit(data)(jax.random.key(0))
-    state = made.init(jax.random.key(1), logged)
-    run = jax.jit(
-        lambda s, d: made.run(s, d, config.generations), compiler_options=fast_loops()
-    )
-    seconds = least(lambda: run(state, logged)) / config.generations
+    return made, made.init(jax.random.key(1), logged), logged
+
+
+def _generation(
+    config: Config, env: Any, mesh: Any, space: Any, **search: int
+) -> dict[str, float]:
+    import jax
+
+    from easi_jax.devices.runtime import fast_loops
+
+    n = config.generations
+    made, state, logged = first_state(env, mesh, space, generations=n, **search)
+    run = jax.jit(lambda s, d: made.run(s, d, n), compiler_options=fast_loops())
+    seconds = least(lambda: run(state, logged)) / n
+    chosen = made.config
     steps = chosen.population * chosen.segments * chosen.horizon
     state_size = env.mj_model.nq + env.mj_model.nv
     return {
