@@ -12,35 +12,69 @@ from benchmarks._common import markdown_table
 Column = str | Callable[[Any], object]
 
 
+class Named(dict[Any, Any]):
+    """What a section is about, by name; what is empty was not run."""
+
+
+def _all(found: Any) -> Any:
+    return found
+
+
 @dataclasses.dataclass(frozen=True)
 class Section:
     """Paragraphs made of one source; called with the folder of results.
 
     Attributes:
-        title: with its ``#``; nothing is shown of a section without one that was not
-            run.
-        source: ``NAME.jsonl``, the rows of a file; ``NAME.json``, its content;
-            a pattern such as ``NAME_*.json``, the contents by name, sorted.
-        command: what makes it, without ``python -m benchmarks.``.
-        body: the paragraphs after the title.
+        title: with its ``#``; empty where the paragraphs belong to the section before.
+        source: as `load` takes it.
+        command: what makes it, without ``python -m benchmarks.``; ``{name}`` stands for
+            the name of what is missing, where the source has names.
+        body: the paragraphs after the title, of what is there.
+        of: what of the source the section is about, empty where that was not run.
+        optional: whether nothing is said of what was not run.
     """
 
     title: str
-    source: str
+    source: str | Mapping[Any, str]
     command: str
     body: Callable[[Any], list[str]]
+    of: Callable[[Any], Any] = _all
+    optional: bool = False
 
     def __call__(self, folder: Path) -> list[str]:
-        found = load(folder, self.source)
-        if found:
-            return [self.title, *self.body(found)] if self.title else self.body(found)
-        return [self.title, not_run(self.command)] if self.title else []
+        found = self.of(load(folder, self.source))
+        said = [self.title] if self.title else []
+        if isinstance(found, Named):
+            missing = (self.command.format(name=n) for n, v in found.items() if not v)
+            said += map(not_run, dict.fromkeys(missing))
+            found = {name: value for name, value in found.items() if value}
+        elif not found:
+            said = [] if self.optional else [*said, not_run(self.command)]
+        return said + self.body(found) if found else said
 
 
-def load(folder: Path, source: str) -> Any:
-    """A source as `Section` has it; empty or None where nothing was run."""
+def those(keep: Callable[[Any], object]) -> Callable[[Iterable[Any]], list[Any]]:
+    """Takes the rows of which ``keep`` is true."""
+    return lambda rows: [row for row in rows if keep(row)]
+
+
+def shown(sections: Iterable[Section], folder: Path) -> list[str]:
+    """The paragraphs of all of them."""
+    return [text for section in sections for text in section(folder)]
+
+
+def load(folder: Path, source: str | Mapping[Any, str]) -> Any:
+    """Results; empty or None where nothing was run.
+
+    Args:
+        source: ``NAME.jsonl``, the rows of a file; ``NAME.json``, its content; a
+            pattern such as ``NAME_*.json``, the contents by name, sorted; several of
+            these, by names.
+    """
     from easi_jax.io.files import read_json
 
+    if not isinstance(source, str):
+        return Named({name: load(folder, one) for name, one in source.items()})
     if source.endswith(".jsonl"):
         return read_rows(folder / source)
     if "*" in source:

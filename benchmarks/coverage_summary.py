@@ -1,6 +1,5 @@
 """Section of the results page on the spread that a search returns."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,11 +14,6 @@ MEANT = WAYS[1:]  # spreads that commands state
 BOUND = 2.0  # times the Cramer-Rao bound
 TARGETS = 100
 _NINETY, _FAR = 1.645, 3.0  # standard deviations
-
-
-def section(folder: Path) -> list[str]:
-    """Coverage of the regions, and errors beside the Cramer-Rao bound."""
-    return [*_RIGHT(folder), *_LATE(folder)]
 
 
 def _late(rows: list[dict[str, Any]]) -> list[str]:
@@ -79,15 +73,6 @@ def _right(rows: list[dict[str, Any]]) -> list[str]:
     ]
 
 
-_RIGHT = Section(
-    *("## What the stated spread is worth", "coverage.jsonl", "coverage", _right)
-)
-_LATE = Section(
-    *("### Spreads where the model falls short", "coverage_late.jsonl"),
-    *("coverage --late 0.005", _late),
-)
-
-
 def _unseen(rows: list[dict[str, Any]]) -> list[str]:
     """Whether something is stated of what data do not show; no region counts that."""
     far = [
@@ -122,3 +107,14 @@ def covered(rows: list[dict[str, Any]], way: str, share: float) -> np.ndarray:
 def beside_bound(rows: list[dict[str, Any]], way: str) -> np.ndarray:
     """RMS errors in units of the Cramer-Rao bound, ``(targets,)``."""
     return np.array([(r[way]["bound"] / max(r["rank"], 1)) ** 0.5 for r in rows])
+
+
+SECTIONS = (
+    Section(
+        *("## What the stated spread is worth", "coverage.jsonl", "coverage", _right)
+    ),
+    Section(
+        *("### Spreads where the model falls short", "coverage_late.jsonl"),
+        *("coverage --late 0.005", _late),
+    ),
+)

@@ -1,10 +1,9 @@
 """Sections of the results page on kills and on long use."""
 
-from pathlib import Path
 from typing import Any
 
 from benchmarks._common import commits_of, markdown_table
-from benchmarks._page import Section, load, not_run, table
+from benchmarks._page import Section, table
 from benchmarks.crash import COMMANDS
 
 
@@ -29,30 +28,26 @@ def _crashes(rows: list[Any]) -> list[str]:
     ]
 
 
-def faults(folder: Path) -> list[str]:
+def _faults(found: dict[str, Any]) -> list[str]:
     """Everything that was broken on purpose, in one table."""
-    out, lines = ["## Faults tried and survived"], []
-    r = load(folder, "faults.json")
-    if r:
+    out, lines = [], []
+    if "faults" in found:
+        r = found["faults"]
         out.append(f"Tests: `{r['command']}`, commit {commits_of([r])}.")
         lines += [
             (fault, "tests", c["tried"], c["survived"])
             for fault, c in r["counts"].items()
         ]
-    else:
-        out.append(not_run("faults"))
-    r = load(folder, "fuzz.json")
-    if r:
-        cases, failed = r["total"]["cases"], r["total"]["failed"]
+    if "fuzz" in found:
+        cases, failed = (found["fuzz"]["total"][k] for k in ("cases", "failed"))
         what = "files changed, drawn or written to do harm"
         lines.append((what, "`benchmarks.fuzz`", cases, cases - failed))
-    rows = load(folder, "crash.jsonl")
-    if rows:
-        same = sum(not r["different"] for r in rows)
+    if "crash" in found:
+        same = sum(not r["different"] for r in found["crash"])
         what = "commands killed at random moments"
-        lines.append((what, "`benchmarks.crash`", len(rows), same))
+        lines.append((what, "`benchmarks.crash`", len(found["crash"]), same))
     head = ("what breaks", "by", "tried", "survived")
-    return [*out, markdown_table(head, lines)] if lines else out
+    return [*out, markdown_table(head, lines)]
 
 
 def _soak(r: Any) -> list[str]:
@@ -72,5 +67,9 @@ def _soak(r: Any) -> list[str]:
     ]
 
 
-crashes = Section("## Killed and gone on", "crash.jsonl", "crash", _crashes)
-soak = Section("## Many searches in one process", "soak.json", "soak", _soak)
+_FILES = {"faults": "faults.json", "fuzz": "fuzz.json", "crash": "crash.jsonl"}
+SECTIONS = (
+    Section("## Faults tried and survived", _FILES, "{name}", _faults),
+    Section("## Killed and gone on", "crash.jsonl", "crash", _crashes),
+    Section("## Many searches in one process", "soak.json", "soak", _soak),
+)

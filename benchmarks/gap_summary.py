@@ -1,6 +1,7 @@
 """Pages of results on the gap workflow."""
 
 from collections.abc import Iterable, Iterator
+from functools import partial
 from itertools import product
 from pathlib import Path
 from statistics import median
@@ -28,11 +29,6 @@ from benchmarks.gap_times import GOALS as TIME_GOALS
 from benchmarks.loop import HIDDEN
 
 EMPS_GOAL = 8e-4  # m, over 0.5 s of the pulses
-
-
-def generated(folder: Path) -> list[str]:
-    """Cases with a hidden effect."""
-    return [part for s in _GENERATED for part in s(folder)]
 
 
 def _cases(rows: list[Any]) -> list[str]:
@@ -124,13 +120,6 @@ def _coarse(rows: list[Any]) -> list[str]:
     ]
 
 
-_GENERATED = (
-    Section("## Hidden effects", "gap_cases.jsonl", "gap", _cases),
-    Section("", "gap_contacts.jsonl", "gap", _contacts),
-    Section("", "gap_coarse.jsonl", "gap", _coarse),
-)
-
-
 def figures(folder: Path) -> dict[str, str]:
     """Texts of the pictures and counts, by file name; none without cases."""
     from benchmarks.gap_figures import calibration_curve, confusion_matrix
@@ -149,31 +138,18 @@ def figures(folder: Path) -> dict[str, str]:
     }
 
 
-def loop(folder: Path) -> list[str]:
+def _loop(robot: str, found: dict[str, Any]) -> list[str]:
     """Returns in a target with a hidden effect, before and after it is found."""
-    out = ["## The loop closed: a hidden effect in the target"]
-    for robot, effects in HIDDEN.items():
-        lines, methods = [], []
-        for effect in effects:
-            r = load(folder, f"loop_{robot}_{effect}.json")
-            if r is None:
-                how = "" if robot == "cartpole" else f" --robot {robot}"
-                out.append(
-                    f"{robot}, {effect}: not run (`python -m benchmarks.loop{how} "
-                    f"--effect {effect}`)."
-                )
-                continue
-            methods = list(r["returns"])
-            named = ", ".join(f"{e['effect']}@{e['at']}" for e in r["found"]["effects"])
-            each = [[*v.values()] for v in r["returns"].values()]
-            lines.append((effect, named, *map(_mean_and_all, each)))
-        if lines:
-            head = (f"{robot}, hidden", "named by train.gap", *methods)
-            out.append(markdown_table(head, lines))
-            out.append(
-                "`python -m benchmarks.loop`: mean return in the target (every seed)."
-            )
-    return out
+    lines = []
+    for effect, r in found.items():
+        named = ", ".join(f"{e['effect']}@{e['at']}" for e in r["found"]["effects"])
+        each = [[*v.values()] for v in r["returns"].values()]
+        lines.append((effect, named, *map(_mean_and_all, each)))
+    methods = list(r["returns"])
+    return [
+        markdown_table((f"{robot}, hidden", "named by train.gap", *methods), lines),
+        "`python -m benchmarks.loop`: mean return in the target (every seed).",
+    ]
 
 
 def _mean_and_all(values: list[float]) -> str:
@@ -243,5 +219,20 @@ def _unnamed(r: Any) -> str:
     return ", ".join(missing) or "none"
 
 
-times = Section("## Time of train.gap", "gap_times.jsonl", "gap_times", _times)
-real = Section(*("## Effects in real recordings", "gap_real_*.json", "gap_real", _real))
+_FIRST = next(iter(HIDDEN))
+SECTIONS = (
+    Section("## Hidden effects", "gap_cases.jsonl", "gap", _cases),
+    Section("", "gap_contacts.jsonl", "gap --effect contact_friction", _contacts),
+    Section("", "gap_coarse.jsonl", "gap --coarse --cheap", _coarse, optional=True),
+    Section("## Effects in real recordings", "gap_real_*.json", "gap_real", _real),
+    Section("## Time of train.gap", "gap_times.jsonl", "gap_times", _times),
+    *(
+        Section(
+            "## The loop closed: a hidden effect in the target" * (robot == _FIRST),
+            {effect: f"loop_{robot}_{effect}.json" for effect in effects},
+            f"loop --robot {robot} --effect {{name}}",
+            partial(_loop, robot),
+        )
+        for robot, effects in HIDDEN.items()
+    ),
+)

@@ -79,7 +79,6 @@ def paragraphs(result: dict[str, Any]) -> list[str]:
     ]
     lines = [(k, f"{a:,}", f"{b:,}", f"{b - a:+,}") for k, (a, b) in rows]
     return [
-        "## Lines by package",
         f"`{result['command']}`: lines of Python.",
         markdown_table(("package", "before", "after", "change"), lines),
     ]

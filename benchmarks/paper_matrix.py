@@ -15,7 +15,7 @@ _OF_OTHERS = (SEARCHES[1], AFTER_GAP)
 Row = Mapping[str, Any]
 
 
-def section(rows: Iterable[Row]) -> list[str]:
+def paragraphs(rows: Iterable[Row]) -> list[str]:
     """A line for each experiment and robot of which a cell was run; then all others."""
     have = {r["key"]: r for r in rows}
     lines, none = [], []
@@ -42,7 +42,6 @@ def section(rows: Iterable[Row]) -> list[str]:
     idle = [m for m in METHODS if m not in (*MUST, *tried, *_OF_OTHERS)]
     head = ("experiment", "robot", "cells run", "seeds complete", "on", "commits")
     out = [
-        "### What was run",
         "`python -m benchmarks.paper NAME --robot ROBOT`; a commit with + had changes "
         "that were not committed.",
         markdown_table(head, lines),

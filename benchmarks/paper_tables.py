@@ -6,6 +6,8 @@ preset (``--env-steps``) are left out.
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from itertools import product
 from pathlib import Path
 from statistics import mean, median, stdev
 from typing import Any
@@ -13,13 +15,14 @@ from typing import Any
 from benchmarks import paper_matrix
 from benchmarks._cells import read_rows
 from benchmarks._common import markdown_table
-from benchmarks._page import each_of, met, not_run, table
+from benchmarks._page import Named, Section, each_of, met, table, those
 from benchmarks.paper import CHANGED, MUST, ON_HARDWARE, SEARCHES, STARTS
 from benchmarks.paper_cells import METHODS, WARM
 from benchmarks.paper_runtime import WAYS
 from benchmarks.paper_twin import TWIN
 from benchmarks.twin_measures import COMMANDS, EPISODES, TRACKED
 
+_FILE = "paper.jsonl"
 FLAT = 3.0  # times the best setting's error: no setting of the default is worse
 OURS = "EASI default"
 GOAL = 0.9  # share of the way from UDR to Oracle
@@ -81,44 +84,34 @@ _LENGTHS = (
 Row = dict[str, Any]
 
 
-def sections(folder: Path) -> list[str]:
-    """Everything, as paragraphs of Markdown."""
-    rows = whole(read_rows(folder / "paper.jsonl"))
-    out = ["## The paper's tables and figures"]
-    if not rows:
-        return [*out, not_run("paper table1")]
-    out += paper_matrix.section(rows)
-    for part in (
-        *(_table1, _table2, _table3, _table4, _table5),
-        *(_fig4, _fig6, _fig7, _appendix_a, _runtime),
-    ):
-        out += part(rows)
-    pictures = figures(folder)
-    for name in sorted(pictures):
-        out.append(f"![{_title(name)}]({name})")
-    return out
-
-
 def figures(folder: Path) -> dict[str, str]:
     """Pictures by file name."""
-    rows = whole(read_rows(folder / "paper.jsonl"))
-    out = {}
-    for robot in CHANGED:
-        for name, draw in (
-            ("fig4", _drawn_fig4),
-            ("fig5", _drawn_fig5),
-            ("fig6", _drawn_fig6),
-        ):
-            text = draw([r for r in rows if r["robot"] == robot and not r["options"]])
-            if text:
-                out[f"paper_{name}_{robot}.svg"] = text
-    text = _drawn_fig7(rows)
-    if text:
-        out["paper_fig7_go2.svg"] = text
-    text = _drawn_appendix_a([r for r in rows if r["options"]])
-    if text:
-        out["paper_appendix_a.svg"] = text
+    drawn = _drawn(whole(read_rows(folder / _FILE)))
+    return {name: text for of in drawn.values() for name, text in of.items()}
+
+
+def _drawn(rows: Sequence[Row]) -> Named:
+    """Pictures by experiment and file name."""
+    out = Named()
+    plain = [r for r in rows if not r["options"]]
+    for figure, draw in (
+        ("fig4", _drawn_fig4),
+        ("fig5", _drawn_fig5),
+        ("fig6", _drawn_fig6),
+    ):
+        texts = {x: draw([r for r in plain if r["robot"] == x]) for x in CHANGED}
+        out[figure] = {f"paper_{figure}_{x}.svg": t for x, t in texts.items() if t}
+    for figure, name, text in (
+        ("fig7", "paper_fig7_go2.svg", _drawn_fig7(rows)),
+        ("appendix_a", "paper_appendix_a.svg", _drawn_appendix_a(rows)),
+    ):
+        out[figure] = {name: text} if text else {}
     return out
+
+
+def _shown(found: dict[str, dict[str, str]]) -> list[str]:
+    names = sorted(name for of in found.values() for name in of)
+    return [f"![{_title(name)}]({name})" for name in names]
 
 
 def whole(rows: Iterable[Row]) -> list[Row]:
@@ -170,42 +163,47 @@ def _share(of: dict[int, float], udr: dict[int, float], best: dict[int, float]) 
     return f"{sum(of[s] - udr[s] for s in seeds) / way:.2f}"
 
 
-def _table1(rows: Sequence[Row]) -> list[str]:
-    out = ["### Table 1: return in the target", _LENGTHS]
-    for robot in CHANGED:
-        lines = []
-        by_target = {
-            x: _returns(rows, robot, f"{CHANGED[robot]}*{x:g}") for x in (0.25, 0.5)
-        }
-        others = [m for m in METHODS if any(m in found for found in by_target.values())]
-        for method in dict.fromkeys((*MUST, *others)):
-            cells: list[str] = []
-            for factor, found in by_target.items():
-                mine = found.get(method, {})
-                cells.append(told([mine[s] for s in sorted(mine)]))
-                ends = (found.get("UDR", {}), found.get("Oracle", {}))
-                cells.append(_judged(method, _share(mine, *ends)))
-                stated = PUBLISHED.get(f"{CHANGED[robot]}*{factor:g}", {})
-                theirs = "EASI" if method == SEARCHES[0] else method
-                cells.append(stated.get(theirs, ""))
-            lines.append((method, *cells))
-        if not any(by_target.values()):
-            out.append(not_run(f"paper table1 --robot {robot}"))
-            continue
-        name = CHANGED[robot]
-        head = (
-            *("method", f"{name}*0.25", "share", "published"),
-            *(f"{name}*0.5", "share", "published"),
-        )
-        out += [
-            f"{robot}: mean ± standard deviation (every seed); share of the way from "
-            f"UDR to Oracle, goal of EASI default {GOAL}; published are the paper's, "
-            "in another simulator:",
-            markdown_table(head, lines),
-            *_first(robot, by_target, rows),
-            *_other_recipe(robot, rows),
-        ]
-    return out
+def _in_targets(robot: str, rows: Sequence[Row]) -> list[Row]:
+    """Rows of a robot, some of which are trainings for its targets of Table 1."""
+    mine = [r for r in rows if r["robot"] == robot]
+    return mine if any(_by_target(robot, mine).values()) else []
+
+
+def _by_target(
+    robot: str, rows: Sequence[Row]
+) -> dict[float, dict[str, dict[int, float]]]:
+    """Return by factor on the changed parameter, method and seed."""
+    return {x: _returns(rows, robot, f"{CHANGED[robot]}*{x:g}") for x in (0.25, 0.5)}
+
+
+def _table1(robot: str, rows: Sequence[Row]) -> list[str]:
+    lines = []
+    by_target = _by_target(robot, rows)
+    others = [m for m in METHODS if any(m in found for found in by_target.values())]
+    for method in dict.fromkeys((*MUST, *others)):
+        cells: list[str] = []
+        for factor, found in by_target.items():
+            mine = found.get(method, {})
+            cells.append(told([mine[s] for s in sorted(mine)]))
+            ends = (found.get("UDR", {}), found.get("Oracle", {}))
+            cells.append(_judged(method, _share(mine, *ends)))
+            stated = PUBLISHED.get(f"{CHANGED[robot]}*{factor:g}", {})
+            theirs = "EASI" if method == SEARCHES[0] else method
+            cells.append(stated.get(theirs, ""))
+        lines.append((method, *cells))
+    name = CHANGED[robot]
+    head = (
+        *("method", f"{name}*0.25", "share", "published"),
+        *(f"{name}*0.5", "share", "published"),
+    )
+    return [
+        f"{robot}: mean ± standard deviation (every seed); share of the way from "
+        f"UDR to Oracle, goal of EASI default {GOAL}; published are the paper's, "
+        "in another simulator:",
+        markdown_table(head, lines),
+        *_first(robot, by_target, rows),
+        *_other_recipe(robot, rows),
+    ]
 
 
 def _other_recipe(robot: str, rows: Sequence[Row]) -> list[str]:
@@ -287,11 +285,7 @@ def _by(first: dict[int, float], second: dict[int, float]) -> str:
     return f" by {mean(ahead):.1f} (standard error {error:.1f}, same seeds)"
 
 
-def _table2(rows: Sequence[Row]) -> list[str]:
-    out = ["### Table 2: balancing in a twin"]
-    mine = _in_twin(rows, "cartpole")
-    if not mine:
-        return [*out, not_run("paper table2")]
+def _table2(found: dict[str, list[Row]]) -> list[str]:
     columns = {
         "method": lambda m: m[0],
         "pole angle [0.01 rad]": lambda m: _of(m[1], lambda r: r["angle_error"], 2),
@@ -300,11 +294,10 @@ def _table2(rows: Sequence[Row]) -> list[str]:
         "fell": lambda m: f"{sum(r['fallen'] for r in m[1])} of {EPISODES * len(m[1])}",
     }
     return [
-        *out,
         f"{_NO_HARDWARE} cart-pole; 50 logged episodes. Mean sizes until a fall; mean "
         "± standard deviation (every seed). Published, on hardware: pole 2.65 ± 0.19 "
         "and cart 1.63 ± 0.03 for UDR, 1.67 ± 0.16 and 1.21 ± 0.08 for EASI.",
-        table(mine.items(), columns),
+        table(found.items(), columns),
     ]
 
 
@@ -313,7 +306,7 @@ def _of(rows: Sequence[Row], value: Callable[[Row], Any], digits: int) -> str:
     return told([v for v in map(value, rows) if v is not None], digits)
 
 
-def _in_twin(rows: Sequence[Row], robot: str) -> dict[str, list[Row]]:
+def _in_twin(robot: str, rows: Sequence[Row]) -> dict[str, list[Row]]:
     """Rows by method, in the order of seeds."""
     mine = [r for r in rows if (r["robot"], r["target"]) == (robot, TWIN)]
     mine.sort(key=lambda r: r["seed"])
@@ -321,17 +314,12 @@ def _in_twin(rows: Sequence[Row], robot: str) -> dict[str, list[Row]]:
     return {m: f for m, f in found.items() if f}
 
 
-def _fig7(rows: Sequence[Row]) -> list[str]:
-    out = ["### Fig. 7: walking in a twin"]
-    mine = _in_twin(rows, "go2")
-    if not mine:
-        return [*out, not_run("paper fig7")]
-
-    def speed(found: Sequence[Row]) -> str:
-        speeds = [v for r in found for v in r["speed"]]
+def _fig7(found: dict[str, list[Row]]) -> list[str]:
+    def speed(rows: Sequence[Row]) -> str:
+        speeds = [v for r in rows for v in r["speed"]]
         left = sum(v is not None for v in speeds)
         at = f", at {left} of {len(speeds)} commands" if left < len(speeds) else ""
-        return _of(found, lambda r: r["tracking_error"], 3) + at
+        return _of(rows, lambda r: r["tracking_error"], 3) + at
 
     columns = {
         "method": lambda m: m[0],
@@ -346,19 +334,18 @@ def _fig7(rows: Sequence[Row]) -> list[str]:
         ),
     }
     return [
-        *out,
         f"{_NO_HARDWARE} Go2; one log of 40 s at 1.4 m/s. The UDR policy's joint "
         "motion in the simulation as given (UDR) or as identified (EASI), against that "
         "in the twin, RMS over 0.25 to 10 Hz; speeds are of each method's own policy, "
         "at commands at which it does not fall.",
-        table(mine.items(), columns),
+        table(found.items(), columns),
     ]
 
 
 def _drawn_fig7(rows: Sequence[Row]) -> str:
     from benchmarks.paper_figures import motion_and_speed
 
-    mine = _in_twin(rows, "go2")
+    mine = _in_twin("go2", rows)
     first = {m: found[0] for m, found in mine.items()}
     if "UDR" not in first or first["UDR"]["spectrum"]["twin"] is None:
         return ""
@@ -379,32 +366,35 @@ def _drawn_fig7(rows: Sequence[Row]) -> str:
     return motion_and_speed(before["frequency"], density, COMMANDS, speed)
 
 
-def _table3(rows: Sequence[Row]) -> list[str]:
-    out, lines = ["### Table 3: return by number of demonstrations"], []
-    for robot in CHANGED:
+def _by_count(rows: Sequence[Row]) -> Named:
+    """Rows of each robot; none without a training by less demonstrations than all."""
+    found = Named()
+    for robot, changed in CHANGED.items():
+        counts = [_returns(rows, robot, f"{changed}*0.5", n) for n in (1, 50, 100)]
+        some = any(OURS in c for c in counts)
+        found[robot] = [r for r in rows if r["robot"] == robot] if some else []
+    return found
+
+
+def _table3(found: dict[str, list[Row]]) -> list[str]:
+    lines, mixed, shares = [], [], []
+    for robot, rows in found.items():
         target = f"{CHANGED[robot]}*0.5"
-        udr = _returns(rows, robot, target).get("UDR", {})
-        cells = [told([udr[s] for s in sorted(udr)])]
-        for count in (1, 50, 100, 200):
-            mine = _returns(rows, robot, target, count).get("EASI default", {})
-            cells.append(told([mine[s] for s in sorted(mine)]))
-        if any(c != _NOT_RUN for c in cells[1:4]):
-            lines.append((f"{robot}, {target}", *cells))
-            if robot in _BY_COUNT:
-                lines.append((f"{robot}, published", *_BY_COUNT[robot]))
-        else:
-            out.append(not_run(f"paper table3 --robot {robot}"))
-    if lines:
-        head = ("target", "UDR", "1", "50", "100", "200")
-        out.append(markdown_table(head, lines))
-    out += [x for robot in CHANGED for x in _mixed(rows, robot)]
-    found = _returns(rows, "cartpole", "cart_kp*0.5")
-    one = _returns(rows, "cartpole", "cart_kp*0.5", 1).get(OURS, {})
-    shares = [
-        _share(of, found.get("UDR", {}), found.get("Oracle", {}))
-        for of in (one, found.get(OURS, {}))
-    ]
-    if all(shares):
+        full = _returns(rows, robot, target)
+        udr, oracle = (full.get(m, {}) for m in ("UDR", "Oracle"))
+        by_count = {
+            n: _returns(rows, robot, target, n).get(OURS, {}) for n in (1, 50, 100, 200)
+        }
+        cells = [told([m[s] for s in sorted(m)]) for m in (udr, *by_count.values())]
+        lines.append((f"{robot}, {target}", *cells))
+        if robot in _BY_COUNT:
+            lines.append((f"{robot}, published", *_BY_COUNT[robot]))
+        mixed += _mixed(rows, robot)
+        if robot == "cartpole":
+            shares = [_share(by_count[n], udr, oracle) for n in (1, 200)]
+    head = ("target", "UDR", "1", "50", "100", "200")
+    out = [markdown_table(head, lines), *mixed]
+    if shares and all(shares):
         out.append(
             f"With one demonstration, {OURS} goes {shares[0]} of Cartpole's way from "
             f"UDR to Oracle, with 200 {shares[1]}."
@@ -428,58 +418,46 @@ def _mixed(rows: Sequence[Row], robot: str) -> list[str]:
     return [f"{robot}, demonstrations by machine, each with UDR of its own: {told}."]
 
 
+def _with_setting(name: str, rows: Sequence[Row]) -> list[Row]:
+    """Searches in which a setting was changed, each with its ``value``."""
+    return [
+        {**r, "value": float(word.partition("=")[2])}
+        for r in sorted(rows, key=lambda r: r["seed"])
+        for word in r["settings"]
+        if word.startswith(f"{name}=") and r["method"] in SEARCHES
+    ]
+
+
 def _table4(rows: Sequence[Row]) -> list[str]:
-    out = _swept(rows, "table4", "Table 4", "elite_ratio", "μ/λ")
-    if any("elite_ratio" in s for r in rows for s in r["settings"]):
-        out.append(
-            "Weights of the better half alone are above zero "
-            "(`easi_jax.search.evolution.recombination_weights`), "
-            "so from μ/λ = 0.5 on it is the same search."
-        )
-    return out
+    return [
+        *_swept(rows),
+        "Weights of the better half alone are above zero "
+        "(`easi_jax.search.evolution.recombination_weights`), "
+        "so from μ/λ = 0.5 on it is the same search.",
+    ]
 
 
-def _table5(rows: Sequence[Row]) -> list[str]:
-    name = "discriminator_updates"
-    return _swept(rows, "table5", "Table 5", name, "discriminator updates")
-
-
-def _swept(
-    rows: Sequence[Row], command: str, title: str, setting: str, shown: str
-) -> list[str]:
-    out, lines = [f"### {title}: parameter error by {shown}"], []
-    for robot in CHANGED:
-        found: dict[str, dict[float, list[float]]] = {m: {} for m in SEARCHES}
-        begun: dict[str, list[float]] = defaultdict(list)
-        for r in sorted(rows, key=lambda r: r["seed"]):
-            if r["robot"] != robot or r["method"] not in found:
-                continue
-            for word in r["settings"]:
-                name, _, value = word.partition("=")
-                if name == setting:
-                    errors = found[r["method"]].setdefault(float(value), [])
-                    errors.append(r["error"])
-                    if "start_error" in r:
-                        begun[r["method"]].append(r["start_error"])
-        for method, by_value in found.items():
-            if not by_value:
-                continue
-            middle = {v: median(e) for v, e in by_value.items()}
-            ratio = max(middle.values()) / min(middle.values())
-            verdict = f"{ratio:.1f}"
-            if method != SEARCHES[0]:
-                verdict += f", {met(ratio <= FLAT)}"
-            cells = "; ".join(
-                f"{v:g}: {_middle(by_value[v])}" for v in sorted(by_value)
-            )
-            start = f"{median(begun[method]):.3f}" if begun[method] else ""
-            lines.append((robot, method, start, cells, verdict))
-    if not lines:
-        return [*out, not_run(f"paper {command}")]
+def _swept(rows: Sequence[Row]) -> list[str]:
+    lines = []
+    for robot, method in product(CHANGED, SEARCHES):
+        mine = [r for r in rows if (r["robot"], r["method"]) == (robot, method)]
+        if not mine:
+            continue
+        errors: dict[float, list[float]] = defaultdict(list)
+        for r in mine:
+            errors[r["value"]].append(r["error"])
+        middle = [median(e) for e in errors.values()]
+        ratio = max(middle) / min(middle)
+        verdict = f"{ratio:.1f}"
+        if method != SEARCHES[0]:
+            verdict += f", {met(ratio <= FLAT)}"
+        cells = "; ".join(f"{v:g}: {_middle(errors[v])}" for v in sorted(errors))
+        begun = [r["start_error"] for r in mine if "start_error" in r]
+        start = f"{median(begun):.3f}" if begun else ""
+        lines.append((robot, method, start, cells, verdict))
     goal = f"worst/best (goal {FLAT:g})"
     head = ("robot", "search", "start", "median error (every seed)", goal)
     return [
-        *out,
         f"{_ERROR} `start`: of the middle of where the search starts.",
         markdown_table(head, lines),
     ]
@@ -487,15 +465,12 @@ def _swept(
 
 def _fig4(rows: Sequence[Row]) -> list[str]:
     """What the pictures of Fig. 4 end with."""
-    lines = []
-    out = ["### Fig. 4: parameter error after the search, by where it starts"]
-    for robot in CHANGED:
-        mine = [r for r in rows if _traced(r) and r["robot"] == robot]
-        lines += [(robot, *line) for line in _by_start(mine)]
-    if not lines:
-        return [*out, not_run("paper fig4")]
+    lines = [
+        (robot, *line)
+        for robot in CHANGED
+        for line in _by_start([r for r in rows if r["robot"] == robot])
+    ]
     return [
-        *out,
         f"{_ERROR} Median (every seed), and after it of the middle of where the search "
         "starts. From UDR's range, the target has one value halved (a target in the "
         "middle of the range would be found before the search); from the others, whose "
@@ -507,14 +482,9 @@ def _fig4(rows: Sequence[Row]) -> list[str]:
 
 def _appendix_a(rows: Sequence[Row]) -> list[str]:
     """What its picture ends with."""
-    out = ["### Appendix A: error of Go2's 25 parameters, by where the search starts"]
-    lines = _by_start([r for r in rows if r["options"]])
-    if not lines:
-        return [*out, not_run("paper appendix_a")]
     return [
-        *out,
         "As Fig. 4; the target has one leg's thigh drive at half its stiffness.",
-        markdown_table(("search", *map(_from, STARTS)), lines),
+        markdown_table(("search", *map(_from, STARTS)), _by_start(rows)),
     ]
 
 
@@ -548,17 +518,7 @@ def _from_start(rows: Sequence[Row]) -> str:
     return f"{text}; {median(begun):.3f}" if begun else text
 
 
-def _fig6(rows: Sequence[Row]) -> list[str]:
-    if any(_drawn_fig6([r for r in rows if r["robot"] == x]) for x in CHANGED):
-        return []
-    return [not_run("paper fig6")]
-
-
 def _runtime(rows: Sequence[Row]) -> list[str]:
-    out = ["### Run time: one program beside separate programs"]
-    timed = [r for r in rows if r["method"] in WAYS]
-    if not timed:
-        return [*out, not_run("paper runtime")]
     columns = {
         "chain": "{robot}, seed {seed}",
         "as": "{method}",
@@ -571,7 +531,7 @@ def _runtime(rows: Sequence[Row]) -> list[str]:
         "return": "{return:.1f}",
     }
     both: dict[tuple[str, int], dict[str, Row]] = defaultdict(dict)
-    for r in timed:
+    for r in rows:
         both[r["robot"], r["seed"]][r["method"]] = r
     pairs = [[b[w] for w in WAYS] for b in both.values() if len(b) == len(WAYS)]
     paired = []
@@ -585,7 +545,7 @@ def _runtime(rows: Sequence[Row]) -> list[str]:
             f"{moved:.2g} times the bytes (medians of {len(pairs)} seeds). The "
             "programs compiled beside it are small ones, which prepare and report."
         )
-    return [*out, table(timed, columns), *paired]
+    return [table(rows, columns), *paired]
 
 
 def _drawn_fig4(rows: Sequence[Row]) -> str:
@@ -656,7 +616,7 @@ def _drawn_appendix_a(rows: Sequence[Row]) -> str:
 
     from benchmarks.paper_figures import ratios_by_generation
 
-    traced = [r for r in rows if "trace" in r]
+    traced = [r for r in rows if r["options"] and "trace" in r]
     if not traced:
         return ""
 
@@ -672,3 +632,46 @@ def _drawn_appendix_a(rows: Sequence[Row]) -> str:
         for start in STARTS
     }
     return ratios_by_generation(panels, columns=len(STARTS), whole=True)
+
+
+def _part(
+    title: str,
+    command: str,
+    body: Callable[[Any], list[str]],
+    of: Callable[[list[Row]], Any] = list,
+) -> Section:
+    """A section of whole trainings."""
+    return Section(title, _FILE, f"paper {command}", body, lambda rows: of(whole(rows)))
+
+
+_TITLE = "## The paper's tables and figures\n\n### What was run"
+_TITLE5 = "### Table 5: parameter error by discriminator updates"
+_TITLE4 = "### Fig. 4: parameter error after the search, by where it starts"
+_TITLE_A = "### Appendix A: error of Go2's 25 parameters, by where the search starts"
+_TITLE_TIME = "### Run time: one program beside separate programs"
+_RATIO, _UPDATES = (
+    partial(_with_setting, name) for name in ("elite_ratio", "discriminator_updates")
+)
+SECTIONS = (
+    _part(_TITLE, "table1", paper_matrix.paragraphs),
+    _part("### Table 1: return in the target", "table1", lambda _: [_LENGTHS]),
+    *(
+        _part("", f"table1 --robot {x}", partial(_table1, x), partial(_in_targets, x))
+        for x in CHANGED
+    ),
+    _part(
+        *("### Table 2: balancing in a twin", "table2", _table2),
+        partial(_in_twin, "cartpole"),
+    ),
+    _part(
+        "### Table 3: return by number of demonstrations",
+        *("table3 --robot {name}", _table3, _by_count),
+    ),
+    _part("### Table 4: parameter error by μ/λ", "table4", _table4, _RATIO),
+    _part(_TITLE5, "table5", _swept, _UPDATES),
+    _part(_TITLE4, "fig4", _fig4, those(_traced)),
+    _part("### Fig. 7: walking in a twin", "fig7", _fig7, partial(_in_twin, "go2")),
+    _part(_TITLE_A, "appendix_a", _appendix_a, those(lambda r: r["options"])),
+    _part(_TITLE_TIME, "runtime", _runtime, those(lambda r: r["method"] in WAYS)),
+    _part("", "{name}", _shown, _drawn),
+)

@@ -3,13 +3,11 @@
 from collections import defaultdict
 from collections.abc import Sequence
 from itertools import product
-from pathlib import Path
 from statistics import median
 from typing import Any
 
-from benchmarks._cells import read_rows
 from benchmarks._common import commits_of, markdown_table
-from benchmarks._page import not_run, table
+from benchmarks._page import Section, table, those
 from benchmarks.rival_cells import AFTER_GAP, METHODS, ROBOTS, SETTINGS, Cell
 
 OURS = METHODS[0]
@@ -18,13 +16,9 @@ _EXACT = 1e-3  # errors below it are the same: a tenth of a percent
 Row = dict[str, Any]
 
 
-def section(folder: Path) -> list[str]:
-    """Errors, regions and costs of every method, robot by robot."""
-    rows = read_rows(folder / "rivals.jsonl")
-    out = ["## Identification beside rivals and today's tools"]
-    if not rows:
-        return [*out, not_run("rivals")]
-    out.append(
+def _measured(rows: Sequence[Row]) -> list[str]:
+    """What is compared, and how to read it."""
+    return [
         f"`python -m benchmarks.rivals`, commits {commits_of(rows)}: equal data and "
         "budget (simulated control steps, a derivative as one), each seed a machine of "
         "its own. RMS of the log ratio to the truth "
@@ -36,9 +30,7 @@ def section(folder: Path) -> list[str]:
         "no model has; there EASI also goes with what `train.gap` names. SimOpt asks "
         "for more trajectories of the real machine, which explore in every setting, "
         "and knows their starts exactly; the controller stays the same, for none of "
-        "these machines has a task."
-    )
-    out.append(
+        "these machines has a task.",
         "To read with it: CMA-ES, random search, `mujoco.sysid` and NPE replay pieces "
         "of 25 control steps from the states that were recorded, noise included, as "
         "their authors do; EASI's finish fits the starts as well. Parameters of which "
@@ -46,15 +38,13 @@ def section(folder: Path) -> list[str]:
         "logarithms count that in full. The bound is that of estimates without any "
         "prior knowledge: along a direction that is hardly seen, a method that keeps "
         "to the middle of its start may be nearer by chance, so that a verdict of one "
-        "seed says little where errors are beyond a tenth of a percent."
-    )
-    for robot in ROBOTS:
-        mine = [r for r in rows if r["robot"] == robot]
-        if not mine:
-            out.append(not_run(f"rivals --robots {robot}"))
-            continue
-        out += [f"### {robot}", _errors(mine), *_verdicts(mine), *_costs(mine)]
-    return out
+        "seed says little where errors are beyond a tenth of a percent.",
+    ]
+
+
+def _robot(rows: Sequence[Row]) -> list[str]:
+    """Errors, regions and costs of every method on one robot."""
+    return [_errors(rows), *_verdicts(rows), *_costs(rows)]
 
 
 def best_rival(rows: Sequence[Row], setting: str) -> tuple[str, float, float] | None:
@@ -188,3 +178,17 @@ def _beyond(rows: Sequence[Row]) -> list[str]:
                 f"of {len(mine)} cells, up to {most / 1e6:.3g}."
             )
     return said
+
+
+_FILE = "rivals.jsonl"
+_TITLE = "## Identification beside rivals and today's tools"
+SECTIONS = (
+    Section(_TITLE, _FILE, "rivals", _measured),
+    *(
+        Section(
+            *(f"### {robot}", _FILE, f"rivals --robots {robot}", _robot),
+            those(lambda row, robot=robot: row["robot"] == robot),
+        )
+        for robot in ROBOTS
+    ),
+)

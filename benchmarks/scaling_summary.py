@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 
 from benchmarks._cells import read_rows
 from benchmarks._common import commits_of, markdown_table
-from benchmarks._page import not_run
+from benchmarks._page import Section
 from easi_jax.io.report.figure_style import (
     SERIES,
     dash,
@@ -32,17 +32,13 @@ OF = {
 }
 
 
-def growth(folder: Path) -> list[str]:
+def _growth(rows: Sequence[dict[str, Any]]) -> list[str]:
     """Seconds by size, on every device that was timed."""
-    out = ["## How cost grows"]
-    rows = read_rows(folder / "scaling.jsonl")
-    if not rows:
-        return [*out, not_run("scaling")]
-    out.append(
+    out = [
         f"`python -m benchmarks.scaling`, commits {commits_of(rows)}: seconds once "
-        "compiled, the least of three; control steps simulated a second in brackets."
-    )
-    out.append("![Seconds by size](scaling.svg)")
+        "compiled, the least of three; control steps simulated a second in brackets.",
+        "![Seconds by size](scaling.svg)",
+    ]
     for what, title in OF.items():
         part = [r for r in rows if r["what"] == what]
         sizes = sorted({r["size"] for r in part})
@@ -218,3 +214,6 @@ def _cell(rows: Sequence[dict[str, Any]], size: int) -> str:
         if r["size"] == size:
             return f"{r['seconds']:.3g} ({r['control_steps_per_s']:,.0f})"
     return "not run"
+
+
+SECTIONS = (Section("## How cost grows", "scaling.jsonl", "scaling", _growth),)

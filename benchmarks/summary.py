@@ -25,7 +25,8 @@ from benchmarks import (
     scaling_summary,
 )
 from benchmarks._common import RESULTS, markdown_table
-from benchmarks._page import Section, each_of, load, met, not_run, percent, table
+from benchmarks._page import Section, each_of, met, percent, shown, table
+from benchmarks.accuracy import ROBOTS as ACCURATE
 from benchmarks.devices import SAME, STEPS
 from benchmarks.export import GOAL
 from benchmarks.physics import GOALS
@@ -56,8 +57,7 @@ def run(config: Config) -> None:
     by_hand = config.results / "SUMMARY.md"
     if by_hand.is_file():
         parts.append(by_hand.read_text().strip())
-    for section in SECTIONS:
-        parts += section(config.results)
+    parts += shown(SECTIONS, config.results)
     for module in (gap_summary, paper_tables, scaling_summary):
         for name, text in module.figures(config.results).items():
             atomic_write(config.results / name, text)
@@ -98,29 +98,21 @@ def _speed(r: Any) -> list[str]:
     ]
 
 
-def _physics(folder: Path) -> list[str]:
+def _physics(found: dict[str, Any]) -> list[str]:
     """Physics steps per second of every robot, and ways to run a step."""
-    title = "## Physics of every robot"
-    found = {name: load(folder, f"physics_{name}.json") for name in GOALS}
-    if not any(found.values()):
-        return [title, "Not run (`python -m benchmarks.physics`)."]
     rows, tried = [], []
     for name, r in found.items():
-        if r is None:
-            rows.append((name, "not run"))
-            continue
         native, ours = (
             float(np.median(r[f"{k}_steps_per_s"])) for k in ("native", "search")
         )
         goal = f"{r['ratio_goal']:g}, {met(r['ratio'] >= r['ratio_goal'])}"
-        shown = (f"{ours:,.0f}", f"{native:,.0f}", f"{r['ratio']:.2f}", goal)
-        rows.append((name, *shown, f"{r['compile_s']:.0f} s"))
+        told = (f"{ours:,.0f}", f"{native:,.0f}", f"{r['ratio']:.2f}", goal)
+        rows.append((name, *told, f"{r['compile_s']:.0f} s"))
         for label, v in r["variants"].items():
             share = f"{float(np.median(v['steps_per_s'])) / native:.2f}"
             tried.append((name, label, share, f"{v['compile_s']:.0f} s"))
     head = ("robot", "steps/s", "native", "ratio", "goal", "trace and compile")
     return [
-        title,
         "`python -m benchmarks.physics`: a population of 300, each a model of its own, "
         "against `mujoco.rollout` on the same cores, float32 beside "
         "its float64; medians, all timings in the "
@@ -128,40 +120,24 @@ def _physics(folder: Path) -> list[str]:
         markdown_table(head, rows),
         "Other ways to run a step that were tried (ratio to native):",
         markdown_table(("robot", "step", "ratio", "trace and compile"), tried),
-        *_accuracy(folder),
     ]
 
 
-def _accuracy(folder: Path) -> list[str]:
+def _accuracy(found: dict[str, Any]) -> list[str]:
     """What solver and time step of each robot cost in accuracy."""
     rows, head = [], ()
-    for name in GOALS:
-        r = load(folder, f"accuracy_{name}.json")
-        if r is None:
-            continue
+    for name, r in found.items():
         head = ("robot", "compared", *(f"{s} % of models" for s in r["percentiles"]))
         used = f"{r['used']} Newton steps"
         for what, by_time in r["difference"].items():
             label = f"**{what}**, as used" if what == used else what
             rows.append((name, label, *(f"{x:.1e}" for x in by_time[-1])))
-    if not rows:
-        return []
     return [
         "`python -m benchmarks.accuracy`: largest difference of a position [m, rad] "
         "after 0.2 s of random commands, over random models: Newton steps of the "
         "contact solver against a converged one, and beside it what a quarter of the "
         "time step would change:",
         markdown_table(head, rows),
-    ]
-
-
-def _robots(folder: Path) -> list[str]:
-    """Searches on the larger robots: time, memory, recovery."""
-    return [
-        "## Searches on the other robots",
-        *Section("", "search_*.json", "robots", _times)(folder),
-        *Section("", "memory_*.json", "robots", _memory)(folder),
-        *_found(folder),
     ]
 
 
@@ -208,60 +184,49 @@ def _off(summary: Any, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return middle, worst
 
 
-def _found(folder: Path) -> list[str]:
-    out, rows, said, missing = [], [], [], []
-    for name in ROBOTS:
-        for start in STARTS:
-            r = load(folder, f"robots_{name}_{start}.json")
-            if r is None:
-                missing.append(f"{name} {start}")
+def _found(found: dict[tuple[str, str], Any]) -> list[str]:
+    """What searches of each robot found, by where they started."""
+    rows, said = [], []
+    for (name, start), r in found.items():
+        seeds = r["seeds"]
+        known, count = _known(seeds)
+        for method, s in r["summary"].items():
+            rows.append((name, start, method, len(seeds), f"{len(known)} of {count}"))
+            if not len(known):
                 continue
-            seeds = r["seeds"]
-            known, count = _known(seeds)
-            for method, s in r["summary"].items():
-                rows.append(
-                    (name, start, method, len(seeds), f"{len(known)} of {count}")
-                )
-                if not len(known):
-                    continue
-                middle, worst = _off(s, known)
-                k = int(np.argmax(worst))
-                rows[-1] += (
-                    f"{percent(float(np.median(middle)))} %",
-                    f"{percent(float(worst[k]))} % ({r['parameters'][known[k]]})",
-                )
-            ranks = " or ".join(map(str, sorted({s["rank"] for s in seeds})))
-            open_ = sorted({d for s in seeds for d in s["undetermined"]})
-            said.append(
-                f"- {name}, {start}: the data determine {ranks} of {count} directions"
-                + (f"; {'; '.join(open_)}" if open_ else "")
-                + "."
+            middle, worst = _off(s, known)
+            k = int(np.argmax(worst))
+            rows[-1] += (
+                f"{percent(float(np.median(middle)))} %",
+                f"{percent(float(worst[k]))} % ({r['parameters'][known[k]]})",
             )
-    if rows:
-        head = (
-            *("robot", "start", "method", "seeds", "known to 2 %"),
-            *("median error of these", "worst error of these, any seed"),
+        ranks = " or ".join(map(str, sorted({s["rank"] for s in seeds})))
+        open_ = sorted({d for s in seeds for d in s["undetermined"]})
+        said.append(
+            f"- {name}, {start}: the data determine {ranks} of {count} directions"
+            + (f"; {'; '.join(open_)}" if open_ else "")
+            + "."
         )
-        out.append(
-            "`python -m benchmarks.robots --udr RUN`: `default` is "
-            "the search alone, `refine` with the least-squares finish; `high` and "
-            "`low` start at 2 to 4 and 0.05 to 0.5 times the truth. What the data can "
-            "know to 2 % is read from their Fisher information."
-        )
-        out += [markdown_table(head, rows), "\n".join(said)]
-    return [*out, f"Not run: {', '.join(missing)}."] if missing else out
+    head = (
+        *("robot", "start", "method", "seeds", "known to 2 %"),
+        *("median error of these", "worst error of these, any seed"),
+    )
+    return [
+        "`python -m benchmarks.robots --udr RUN`: `default` is "
+        "the search alone, `refine` with the least-squares finish; `high` and "
+        "`low` start at 2 to 4 and 0.05 to 0.5 times the truth. What the data can "
+        "know to 2 % is read from their Fisher information.",
+        markdown_table(head, rows),
+        "\n".join(said),
+    ]
 
 
-def _own_robot(folder: Path) -> list[str]:
-    """The README's example of a robot of one's own; nothing where it was not run."""
-    r = load(folder, "own_robot.json")
-    if r is None:
-        return []
+def _own_robot(r: Any) -> list[str]:
+    """The README's example of a robot of one's own."""
     errors = [abs(r["found"][k] / r["truth"][k] - 1) for k in r["truth"]]
     after = " and ".join(f"{x:.5f}" for x in r["held_out"]["after"]["0"])
     before = " and ".join(f"{x:.3f}" for x in r["held_out"]["before"])
     return [
-        "## A robot of one's own",
         f"`{r['command']}`, the README's arm with nothing cached: {r['seconds']:.0f} s "
         f"(goal {r['goal_s']} s, {met(r['seconds'] < r['goal_s'])}). "
         f"{len(errors)} parameters within {100 * max(errors):.1f} % of the truth; "
@@ -365,22 +330,19 @@ def _speed_told(speed: float | None, fallen: int) -> str:
     return f"{speed:.2f}" + (f" ({fallen} fell)" if fallen else "")
 
 
-def _recovery(folder: Path) -> list[str]:
-    out = ["## Recovery of known Cartpole parameters"]
-    errors, found = [], []
-    for name, case in CASES.items():
-        r = load(folder, f"recovery_{name}.json")
-        if r is None:
-            out.append(not_run(f"recovery --cases {name}"))
-            continue
+def _recovery(found: dict[str, Any]) -> list[str]:
+    """Errors of prediction, and of parameters that the data determine."""
+    errors, parameters = [], []
+    for name, r in found.items():
+        case = CASES[name]
         for method, s in r["summary"].items():
             goal = case["free"] and not any(case["noise"]) and method != "paper"
-            shown = [
+            cells = [
                 f"{100 * x:.2f} %" + (f" ({met(x <= g / 100)}: {g} %)" if goal else "")
                 for k, g in (("median_one_step", 1), ("median_open_loop", 3))
                 for x in [max(s[k])]
             ]
-            errors.append((name, method, len(r["seeds"]), *shown))
+            errors.append((name, method, len(r["seeds"]), *cells))
         seeds = [row for row in r["seeds"] if "cramer_rao_std" in row]
         if case["free"] or not seeds:
             continue
@@ -391,42 +353,28 @@ def _recovery(folder: Path) -> list[str]:
             ok = middle.max() <= np.log1p(limit)
             if "start" not in case:
                 ok = ok and worst.max() <= np.log1p(0.15)
-            shown = [
+            cells = [
                 f"{r['parameters'][k]} {percent(m)} ({percent(w)})"
                 for k, m, w in zip(known, middle, worst, strict=True)
             ]
-            found.append((name, method, ", ".join(shown), met(ok)))
-    if errors:
-        head = ("case", "method", "seeds", "one step", "open loop 0.2 s")
-        out.append(
-            "Worst channel of the held-out error, median over seeds, as a share of "
-            "the motion:"
-        )
-        out.append(markdown_table(head, errors))
-    if found:
+            parameters.append((name, method, ", ".join(cells), met(ok)))
+    head = ("case", "method", "seeds", "one step", "open loop 0.2 s")
+    out = [
+        "Worst channel of the held-out error, median over seeds, as a share of "
+        "the motion:",
+        markdown_table(head, errors),
+    ]
+    if parameters:
         out.append(
             "Parameters whose Cramer-Rao standard deviation is below 2 %: error in %, "
             "median (worst) over seeds. Goal: 5 (15), from starts that exclude the "
             "truth 10 in the median."
         )
-        out.append(markdown_table(("case", "method", "parameters", ""), found))
+        out.append(markdown_table(("case", "method", "parameters", ""), parameters))
     return out
 
 
-def _transfer(folder: Path) -> list[str]:
-    out, rows = ["## Transfer: return in a target unlike the model"], []
-    for factor in FACTORS:
-        names = [f"transfer_kp_x{factor:g}"]
-        names += sorted(p.stem for p in folder.glob(f"{names[0]}_joint*.json"))
-        others = [f"transfer_{robot}_x{factor:g}" for robot in ROBOTS]
-        names += [n for n in others if (folder / f"{n}.json").is_file()]
-        for name in names:
-            r = load(folder, f"{name}.json")
-            if r is None:
-                out.append(not_run(f"transfer --factors {factor:g}"))
-            else:
-                rows.append({"name": name.removeprefix("transfer_"), **r})
-
+def _transfer(found: dict[str, dict[str, Any]]) -> list[str]:
     def mean(method: str) -> Any:
         return lambda r: f"{np.mean([*r['returns'][method].values()]):.1f}"
 
@@ -443,17 +391,19 @@ def _transfer(folder: Path) -> list[str]:
         "share closed": "{share_of_gap:.2f} [{share_95[0]:.2f}, {share_95[1]:.2f}]",
         "goal 0.9": goal,
     }
-    if rows:
-        out.append(table(rows, columns))
-    for robot in ROBOTS[:3]:
-        if not any(r["name"].startswith(robot) for r in rows):
-            out.append(not_run(f"transfer --robot {robot}"))
-    if any("_joint" in r["name"] for r in rows):
-        out.append(
-            "`_jointN`: the policy goes on training inside the search, N steps of all "
-            "environments a generation, which are taken off the final training."
-        )
-    return out
+    rows = [
+        {"name": name.removeprefix("transfer_"), **r}
+        for files in found.values()
+        for name, r in files.items()
+    ]
+    return [table(rows, columns)]
+
+
+def _joint(_: Any) -> list[str]:
+    return [
+        "`_jointN`: the policy goes on training inside the search, N steps of all "
+        "environments a generation, which are taken off the final training."
+    ]
 
 
 def _real(r: Any) -> list[str]:
@@ -481,15 +431,53 @@ def _real(r: Any) -> list[str]:
 
 SECTIONS = (
     Section("## Speed", "speed.json", "speed", _speed),
-    _physics,
-    _robots,
-    _own_robot,
+    Section(
+        "## Physics of every robot",
+        {name: f"physics_{name}.json" for name in GOALS},
+        "physics --robots {name}",
+        _physics,
+    ),
+    Section(
+        "",
+        {name: f"accuracy_{name}.json" for name in ACCURATE},
+        "accuracy --robots {name}",
+        _accuracy,
+    ),
+    Section(
+        *("## Searches on the other robots", "search_*.json", "robots --part time"),
+        _times,
+    ),
+    Section("", "memory_*.json", "robots --part memory", _memory),
+    Section(
+        "",
+        {(r, s): f"robots_{r}_{s}.json" for r in ROBOTS for s in STARTS},
+        "robots --udr RUN_OF_{name[0]} --starts {name[1]}",
+        _found,
+    ),
+    Section("## A robot of one's own", "own_robot.json", "own_robot", _own_robot),
     Section(
         *("## Policies of the other robots", "policies_*.json", "policies", _policies)
     ),
-    _recovery,
-    coverage_summary.section,
-    _transfer,
+    Section(
+        "## Recovery of known Cartpole parameters",
+        {name: f"recovery_{name}.json" for name in CASES},
+        "recovery --cases {name}",
+        _recovery,
+    ),
+    *coverage_summary.SECTIONS,
+    Section(
+        "## Transfer: return in a target unlike the model",
+        {f"{factor:g}": f"transfer_kp_x{factor:g}*.json" for factor in FACTORS},
+        "transfer --factors {name}",
+        _transfer,
+    ),
+    Section(
+        "",
+        {robot: f"transfer_{robot}*_x*.json" for robot in ROBOTS[:3]},
+        "transfer --robot {name}",
+        _transfer,
+    ),
+    Section("", "transfer_kp_*_joint*.json", "transfer --joint 10", _joint),
     Section("## Real cart-pole", "real_cartpole.json", "real_cartpole", _real),
     Section(*("## MuJoCo's features", "parity.json", "parity", parity.paragraphs)),
     Section("## Hostile and broken files", "fuzz.json", "fuzz", _fuzz),
@@ -497,17 +485,12 @@ SECTIONS = (
     Section(
         *("## Same result on other devices", "devices_*.json", "devices", _devices)
     ),
-    crash_summary.faults,
-    crash_summary.crashes,
-    crash_summary.soak,
-    gap_summary.generated,
-    gap_summary.real,
-    gap_summary.times,
-    gap_summary.loop,
-    paper_tables.sections,
-    rivals_summary.section,
-    scaling_summary.growth,
-    Section("", "lines.json", "lines", lines.paragraphs),
+    *crash_summary.SECTIONS,
+    *gap_summary.SECTIONS,
+    *paper_tables.SECTIONS,
+    *rivals_summary.SECTIONS,
+    *scaling_summary.SECTIONS,
+    Section("## Lines by package", "lines.json", "lines", lines.paragraphs),
 )
 
 

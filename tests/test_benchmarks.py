@@ -1,6 +1,8 @@
 """The page of results says what the files say, also of what was not run."""
 
+import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ import pytest
 
 from benchmarks import gap_score, lines, summary, transfer
 from benchmarks._common import RESULTS
+from benchmarks._page import Section
 from easi_jax.errors import UserError
 from envs import make
 from train._command import main
@@ -32,7 +35,19 @@ def test_nothing_run_is_said(tmp_path: Path) -> None:
     text = page(tmp_path)
     for command in ("speed", "recovery --cases free_clean", "transfer --factors 0.25"):
         assert f"Not run: `python -m benchmarks.{command}" in text
-    assert "met" not in text.replace("parameters", "")
+    assert re.search(r"\bmet\b|missed", text) is None
+
+
+def test_of_several_sources_what_is_missing_is_named(tmp_path: Path) -> None:
+    some = {"a": "rate_a.json", "b": "rate_b.json", "rest": "more_*.json"}
+    section = Section("## Rates", some, "rate --robot {name}", lambda f: [str(f)])
+    (tmp_path / "rate_b.json").write_text('{"rate": 0}')
+    missing = [f"Not run: `python -m benchmarks.rate --robot {x}`." for x in "ab"]
+    rest = "Not run: `python -m benchmarks.rate --robot rest`."
+    assert section(tmp_path) == ["## Rates", missing[0], rest, "{'b': {'rate': 0}}"]
+    (tmp_path / "rate_b.json").unlink()
+    assert section(tmp_path) == ["## Rates", *missing, rest]
+    assert dataclasses.replace(section, source="c.jsonl", optional=True)(tmp_path) == []
 
 
 @pytest.mark.parametrize(("ratio", "said"), [(5.0, "| 4 | met |"), (2.0, "**missed**")])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks import coverage, coverage_summary
+from benchmarks._page import shown
 from easi_jax.estimation.identifiability import identifiability
 from envs import make
 
@@ -61,7 +62,7 @@ def test_the_page_counts_what_is_inside(tmp_path: Path) -> None:
             row[way] = {"distance": size**2 * square, "bound": 2.25 * square}
         lines.append(json.dumps(row))
     (tmp_path / "coverage.jsonl").write_text("\n".join(lines) + "\n")
-    text = "\n".join(coverage_summary.section(tmp_path))
+    text = "\n".join(shown(coverage_summary.SECTIONS, tmp_path))
     rows = {
         w: next(x for x in text.splitlines() if f"| {w} |" in x) for w in coverage.WAYS
     }
@@ -90,7 +91,7 @@ def test_what_is_stated_of_the_unseen_is_counted(tmp_path: Path) -> None:
     ):
         row["determined"] = seen
         (tmp_path / "coverage.jsonl").write_text(json.dumps(row) + "\n")
-        assert said in "\n".join(coverage_summary.section(tmp_path))
+        assert said in "\n".join(shown(coverage_summary.SECTIONS, tmp_path))
 
 
 @pytest.mark.slow
@@ -106,7 +107,7 @@ def test_a_limit_that_no_piece_meets_is_not_stated_as_known(tmp_path: Path) -> N
 
 
 def test_nothing_run_is_said(tmp_path: Path) -> None:
-    assert "Not run" in coverage_summary.section(tmp_path)[-1]
+    assert "Not run" in shown(coverage_summary.SECTIONS, tmp_path)[-1]
 
 
 def test_late_targets_have_a_table_of_their_own(tmp_path: Path) -> None:
@@ -119,7 +120,7 @@ def test_late_targets_have_a_table_of_their_own(tmp_path: Path) -> None:
         row[coverage.WAYS[-1]] = {"distance": square, "bound": 100.0 * square}
         lines.append(json.dumps(row))
     (tmp_path / "coverage_late.jsonl").write_text("\n".join(lines) + "\n")
-    said = coverage_summary.section(tmp_path)[-1].splitlines()[-1]
+    said = shown(coverage_summary.SECTIONS, tmp_path)[-1].splitlines()[-1]
     late, count, *shares, ratio = [x.strip() for x in said.strip("|").split("|")]
     assert (late, count) == ("5 ms", "100")
     plain, stated = (

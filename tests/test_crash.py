@@ -8,8 +8,8 @@ from unittest.mock import MagicMock
 import pytest
 
 from benchmarks import crash_summary, faults, soak
+from benchmarks._page import shown
 from benchmarks.crash import Cell, Jobs, differences, started
-from benchmarks.crash_summary import crashes
 from tests.commands import command
 
 RESULT = {"returns": {"UDR": 1.25}, "seconds": 3.0}
@@ -58,13 +58,13 @@ def test_a_process_is_killed_at_its_moment(
 
 
 def test_what_was_not_run_and_what_went_wrong_is_said(tmp_path: Path) -> None:
-    assert "Not run" in "".join(crashes(tmp_path))
+    assert "Not run" in "".join(shown(crash_summary.SECTIONS, tmp_path))
     row = {"command": "gap", "checkpoints": 2, "different": []}
     lost = {**row, "key": "gap, kill 1", "different": ["gap.json"]}
     rows = [{**r, "versions": {"commit": "0123456789"}} for r in (row, lost)]
     text = "".join(json.dumps(r) + "\n" for r in rows)
     (tmp_path / "crash.jsonl").write_text(text)
-    page = "\n".join(crashes(tmp_path))
+    page = "\n".join(shown(crash_summary.SECTIONS, tmp_path))
     assert "| train.gap | 2 | 2 | 1 | gap, kill 1: gap.json |" in page
     assert "| train.udr | not run |" in page
 
@@ -87,9 +87,10 @@ def test_tests_of_faults_are_counted(tmp_path: Path) -> None:
     told = {"command": "x", "versions": {"commit": "0123456789"}, "counts": counts}
     (tmp_path / "faults.json").write_text(json.dumps(told))
     (tmp_path / "fuzz.json").write_text('{"total": {"cases": 9, "failed": 1}}')
-    page = "\n".join(crash_summary.faults(tmp_path))
+    page = "\n".join(shown(crash_summary.SECTIONS, tmp_path))
     assert "| a disk | tests | 2 | 1 |" in page
     assert "| `benchmarks.fuzz` | 9 | 8 |" in page
+    assert "Not run: `python -m benchmarks.crash`." in page
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from benchmarks import paper, paper_tables
+from benchmarks._page import shown
 from benchmarks.paper import Config, cells
 from benchmarks.paper_cells import WARM, Cell
 from envs import make
@@ -78,7 +79,7 @@ def row(method: str, target: str, seed: int, **values: Any) -> dict[str, Any]:
 def page(folder: Path, *rows: dict[str, Any]) -> str:
     text = "".join(json.dumps(r) + "\n" for r in rows)
     (folder / "paper.jsonl").write_text(text)
-    return "\n\n".join(paper_tables.sections(folder))
+    return "\n\n".join(shown(paper_tables.SECTIONS, folder))
 
 
 def test_table_1_shows_every_seed_and_the_share_of_the_way(tmp_path: Path) -> None:
@@ -273,7 +274,7 @@ def test_twins_are_never_called_hardware(tmp_path: Path) -> None:
 
 
 def test_nothing_run_is_said(tmp_path: Path) -> None:
-    assert "Not run" in paper_tables.sections(tmp_path)[-1]
+    assert "Not run" in shown(paper_tables.SECTIONS, tmp_path)[-1]
     assert paper_tables.figures(tmp_path) == {}
 
 

@@ -12,10 +12,11 @@ import pytest
 
 from benchmarks import rivals
 from benchmarks._cells import Share, read_rows, run_cells
+from benchmarks._page import shown
 from benchmarks.gap_first import own, runs
 from benchmarks.rigs import RIGS
 from benchmarks.rival_cells import BUDGETS, Cell, method_of, score
-from benchmarks.rivals_summary import best_rival, section, verdict
+from benchmarks.rivals_summary import SECTIONS, best_rival, verdict
 from easi_jax.baselines import Identified
 from easi_jax.errors import UserError
 from easi_jax.io.logs.reader import read_logs, write_log
@@ -127,7 +128,7 @@ def test_the_page_says_who_is_ahead(tmp_path: Path) -> None:
     assert best_rival(rows, "clean") is None
     out = tmp_path / "rivals.jsonl"
     out.write_text("".join(json.dumps(r) + "\n" for r in rows))
-    text = "\n".join(section(tmp_path))
+    text = "\n".join(shown(SECTIONS, tmp_path))
     assert "| EASI | not run | 0.06 (0.05, 0.06, 0.07); in 3 of 3 | not run |" in text
     assert "| CMA-ES | not run | 0.12 (0.12, 0.12, 0.12); in 0 of 3 |" in text
     # Where there is nothing to be found it is not tried.
@@ -136,7 +137,8 @@ def test_the_page_says_who_is_ahead(tmp_path: Path) -> None:
     late = [line(m, 0, e, "effect") for m, e in (("EASI", 0.9), ("NPE", 0.5))]
     late.append(line("EASI after train.gap", 0, 0.08, "effect"))
     out.write_text("".join(json.dumps(r) + "\n" for r in late))
-    told = next(x for x in "\n".join(section(tmp_path)).splitlines() if "- effect" in x)
+    lines = "\n".join(shown(SECTIONS, tmp_path)).splitlines()
+    told = next(x for x in lines if "- effect" in x)
     assert "**NPE ahead**" in told and "start is nearer (0.3)" in told
     assert told.endswith("; EASI after train.gap 0.08")
     assert "paired: EASI ahead, 0.06 against 0.12 of CMA-ES" in text
@@ -148,7 +150,7 @@ def test_the_page_says_who_is_ahead(tmp_path: Path) -> None:
     assert "both exact" in verdict("NPE", 1e-5, 1e-4)
     rows[1]["simulated"] = 4_500_000
     out.write_text("".join(json.dumps(r) + "\n" for r in rows))
-    text = "\n".join(section(tmp_path))
+    text = "\n".join(shown(SECTIONS, tmp_path))
     assert "Beyond the budget of 3 million: EASI in 1 of 3 cells, up to 4.5." in text
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import scaling, scaling_summary
+from benchmarks._page import shown
 from envs import make
 
 SMALL = scaling.Config(
@@ -42,7 +43,7 @@ def test_a_stopped_run_goes_on(tmp_path: Path, counted: list) -> None:
     del counted[:]
     scaling.run(config)
     assert counted == [{"population": 16}, *rest]
-    (text,) = [t for t in scaling_summary.growth(tmp_path) if "| 8 |" in t]
+    (text,) = [t for t in shown(scaling_summary.SECTIONS, tmp_path) if "| 8 |" in t]
     assert "0.5 (2,000)" in text and text.count("cartpole, ") == 1
 
 
@@ -54,7 +55,7 @@ def test_every_part_of_a_go2() -> None:
 
 
 def test_what_was_not_run_is_said(tmp_path: Path) -> None:
-    assert "Not run" in scaling_summary.growth(tmp_path)[1]
+    assert "Not run" in shown(scaling_summary.SECTIONS, tmp_path)[1]
 
 
 def test_more_machines_on_paper(tmp_path: Path) -> None:
@@ -84,8 +85,8 @@ def test_more_machines_on_paper(tmp_path: Path) -> None:
             json.dumps(r | known | {"control_steps_per_s": 1.0}) + "\n" for r in rows
         )
     )
-    shown = "\n".join(scaling_summary.growth(tmp_path))
-    assert "| ant, 2 virtual devices on 1 cores | 0.2 (1) | 0.3 (1) |" in shown
+    page = "\n".join(shown(scaling_summary.SECTIONS, tmp_path))
+    assert "| ant, 2 virtual devices on 1 cores | 0.2 (1) | 0.3 (1) |" in page
     drawn = scaling_summary.figures(tmp_path)["scaling.svg"]
     assert "ant, 2 virtual devices on 1 cores" in drawn and ">2000<" in drawn
 
