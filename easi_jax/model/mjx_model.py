@@ -4,6 +4,7 @@ import contextlib
 import copy
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import flax.struct
@@ -67,47 +68,65 @@ class Model:
         def replace(self, **changes: Any) -> "Model": ...
 
 
+# What MJX carries from step to step, or is given with each.
+_CARRIED = ("TIME", "QPOS", "QVEL", "ACT", "WARMSTART", "CTRL", "QFRC_APPLIED")
+_CARRIED += ("XFRC_APPLIED", "EQ_ACTIVE", "MOCAP_POS", "MOCAP_QUAT", "USERDATA")
+# Other state that MuJoCo carries: one step from a fresh start does not show it.
+_STATE_WORDS = {
+    "HISTORY": (
+        "actuator or sensor delay (delay, nsample)",
+        "take it out; a delay can be found and fixed as an effect "
+        "(effect.delay.ACTUATOR)",
+    ),
+    "PLASTIC": ("springs that yield (springyield)", "take springyield out"),
+    "PLUGIN": ("plugins", "take them out"),
+}
+
+# Numbers of a model that MJX ignores without a word where they are not zero: what they
+# are, and what to do. What it refuses by itself is not here, nor what it computes
+# wrongly: that the guard finds (`easi_jax.simulation.guard`).
+_IGNORED: tuple[tuple[tuple[str, ...], str, str], ...] = (
+    (("nplugin",), "plugins", "take them out"),
+    (
+        ("actuator_damping", "actuator_armature", "actuator_dampingpoly"),
+        "actuator damping or armature",
+        "give both to the joint",
+    ),
+    (
+        (
+            *("jnt_stiffnesspoly", "dof_dampingpoly"),
+            *("tendon_stiffnesspoly", "tendon_dampingpoly"),
+        ),
+        "polynomial stiffness or damping",
+        "keep the first number only",
+    ),
+    (("opt.disableactuator",), "actuatorgroupdisable", "take these actuators out"),
+    (("opt.noslip_iterations",), "noslip_iterations", "set it to 0"),
+    (("flg_surfacevel",), "surface velocity", "take it out"),
+    (("geom_adhesion", "pair_adhesion"), "adhesion of geoms", "take it out"),
+)
+
+
 def _unsupported(m: mujoco.MjModel) -> tuple[str, str] | None:
     """What MJX would ignore without a word, and what to do."""
+    if m.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        return "sleeping bodies", "take this flag out of <option>"
+    for i in range(int(mujoco.mjtState.mjNSTATE)):
+        part = mujoco.mjtState(1 << i)
+        name = part.name.removeprefix("mjSTATE_")
+        if name not in _CARRIED and mujoco.mj_stateSize(m, part):
+            unknown = (f"state ({name.lower()})", "take what has it out")
+            return _STATE_WORDS.get(name, unknown)
+    for fields, what, do in _IGNORED:
+        if any(np.any(attrgetter(field)(m)) for field in fields):
+            return what, do
+    motors = m.actuator_dyntype == mujoco.mjtDyn.mjDYN_DCMOTOR  # refused by MJX itself
+    if np.any(m.actuator_actearly[~motors]):
+        return 'actearly="true"', "take it out"
     fluid = m.opt.density > 0 or m.opt.viscosity > 0
-    actuator_extra = (m.actuator_damping, m.actuator_armature, m.actuator_dampingpoly)
-    poly = (m.jnt_stiffnesspoly, m.dof_dampingpoly)
-    poly += (m.tendon_stiffnesspoly, m.tendon_dampingpoly)
-    motors = m.actuator_dyntype == mujoco.mjtDyn.mjDYN_DCMOTOR
-    checks = (
-        (
-            m.nhistory > 0,
-            "actuator or sensor delay (delay, nsample)",
-            "take it out; a delay can be found and fixed as an effect "
-            "(effect.delay.ACTUATOR)",
-        ),
-        (m.nplugin > 0, "plugins", "take them out"),
-        (np.any(motors), "dcmotor actuators", "write them as <motor> or <position>"),
-        (
-            any(np.any(x) for x in actuator_extra),
-            "actuator damping or armature",
-            "give both to the joint",
-        ),
-        (
-            any(np.any(x) for x in poly),
-            "polynomial stiffness or damping",
-            "keep the first number only",
-        ),
-        (np.any(m.actuator_actearly), 'actearly="true"', "take it out"),
-        (m.opt.noslip_iterations > 0, "noslip_iterations", "set it to 0"),
-        (bool(m.flg_surfacevel), "surface velocity", "take it out"),
-        (
-            fluid and np.any(m.geom_fluid[:, 0] > 0),
-            'fluidshape="ellipsoid"',
-            'set fluidshape="none"',
-        ),
-        (
-            np.any(m.geom_gap) or np.any(m.pair_gap),
-            "contact gap",
-            "set it to 0 and take it off the margin",
-        ),
-    )
-    return next(((what, do) for found, what, do in checks if found), None)
+    if fluid and np.any(m.geom_fluid[:, 0]):
+        return 'fluidshape="ellipsoid"', 'set fluidshape="none"'
+    return None
 
 
 # Words in what MJX says, and what to do then; the first that fits counts.

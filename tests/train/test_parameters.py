@@ -88,11 +88,11 @@ def test_a_file_is_not_replaced_unasked(
 REFUSED = {
     "dcmotor": (
         '<dcmotor joint="swing" motorconst="0.1" resistance="1"/>',
-        "dcmotor actuators, which MJX does not simulate: write them as <motor>",
+        "mjBIAS_DCMOTOR: 3>] not supported: use --engine mujoco or --engine auto",
     ),
     "delay": (
         '<position joint="swing" kp="3" delay="0.01" nsample="6"/>',
-        "(history)",
+        "delay, nsample",
     ),
     "pid": ('<pid joint="swing" kp="2"/>', "several commands"),
     "no xml": ("<motor joint='swing' <", "MuJoCo cannot read this model"),

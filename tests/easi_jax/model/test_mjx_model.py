@@ -336,12 +336,14 @@ LENGTH_FIELDS = (
         ('<joint name="pole"', '<joint name="pole" damping="1 2"', "polynomial"),
         ('timestep="0.002"', 'timestep="0.002" noslip_iterations="3"', "noslip"),
         ('<velocity name="wheel"', '<velocity name="wheel" armature="1"', "armature"),
-        ('type="plane"', 'type="plane" gap="0.01"', "gap"),
+        ('type="plane"', 'type="plane" adhesion="2"', "adhesion of geoms"),
+        ('timestep="0.002"', 'timestep="0.002" actuatorgroupdisable="1"', "groupdis"),
+        ('<joint name="pole"', '<joint name="pole" springyield="1"', "springyield"),
         ('dyntype="filterexact"', 'dyntype="filterexact" actearly="true"', "actearly"),
         (
             "<velocity",
             '<dcmotor joint="cart" motorconst="0.1" resistance="1"/><velocity',
-            "dcmotor.*<motor>",
+            "DCMOTOR.*<motor>",
         ),
         ("<velocity", '<adhesion body="pole" ctrlrange="0 1"/><velocity', "joint="),
         (
