@@ -109,8 +109,6 @@ _IGNORED: tuple[tuple[tuple[str, ...], str, str], ...] = (
 
 def _unsupported(m: mujoco.MjModel) -> tuple[str, str] | None:
     """What MJX would ignore without a word, and what to do."""
-    if m.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
-        return "sleeping bodies", "take this flag out of <option>"
     for i in range(int(mujoco.mjtState.mjNSTATE)):
         part = mujoco.mjtState(1 << i)
         name = part.name.removeprefix("mjSTATE_")
@@ -172,6 +170,25 @@ def refusals(*kinds: type[Exception]) -> Iterator[None]:
         ) from error
 
 
+def simulated(m: mujoco.MjModel) -> None:
+    """Refuses what no engine here simulates.
+
+    Raises:
+        UserError: what it is, and what to do.
+    """
+    shared = mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_IPC
+    if m.opt.enableflags & shared:
+        raise UserError(
+            "the model enables sleep or ipc, whose state no engine here carries: take "
+            "this flag out of <option> in the model file"
+        )
+    if len(m.actuator_trntype) != m.nu:
+        raise UserError(
+            "an actuator has several commands (<pid>), and here each has one: write it "
+            "as <position> or <motor>"
+        )
+
+
 def put_model(
     mj_model: mujoco.MjModel,
     addresses_per_parameter: Iterable[Iterable[str]] = (),
@@ -197,6 +214,7 @@ def put_model(
         UserError: an address that does not fit the model; or the model uses what MJX
             cannot simulate or would ignore, by name.
     """
+    simulated(mj_model)
     per_parameter = tuple(tuple(a) for a in addresses_per_parameter)
     ignored = None if native else _unsupported(mj_model)
     if ignored is not None:
@@ -244,12 +262,6 @@ def put_model(
 
 def _put_native(opened: mujoco.MjModel, writers: Iterable[Writer]) -> NativeModel:
     """The model for MuJoCo C, which must not take shortcuts that a parameter undoes."""
-    shared = mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_IPC
-    if opened.opt.enableflags & shared:
-        raise UserError(
-            "the model enables sleep or ipc, whose state no engine here carries: take "
-            "this flag out of <option> in the model file"
-        )
     # What diverges is told, not put back to its start.
     opened.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     bodies = sorted({w.body(opened) for w in writers if w.row.moves_center})

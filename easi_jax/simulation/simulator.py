@@ -17,7 +17,13 @@ from easi_jax.model import effects
 from easi_jax.model.addresses import describe
 from easi_jax.model.contact_pairs import Pair
 from easi_jax.model.joint_space import Configuration, tangent_names
-from easi_jax.model.mjx_model import Model, Sense, put_model, with_parameters
+from easi_jax.model.mjx_model import (
+    Model,
+    Sense,
+    put_model,
+    simulated,
+    with_parameters,
+)
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.torque_speed import TorqueSpeed
 from easi_jax.simulation import native_step
@@ -72,6 +78,7 @@ class Simulator:
         engine: Engine | None = None,
         logged: Logged | None = None,
     ) -> None:
+        simulated(mj_model)
         self.mj_model, self.space, self.fixed = mj_model, space, dict(fixed or {})
         self.logged = logged
         self.engine: Engine = resolved(engine, mj_model, logged, lambda: self._apart)

@@ -9,6 +9,7 @@ import numpy as np
 
 from easi_jax.errors import UserError
 from easi_jax.model.joint_space import given_name
+from easi_jax.model.mjx_model import simulated
 
 _HELD = "held_base"  # custom text and number of a model whose base was held
 _LISTED = 6  # new names in the note
@@ -103,7 +104,9 @@ def as_read(path: Path, like: mujoco.MjModel | None = None) -> mujoco.MjSpec:
         ValueError: MuJoCo cannot read it.
     """
     spec = mujoco.MjSpec.from_file(str(path))
-    m = named(spec, spec.compile())
+    m = spec.compile()
+    simulated(m)
+    m = named(spec, m)
     if like is not None and held_joint(like) and not held_joint(m):
         b = held_body(like)
         hold(spec, m, np.concatenate([like.body_pos[b], like.body_quat[b]]))

@@ -14,7 +14,7 @@ import numpy as np
 from easi_jax.errors import UserError
 from easi_jax.io.files import os_reason, regular_file
 from easi_jax.io.models.completed import as_read, held_joint, hold, names_note
-from easi_jax.model.mjx_model import put_model
+from easi_jax.model.mjx_model import put_model, simulated
 from easi_jax.simulation import engine
 
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
@@ -68,11 +68,7 @@ def read_mjcf(
     with mujoco_warnings() as said:
         try:
             model = mujoco.MjModel.from_xml_path(str(path))
-            if len(model.actuator_trntype) != model.nu:
-                raise UserError(
-                    "an actuator has several commands (<pid>), and here each has one: "
-                    "write it as <position> or <motor>"
-                )
+            simulated(model)
             note = names_note(model)
             if note or held:
                 spec = as_read(path)
@@ -293,8 +289,9 @@ def read_machine(
     if model.nv == 0:
         raise UserError(f"{path}: the model has no joint, so nothing can be identified")
     try:
-        native = logged or engine.resolved(None, model) == "mujoco"
-        put_model(model, sensors=False, native=native)
+        if not logged:
+            native = engine.resolved(None, model) == "mujoco"
+            put_model(model, sensors=False, native=native)
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
     return model
