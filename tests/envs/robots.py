@@ -74,6 +74,8 @@ def converged(env: Any) -> Simulator:
     """The robot with a solver that goes to the end, as C's does below."""
     m = env.mj_model.__copy__()
     m.opt.iterations = 100
+    if env.simulator.engine == "mujoco":
+        m.opt.ls_iterations, m.opt.tolerance = 50, 1e-14
     return env.simulator.rebuilt(m)
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from easi_jax.errors import UserError
 from easi_jax.pipeline.stages import Pipeline, PipelineConfig
+from easi_jax.simulation import engine
 from envs import make, open_env
 from envs.go2 import MOTOR, motor_curve
 
@@ -31,12 +32,15 @@ def test_the_curve_is_flat_then_falls_to_nothing_and_brakes_at_any_speed() -> No
     np.testing.assert_allclose(knee, braking * 45.43 / 23.7, rtol=1e-6)
 
 
-@pytest.fixture(scope="module")
-def kicked() -> Any:
+@pytest.fixture(
+    scope="module", params=["mujoco", pytest.param("mjx", marks=pytest.mark.slow)]
+)
+def kicked(request: pytest.FixtureRequest) -> Any:
     """States of a Go2 thrown into the air with fast joints, strong commands."""
     out = {}
     for curve in (False, True):
-        env = make("go2", torque_speed=curve)
+        with engine.using(request.param):
+            env = make("go2", torque_speed=curve)
         qpos, qvel = _start(env)
         model = env.model()
         step = jax.jit(env.simulator.step)
@@ -59,7 +63,6 @@ def _commands(env: Any) -> np.ndarray:
     return np.array([low if k % 2 else high for k in range(5)])
 
 
-@pytest.mark.slow
 def test_equals_mujoco_c_with_limits_set_before_each_step(kicked: Any) -> None:
     env = make("go2")
     m, d = env.mj_model, mujoco.MjData(env.mj_model)
@@ -99,8 +102,9 @@ def test_options_by_name_and_their_mistakes() -> None:
 
 
 def test_a_search_simulates_the_motors_too() -> None:
-    env = make("go2", torque_speed=True)
-    pipe = Pipeline(env, PipelineConfig(), start=(0.5, 2.0))
+    with engine.using("mujoco"):
+        env, ant = make("go2", torque_speed=True), make("ant")
+        pipe = Pipeline(env, PipelineConfig(), start=(0.5, 2.0))
+        other = Pipeline(ant, PipelineConfig())
     assert pipe.simulator.base.torque_speed is not None
-    ant = Pipeline(make("ant"), PipelineConfig())
-    assert ant.simulator.base.sense_size == make("ant").simulator.base.sense_size > 0
+    assert other.simulator.base.sense_size == ant.simulator.base.sense_size > 0

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from easi_jax.simulation import engine
 from easi_jax.simulation.rollout import policy_rollout
-from tests.envs.robots import CASES, c_rollout, converged
+from tests.envs.robots import CASES, Case, c_rollout, converged
 from train._robots import search_config
 
 CHANGE = 1.4  # of a parameter, against C
@@ -26,7 +27,7 @@ class Runs:
     Attributes:
         env: the robot.
         thetas: parameters, ``(1 + n, n)``, the first nominal.
-        ours, theirs: states ``(1 + n, T, nq + nv)`` of MJX and of MuJoCo C.
+        ours, theirs: states ``(1 + n, T, nq + nv)`` of a simulator and of MuJoCo C.
     """
 
     env: Any
@@ -35,15 +36,35 @@ class Runs:
     theirs: np.ndarray
 
 
-def either(names: Iterable[str], *slow: str) -> list[Any]:
-    """All ``names``, of which these take a minute to compile."""
-    return [pytest.param(n, marks=pytest.mark.slow) if n in slow else n for n in names]
+QUICK = ("cartpole", "two_link")  # MJX compiles them in seconds, others in a minute
 
 
-@pytest.fixture(scope="module", params=either(CASES, "ant", "ballbalance", "go2_full"))
+def engines(names: Iterable[str]) -> list[Any]:
+    """Each of ``names`` with each engine."""
+    return [
+        pytest.param(
+            (name, which),
+            id=f"{name}-{which}",
+            marks=[pytest.mark.slow] if which == "mjx" and name not in QUICK else [],
+        )
+        for name in names
+        for which in ("mujoco", "mjx")
+    ]
+
+
+def made(case: Case, which: str) -> Any:
+    """Its robot. MJX is the default, and then compared with MuJoCo C only here."""
+    if which == "mjx":
+        return case.make()
+    with engine.using(which):
+        return case.make()
+
+
+@pytest.fixture(scope="module", params=engines(CASES))
 def runs(request: pytest.FixtureRequest) -> Runs:
-    case = CASES[request.param]
-    env = case.make()
+    name, which = request.param
+    case = CASES[name]
+    env = made(case, which)
     rng = np.random.default_rng(1)
     hold = max(1, round(0.1 / env.dt))
     count = -(-case.steps // hold)
@@ -52,11 +73,11 @@ def runs(request: pytest.FixtureRequest) -> Runs:
     nominal = env.space.nominal
     factors = 1 + (CHANGE - 1) * np.eye(env.space.size)
     thetas = np.concatenate([nominal[None], nominal * factors])
+    first = env.reset(env.model(), jax.random.key(2)).physics
+    start = case.start or (first.qpos, first.qvel)
+    qpos, qvel = (np.asarray(x, float) for x in start)
     with jax.enable_x64(True):
         simulator = converged(env)
-        first = env.reset(env.model(), jax.random.key(2)).physics
-        start = case.start or (first.qpos, first.qvel)
-        qpos, qvel = (np.asarray(x, float) for x in start)
 
         @jax.jit
         def simulate(thetas: jax.Array, ctrl: jax.Array) -> jax.Array:
@@ -97,14 +118,12 @@ def test_every_parameter_moves_the_rollout(runs: Runs) -> None:
 
 
 # Go2's 25 parameters reach no further than its 8 do.
-@pytest.fixture(
-    scope="module",
-    params=either((c for c in CASES if c != "go2_full"), "ant", "ballbalance", "go2"),
-)
+@pytest.fixture(scope="module", params=engines(c for c in CASES if c != "go2_full"))
 def episodes(request: pytest.FixtureRequest) -> Any:
     """Random actions from a reset, at random corners of the parameter box."""
-    case = CASES[request.param]
-    env = case.make()
+    name, which = request.param
+    case = CASES[name]
+    env = made(case, which)
     steps = min(case.steps, 60)
 
     def act(obs: jax.Array, key: jax.Array) -> jax.Array:

@@ -74,7 +74,7 @@ def test_folder_of_udr(chain: Path) -> None:
     assert _restored(chain / "udr", "train").step == LAST
 
 
-@pytest.mark.parametrize("kept", [24, LAST])
+@pytest.mark.parametrize("kept", [24, pytest.param(LAST, marks=pytest.mark.slow)])
 @pytest.mark.fault("killed (signal 9), then resumed")
 def test_killed_training_goes_on_bit_equal(
     chain: Path, tmp_path: Path, kept: int

@@ -173,7 +173,11 @@ COARSE = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbo
 </worldbody><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
 
 
-@pytest.mark.parametrize("steps", [100, 5], ids=["machine", "simulation"])
+@pytest.mark.parametrize(
+    "steps",
+    [100, pytest.param(5, marks=pytest.mark.slow)],
+    ids=["machine", "simulation"],
+)
 def test_what_the_models_own_steps_do_is_no_effect(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], steps: int
 ) -> None:

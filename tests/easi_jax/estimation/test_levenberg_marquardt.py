@@ -11,6 +11,7 @@ import pytest
 from benchmarks.recovery import controller
 from benchmarks.rigs import RIGS
 from easi_jax.data.segments import Segments, cut, to_device, windows
+from easi_jax.devices.runtime import quick_compile
 from easi_jax.estimation.identifiability import identifiability
 from easi_jax.estimation.levenberg_marquardt import RefineResult, jumps, refine
 from easi_jax.model.joint_space import Configuration
@@ -33,14 +34,16 @@ def space(cartpole: Cartpole) -> ParameterSpace:
 def fit(cartpole: Cartpole, space: ParameterSpace) -> Any:
     simulator = Simulator(cartpole.mj_model, space, cartpole.dt)
 
-    @jax.jit
     def run(unit: jax.Array, seg: Segments, noise: jax.Array, more: jax.Array) -> Any:
         return refine(simulator, space, unit, seg, noise, iterations=15, others=more)
+
+    # It runs for longer than it compiles.
+    compiled = jax.jit(run, compiler_options=quick_compile())
 
     def from_all(
         unit: jax.Array, seg: Segments, noise: jax.Array, others: Any = None
     ) -> RefineResult:
-        return run(unit, seg, noise, unit[None] if others is None else others)
+        return compiled(unit, seg, noise, unit[None] if others is None else others)
 
     return from_all
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from easi_jax.data.segments import Segments
+from easi_jax.devices.runtime import quick_compile
 from easi_jax.estimation.levenberg_marquardt import RefineResult, refine
 from easi_jax.estimation.profile_score import Adjusted, adjust, less_scatter
 from easi_jax.model.parameters import ParameterSpace, declare
@@ -69,7 +70,6 @@ def fits() -> Any:
     simulator = Simulator(m, space, 0.02)
     truth = space.to_unit(jnp.asarray(space.nominal))
 
-    @jax.jit
     def run(assumed: float, spread: float) -> tuple[RefineResult, Adjusted]:
         def one(key: jax.Array) -> tuple[RefineResult, Adjusted]:
             pieces = recorded(simulator, key, jnp.asarray(spread))
@@ -79,8 +79,11 @@ def fits() -> Any:
 
         return jax.lax.map(one, jax.random.split(jax.random.key(3), _SEEDS))
 
+    # It runs for longer than it compiles.
+    compiled = jax.jit(run, compiler_options=quick_compile())
+
     def fits(assumed: float = 1.0, spread: float = _SPEED) -> Any:
-        fit, adjusted = jax.device_get(run(assumed, spread))
+        fit, adjusted = jax.device_get(compiled(assumed, spread))
         std = np.sqrt([np.diag(np.linalg.inv(x)) for x in adjusted.hessian]) / assumed
         return *((x.unit - truth) / std for x in (fit, adjusted)), adjusted.left
 
@@ -155,13 +158,13 @@ def test_a_limit_that_was_not_met_is_not_known(limit: float) -> None:
     # Of 8,000 pushes a handful is stronger than what is met from here.
     start = truth.at[2].set(0.0) if limit > 5.0 else truth
 
-    @jax.jit
     def run(key: jax.Array) -> Adjusted:
         pieces = recorded(simulator, key, jnp.asarray(_SPEED))
         return adjust(simulator, space, start, pieces, _NOISE)
 
+    compiled = jax.jit(run, compiler_options=quick_compile())
     for seed in range(3):
-        found = run(jax.random.key(seed))
+        found = compiled(jax.random.key(seed))
         told = float(found.hessian[2, 2])
         if limit > 5.0:
             assert told < 1.0, seed

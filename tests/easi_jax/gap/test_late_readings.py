@@ -82,7 +82,7 @@ def rms(error: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(np.square(error, dtype=float), axis=(1, 2)))
 
 
-@pytest.mark.parametrize("joint", ["a", "b"])
+@pytest.mark.parametrize("joint", [pytest.param("a", marks=pytest.mark.slow), "b"])
 def test_one_late_sensor_of_two_is_predicted(joint: str) -> None:
     m = mujoco.MjModel.from_xml_string(ARM.format(SECOND))
     p, _ = predictor(m, recorded(m, (0.0, 0.0)))

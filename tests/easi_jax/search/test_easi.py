@@ -179,7 +179,39 @@ SWITCHES: tuple[tuple[SearchConfig, dict[str, Any]], ...] = (
 )
 
 
+def program(config: SearchConfig) -> tuple[str, list[bytes]]:
+    """What a generation does, and the numbers it does it with."""
+    search = make(config)
+    state = search.init(jax.random.key(0), data())
+    found = jax.make_jaxpr(search.step)(state, data())
+    return str(found), [x.tobytes() for x in raw((found.consts, state))]
+
+
+@cache
+def plain_program(config: SearchConfig) -> tuple[str, list[bytes]]:
+    return program(config)
+
+
 @pytest.mark.parametrize(("base", "change"), SWITCHES, ids=lambda c: str(c)[:40])
+def test_every_switch_changes_the_program(
+    base: SearchConfig, change: dict[str, Any]
+) -> None:
+    """Which compiles nothing; the slow tests run each of them."""
+    assert program(dataclasses.replace(base, **change)) != plain_program(base)
+
+
+# Those that bring code of their own.
+RUN = ("loss", "regularizer", "strategy", "source", "delta_inputs")
+
+
+@pytest.mark.parametrize(
+    ("base", "change"),
+    [
+        pytest.param(*s, marks=[] if set(s[1]) <= set(RUN) else [pytest.mark.slow])
+        for s in SWITCHES
+    ],
+    ids=lambda c: str(c)[:40],
+)
 def test_every_switch_changes_the_result(
     base: SearchConfig, change: dict[str, Any]
 ) -> None:
