@@ -8,6 +8,7 @@ import os
 import re
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, Protocol, TypeVar
@@ -19,6 +20,7 @@ _Config = TypeVar("_Config")
 
 LOG_SECONDS = 10.0
 _NUMBER = re.compile(r"[-+]?\d|nan|-?inf|$")
+_PLACE = re.compile(r",? at (?:DOF|ACTUATOR) \d+|\s*Time = .*", re.DOTALL)
 USER_ERROR = 2
 _LONGEST = 2000  # characters of a message
 INTERRUPTED = 130
@@ -73,7 +75,7 @@ def main(
         from easi_jax.errors import UserError
 
         try:
-            with _interrupt.remembered(), _engine(config):
+            with _interrupt.remembered(), _engine(config), _warnings_told():
                 if getattr(config, "distributed", False):
                     distributed.start()
                 run(config)
@@ -108,6 +110,27 @@ def _engine(config: Any) -> Iterator[None]:
     kept = engine_of(out) if out and getattr(config, "resume", False) else None
     with engine.using(kept or config.engine, say):
         yield
+
+
+@contextlib.contextmanager
+def _warnings_told() -> Iterator[None]:
+    """Says at the end, each once, what MuJoCo warned of, which it writes on standard
+    error and to a file in the working folder otherwise. Its threads may warn, too."""
+    import mujoco
+
+    warned = Counter[str]()
+
+    def count(text: str) -> None:
+        warned[_PLACE.sub("", text)] += 1
+
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(count)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+    for text, times in warned.items():
+        say(f"note: MuJoCo warned, {times} times in all: {text}")
 
 
 def _unheard() -> NoReturn:

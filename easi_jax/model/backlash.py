@@ -71,7 +71,7 @@ def felt_inertia(m: mujoco.MjModel) -> np.ndarray:
     mujoco.mj_forward(m, d)
     full = np.zeros((m.nv, m.nv))
     mujoco.mj_fullM(m, d, full)
-    return 1.0 / np.diag(np.linalg.inv(full))
+    return 1.0 / np.diag(np.linalg.pinv(full))
 
 
 def first_rotor(scalar: npt.ArrayLike, qpos: jax.Array, qvel: jax.Array) -> MotorState:

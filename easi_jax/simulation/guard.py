@@ -523,7 +523,7 @@ def _causes(
     scales = _scale([s[1] for s in states], [b.qvel for b in theirs])
     h = m.opt.timestep
     for mine, other, (change,) in zip(ours, theirs, scales, strict=True):
-        inverse = np.linalg.inv(other.mass)
+        inverse = np.linalg.pinv(other.mass)  # two joints may be as one
 
         def effect(
             force: np.ndarray, to_change: np.ndarray = h * inverse / change

@@ -155,6 +155,20 @@ def test_joints_without_a_name(
     path.write_text(BARE.replace('name="swing" ', ""))
     call("--model", path, "--out", out)
     told = capsys.readouterr().out
-    assert told.count("note: ") == 1
+    assert told.count("without a name") == 1
     assert "1 joint without a name, called rod_joint: logs and addresses" in told
     assert "joint.rod_joint.frictionloss" in out.read_text()
+
+
+def test_warnings_of_mujoco_are_notes_and_no_file(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "play.xml"
+    joints = '<joint name="swing" axis="0 1 0"/><joint name="play" axis="0 1 0"/>'
+    path.write_text(BARE.replace('<joint name="swing" axis="0 1 0"/>', joints))
+    monkeypatch.chdir(tmp_path)
+    call("--model", path, "--out", tmp_path / "p.yaml")
+    told = capfd.readouterr()
+    assert told.out.count("MuJoCo warned") == 1 and "close to singular" in told.out
+    assert "WARNING" not in told.err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["p.yaml", "play.xml"]

@@ -92,13 +92,14 @@ def mujoco_warnings() -> Iterator[list[str]]:
     """Collects what MuJoCo warns of, which otherwise goes to a file in the working
     folder."""
     said: list[str] = []
+    before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(said.append)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield said
     finally:
-        mujoco.set_mju_user_warning(None)
+        mujoco.set_mju_user_warning(before)
 
 
 def check_assets(path: Path, allowed: Sequence[Path] = ()) -> None:
