@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import jax
@@ -88,27 +89,61 @@ def note_compilation(event: str, duration_secs: float, **more: object) -> None:
         COMPILED.append(str(more.get("fun_name")))
 
 
-@pytest.fixture(scope="module")
-def arm(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The example's command, with a small search in two chunks."""
-    out = tmp_path_factory.mktemp("arm") / "run"
+@dataclass(frozen=True)
+class Fitted:
+    """What a small search in two chunks, and a fit, wrote.
+
+    Attributes:
+        out: folder of the run.
+        truth: value of each parameter.
+        held: name of the log that is held out.
+        channels: its joints.
+        address, unit: of a parameter.
+    """
+
+    out: Path
+    truth: dict[str, float]
+    held: str
+    channels: tuple[str, ...]
+    address: str
+    unit: str
+
+
+def made(out: Path) -> Fitted:
+    """A pendulum that is damped otherwise."""
+    model, parameters = out.parent / "pendulum.xml", out.parent / "parameters.yaml"
+    model.write_text(MODEL)
+    parameters.write_text(PARAMETERS)
+    logs = [out.parent / "sweep.csv", out.parent / "moves.csv"]
+    for seed, log in enumerate(logs):
+        swing(log, damping=0.2, rows=600, noise=1e-4, seed=seed)
+    fit(out, model, parameters, *logs)
+    truth, unit = {"damping": 0.2}, "N·m·s/rad"
+    return Fitted(out, truth, "moves", ("hinge",), "joint.hinge.damping", unit)
+
+
+def arm(out: Path) -> Fitted:
+    """The example's command."""
+    logs = (EXAMPLE / "sweep.csv", EXAMPLE / "moves.csv")
+    fit(out, EXAMPLE / "model.xml", EXAMPLE / "parameters.yaml", *logs)
+    channels = ("shoulder", "elbow")
+    return Fitted(out, truth(), "moves", channels, "joint.*.armature", "kg·m²")
+
+
+def fit(out: Path, model: Path, parameters: Path, *logs: Path) -> None:
+    files = ("--model", model, "--parameters", parameters, "--data", *logs)
+    call(*files, "--out", out, "--search-chunk", 1, *SMALL)
+
+
+@pytest.fixture(
+    scope="module", params=[made, pytest.param(arm, marks=pytest.mark.slow)]
+)
+def fitted(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Fitted:
     jax.monitoring.register_event_duration_secs_listener(note_compilation)
     COMPILED.clear()
-    call(
-        "--search-chunk",
-        1,
-        "--model",
-        EXAMPLE / "model.xml",
-        "--parameters",
-        EXAMPLE / "parameters.yaml",
-        "--data",
-        EXAMPLE / "sweep.csv",
-        EXAMPLE / "moves.csv",
-        "--out",
-        out,
-        *SMALL,
-    )
-    return out
+    return request.param(tmp_path_factory.mktemp("fitted") / "run")
 
 
 def truth() -> dict[str, float]:
@@ -120,36 +155,35 @@ def truth() -> dict[str, float]:
     return {c[0].split(" ")[0]: float(c[2]) for c in rows}
 
 
-def test_example_finds_its_truth(arm):
-    found = json.loads((arm / "distribution.json").read_text())
-    wanted = truth()
+def test_the_truth_is_found(fitted: Fitted) -> None:
+    found = json.loads((fitted.out / "distribution.json").read_text())
     result = found["seeds"]["0"]
     names = [p["name"] for p in found["parameters"]]
-    assert sorted(names) == sorted(wanted)
+    assert sorted(names) == sorted(fitted.truth)
     assert result["flags"] == ["determined"] * len(names)
     for name, mean in zip(names, result["mean"], strict=True):
         # The model's timestep alone moves the rotor inertia by 7 % (README).
         tolerance = 0.09 if name == "rotor_inertia" else 0.05
-        assert mean == pytest.approx(wanted[name], rel=tolerance), name
+        assert mean == pytest.approx(fitted.truth[name], rel=tolerance), name
 
 
-def test_every_program_is_compiled_once(arm):
+def test_every_program_is_compiled_once(fitted: Fitted) -> None:
     assert COMPILED.count("jit(finish)") == 1
     assert COMPILED.count("jit(advance)") == 1
 
 
-def test_example_reports_held_out_error(arm):
-    held = json.loads((arm / "distribution.json").read_text())["held_out"]
-    assert held["what"] == "moves"
-    assert held["channels"] == ["shoulder", "elbow"]
+def test_the_held_out_error_is_reported(fitted: Fitted) -> None:
+    held = json.loads((fitted.out / "distribution.json").read_text())["held_out"]
+    assert held["what"] == fitted.held
+    assert held["channels"] == list(fitted.channels)
     for before, after, floor in zip(
         held["before"], held["after"]["0"], held["noise_floor"], strict=True
     ):
         assert before > 0.03
         assert after < 0.1 * before
         assert floor < 1.1 * after
-    page = (arm / "report.html").read_text()
-    for said in ("rotor_inertia", "joint.*.armature", "kg·m²", "moves", "<svg"):
+    page = (fitted.out / "report.html").read_text()
+    for said in (*fitted.truth, fitted.address, fitted.unit, fitted.held, "<svg"):
         assert said in page
     assert not re.search(r'(src|href)="https?:', page)
 
@@ -367,17 +401,19 @@ def test_a_fit_on_some_of_the_logs_ends_where_all_have_it(files, capsys, monkeyp
     assert std[1] == pytest.approx(std[0], rel=0.2)
 
 
-def swing(path: Path, damping: float) -> None:
-    """A log of the model, damped otherwise, with sensor noise."""
+def swing(
+    path: Path, damping: float, rows: int = 1500, noise: float = 1e-3, seed: int = 0
+) -> None:
+    """A log of the model, damped otherwise, with sensor noise [rad]."""
     m = mujoco.MjModel.from_xml_string(MODEL)
     m.dof_damping[0] = damping
-    d, rng, rows = mujoco.MjData(m), np.random.default_rng(0), []
-    for k in range(1500):
-        d.ctrl[0] = 0.8 * np.sin(0.05 * k) + 0.5 * np.sin(0.013 * k)
-        angle = d.qpos[0] + 1e-3 * rng.normal()
-        rows.append(f"{0.01 * k:.6g},{angle:.6f},{d.ctrl[0]:.6f}")
+    d, rng, lines = mujoco.MjData(m), np.random.default_rng(seed), []
+    for k in range(rows):
+        d.ctrl[0] = 0.8 * np.sin(0.05 * k + seed) + 0.5 * np.sin(0.013 * k)
+        angle = d.qpos[0] + noise * rng.normal()
+        lines.append(f"{0.01 * k:.6g},{angle:.6f},{d.ctrl[0]:.6f}")
         mujoco.mj_step(m, d)
-    path.write_text("\n".join(["time,qpos.hinge,ctrl.drive", *rows]) + "\n")
+    path.write_text("\n".join(["time,qpos.hinge,ctrl.drive", *lines]) + "\n")
 
 
 @pytest.mark.slow
