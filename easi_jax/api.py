@@ -53,6 +53,7 @@ from easi_jax.rl.seeds import train_seeds
 from easi_jax.rl.trainer import make_trainer
 from easi_jax.search.config import preset
 from easi_jax.search.easi import Search
+from easi_jax.simulation import engine as engines
 from easi_jax.simulation.simulator import Simulator
 
 PathLike = str | os.PathLike[str]
@@ -88,7 +89,8 @@ def read_model(
         return checked_array("held_base", held_base, (7,))
 
     held = None if held_base is False else pose
-    return read_machine(Path(path), tuple(Path(p) for p in allow), held=held)
+    allowed = tuple(Path(p) for p in allow)
+    return read_machine(Path(path), allowed, held=held, logged=True)
 
 
 def read_parameters(path: PathLike, model: mujoco.MjModel) -> ParameterSpace:
@@ -206,6 +208,7 @@ def search_parameters(
     noise: Sequence[float] = (),
     horizon: float | None = None,
     seed: int = 0,
+    engine: str = "auto",
 ) -> Searched:
     """EASI: the distribution of parameters under which simulation looks like the logs.
 
@@ -223,13 +226,17 @@ def search_parameters(
             m/s, rad/s]; estimated from the logs where empty.
         horizon: longest piece of a log that is simulated [s]; 0.2 where None.
         seed: of the random numbers.
+        engine: ``mjx``, ``mujoco``, or ``auto``, as the commands choose
+            (`easi_jax.simulation.engine`).
 
     Raises:
         UserError: what is wrong with the data or the options; no simulation of a
             generation stayed finite.
     """
-    problem = _problem(model, parameters, log, held_out, effects, noise, horizon)
-    return _searched(problem, generations, population, settings, seed)[1]
+    with engines.chosen(engine) as said:
+        problem = _problem(model, parameters, log, held_out, effects, noise, horizon)
+        found = _searched(problem, generations, population, settings, seed)[1]
+    return replace(found, notes=(*said, *found.notes))
 
 
 def estimate_parameters(
@@ -247,6 +254,7 @@ def estimate_parameters(
     horizon: float | None = None,
     restarts: int = 0,
     seed: int = 0,
+    engine: str = "auto",
     tell: Tell = _silent,
 ) -> Estimated:
     """Parameters and their uncertainty, by least squares from the end of a search.
@@ -262,16 +270,32 @@ def estimate_parameters(
         noise, horizon: as in `search_parameters`.
         restarts: more starts of the fit, drawn from the search's spread; the best fit
             counts.
+        engine: as in `search_parameters`.
         tell: takes a line on how far it is.
 
     Raises:
         UserError: as `search_parameters`; ``start`` is of other parameters.
     """
-    problem = _problem(model, parameters, log, held_out, effects, noise, horizon)
-    if start is None:
-        search, start = _searched(problem, generations, population, settings, seed)
-    else:
-        search = _search(problem, 1, population, settings)
+    with engines.chosen(engine, tell) as said:
+        given = model, parameters, log, held_out, effects, noise, horizon
+        problem = _problem(*given)
+        if start is None:
+            searching = generations, population, settings, seed
+            search, start = _searched(problem, *searching)
+        else:
+            search = _search(problem, 1, population, settings)
+        found = _estimated(problem, search, start, effects, restarts, tell)
+    return replace(found, notes=(*said, *found.notes))
+
+
+def _estimated(
+    problem: Problem,
+    search: Search,
+    start: Searched,
+    effects: FoundEffects | None,
+    restarts: int,
+    tell: Tell,
+) -> Estimated:
     if start.space.names != search.space.names:
         raise UserError(
             f"start is of {', '.join(start.space.names)}, parameters are "
@@ -310,6 +334,7 @@ def find_effects(
     parameters: ParameterSpace | None = None,
     held_out: Log | None = None,
     horizon: float = HORIZON,
+    engine: str = "auto",
     tell: Tell = _silent,
 ) -> GapResult:
     """Which physical effects the model lacks, and where, judged on held-out data.
@@ -321,6 +346,7 @@ def find_effects(
             stiffness that it states, each within a factor of 5.
         held_out: kept out of every fit; None: part of ``log`` is.
         horizon: of the predictions that are compared [s].
+        engine: as in `search_parameters`.
         tell: takes a line on how far it is.
 
     Returns:
@@ -332,22 +358,17 @@ def find_effects(
         UserError: data too short, too still, or that the model does not cover.
     """
     runs = measured_runs(model, log, held_out, checked_horizon(horizon))
-    analysis = Analysis(
-        model,
-        own_space(model) if parameters is None else parameters,
-        runs.fit,
-        runs.held,
-        runs.noise,
-        horizon,
-        tell=tell,
-    )
+    space = own_space(model) if parameters is None else parameters
+    given = model, space, runs.fit, runs.held, runs.noise, horizon
+    with engines.chosen(engine, tell) as said:
+        found = Analysis(*given, tell=tell).run()
     return gap_result(
-        analysis.run(),
+        found,
         model=_name(model),
         readings=reading_faults(model, runs.recorded),
         held_out=[run.name for run in runs.held],
         held_name=runs.held_name,
-        notes=[*runs.notes, *coverage_notes(model, runs.fit, runs.held)],
+        notes=[*said, *runs.notes, *coverage_notes(model, runs.fit, runs.held)],
     )
 
 
@@ -392,7 +413,7 @@ def train_policy(
 
     Args:
         env: a built-in robot (``envs.make``) or an environment of your own
-            (``envs.load``).
+            (``envs.load``), made for an engine.
         estimated: its distribution is drawn from, a sample an episode; parameters that
             it lacks keep their nominal values. None: uniform over the environment's
             own ranges.

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from easi_jax.errors import UserError, nearest
+from easi_jax.simulation.engine import chosen
 from envs.ant import Ant
 from envs.ballbalance import Ballbalance
 from envs.cartpole import Cartpole
@@ -21,8 +22,12 @@ REGISTRY: dict[str, Callable[..., Any]] = {
 }
 
 
-def make(name: str, **options: Any) -> Any:
-    """The built-in robot ``name``.
+def make(name: str, *, engine: str = "auto", **options: Any) -> Any:
+    """The built-in robot ``name``, ``options`` its own.
+
+    Args:
+        engine: ``mjx``, ``mujoco``, or ``auto``: as the commands choose
+            (`easi_jax.simulation.engine`).
 
     Raises:
         UserError: no robot of that name, or none of its options.
@@ -39,7 +44,8 @@ def make(name: str, **options: Any) -> Any:
                 f'{name} has no option "{option}" (known: '
                 f"{', '.join(known) or 'none'}){nearest(option, known)}"
             )
-    return REGISTRY[name](**options)
+    with chosen(engine):
+        return REGISTRY[name](**options)
 
 
 _NEEDED = (
@@ -48,11 +54,11 @@ _NEEDED = (
 )
 
 
-def load(path: Path) -> Any:
+def load(path: Path, *, engine: str = "auto") -> Any:
     """The environment that a Python file's ``make()`` returns.
 
     The file runs as it is, with all rights of the user; a template is
-    ``examples/my_robot/env.py``.
+    ``examples/my_robot/env.py``. ``engine``: as for `make`.
 
     Raises:
         UserError: no such file, an error in it, or an environment that lacks something.
@@ -68,7 +74,8 @@ def load(path: Path) -> Any:
         spec.loader.exec_module(module)
         if not callable(getattr(module, "make", None)):
             raise UserError(f"--env {path}: the file defines no function make()")
-        env = module.make()
+        with chosen(engine):
+            env = module.make()
     except UserError:
         raise
     except Exception as e:  # whatever the user's code does

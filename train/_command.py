@@ -94,7 +94,8 @@ def main(
             _leave_others(error)
             raise
         out = getattr(config, "out", None)
-        _stop(_interrupted(out, hasattr(config, "resume")), INTERRUPTED, args is None)
+        left = _left(out, hasattr(config, "resume"))
+        _stop(f"interrupted{left}", INTERRUPTED, args is None)
 
 
 @contextlib.contextmanager
@@ -103,13 +104,18 @@ def _engine(config: Any) -> Iterator[None]:
     if not isinstance(config, EngineOptions):
         yield
         return
+    from easi_jax.errors import UserError
     from easi_jax.io.runs.folder import engine_of
     from easi_jax.simulation import engine
 
     out = getattr(config, "out", None)
     kept = engine_of(out) if out and getattr(config, "resume", False) else None
-    with engine.using(kept or config.engine, say):
-        yield
+    try:
+        with engine.using(kept[0] if kept else config.engine, say):
+            yield
+    except engine.EngineError as error:
+        left = _left(out, hasattr(config, "resume"))
+        raise UserError(f"{error}{left}") from error
 
 
 @contextlib.contextmanager
@@ -338,20 +344,21 @@ def _line(text: str) -> str:
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in plain)
 
 
-def _interrupted(out: Path | str | None, resumable: bool) -> str:
+def _left(out: Path | str | None, resumable: bool) -> str:
+    """What a command leaves that ends before its time."""
     if out is None:
-        return "interrupted"
+        return ""
     if Path(out).suffix == ".jsonl":
-        return f"interrupted; {out} keeps the lines of all that was done"
+        return f"; {out} keeps the lines of all that was done"
     if not resumable:
-        return f"interrupted; nothing was written to {out}, start the command again"
+        return f"; nothing was written to {out}, start the command again"
     kept = any(Path(out).glob("checkpoints/**/step_*"))
     if kept:
         return (
-            f"interrupted; {out} keeps all up to the last checkpoint: the same "
-            "command with --resume goes on from there"
+            f"; {out} keeps all up to the last checkpoint: the same command with "
+            "--resume goes on from there"
         )
-    return f"interrupted before the first checkpoint; nothing to resume in {out}"
+    return f" before the first checkpoint; nothing to resume in {out}"
 
 
 def _heard() -> bool:

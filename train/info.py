@@ -1,8 +1,9 @@
-"""``python -m train.info``: versions, devices, and what protects this run."""
+"""``python -m train.info``: versions, devices, and what protects a run; its engine."""
 
 import contextlib
 import dataclasses
 import io
+from pathlib import Path
 
 from train._command import main, show_table
 
@@ -11,13 +12,22 @@ from train._command import main, show_table
 class Config:
     """Shows versions, devices and whether each runtime measure is in force."""
 
+    run: Path | None = None
+    """Folder of a run: what simulates there, and why."""
+
 
 def run(config: Config) -> None:
-    """Prints the three tables."""
+    """Prints the tables."""
     printed = _import_output()
     from easi_jax.devices import runtime
+    from easi_jax.io.runs.folder import engine_of, read_config
     from easi_jax.io.runs.versions import versions
 
+    if config.run is not None:
+        read_config(config.run)  # refuses what holds no run
+        known = engine_of(config.run) or ("not known", "no simulation was made yet")
+        rows = [("engine", known[0]), ("why", known[1])]
+        show_table(f"Run {config.run}", ("", "found"), rows)
     found = versions()
     packages = {k: v or "not installed" for k, v in found["packages"].items()}
     rows = [

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
+import jax
 import mujoco
 import numpy as np
 
@@ -19,6 +20,7 @@ from easi_jax.errors import UserError, nearest
 from easi_jax.model.contact_pairs import Pair, pair_ids
 from easi_jax.simulation.guard import Deviation, compare, random_states
 from easi_jax.simulation.logged import Logged
+from easi_jax.simulation.native import failures
 
 Engine = Literal["mjx", "mujoco"]
 CHOICES = ("auto", "mjx", "mujoco")
@@ -32,6 +34,10 @@ LARGEST = 8
 MOST_PAIRS = 4
 
 
+class EngineError(UserError):
+    """Native MuJoCo could not go on with a simulation."""
+
+
 @dataclass
 class _Choice:
     """What simulators take that are made without an engine.
@@ -40,11 +46,25 @@ class _Choice:
         name: one of `CHOICES`.
         tell: called with why ``auto`` took what it took.
         taken: engines that ``auto`` took, with the reasons.
+        write: see `recorded`.
     """
 
     name: str = "mjx"
     tell: Callable[[str], None] | None = None
     taken: dict[str, str] = field(default_factory=dict)
+    write: Callable[[str, str], None] | None = None
+
+    def told(self) -> None:
+        """Writes what there is to write."""
+        if self.write is None:
+            return
+        if self.name != "auto":
+            self.write(self.name, f"--engine {self.name}")
+        elif len(self.taken) == 1:
+            self.write(*next(iter(self.taken.items())))
+        elif self.taken:
+            both = "; ".join(f"{name}: {why}" for name, why in self.taken.items())
+            self.write("auto", both)
 
 
 _stack = [_Choice()]
@@ -60,27 +80,55 @@ def using(name: str, tell: Callable[[str], None] | None = None) -> Iterator[None
 
     Raises:
         UserError: not one of `CHOICES`.
+        EngineError: a call of native MuJoCo inside raised something.
     """
     if name not in CHOICES:
         raise UserError(
             f'engine "{name}": give one of {", ".join(CHOICES)}{nearest(name, CHOICES)}'
         )
     _stack.append(_Choice(name, tell))
+    failures.clear()
     try:
         yield
+    except jax.errors.JaxRuntimeError as error:  # in which jax wraps it as a text
+        if not failures:
+            raise
+        what = failures[0]
+        raise EngineError(
+            f"the engine mujoco failed in a simulation: {type(what).__name__}: {what}"
+        ) from error
     finally:
         _stack.pop()
 
 
-def taken() -> str | None:
-    """The engine inside `using`: given, or what ``auto`` took; None outside, and where
-    no simulator was made, or of both engines."""
-    choice = _stack[-1]
-    if len(_stack) == 1:
-        return None
-    if choice.name != "auto":
-        return choice.name
-    return next(iter(choice.taken)) if len(choice.taken) == 1 else None
+@contextlib.contextmanager
+def chosen(name: str, tell: Callable[[str], None] | None = None) -> Iterator[list[str]]:
+    """`using` for a function that anybody may call: ``auto`` is the engine in use where
+    there is one.
+
+    Yields:
+        What ``tell`` is told, as it comes.
+    """
+    said: list[str] = []
+
+    def hear(line: str) -> None:
+        said.append(line)
+        if tell is not None:
+            tell(line)
+
+    if name == "auto" and len(_stack) > 1:
+        yield said
+        return
+    with using(name, hear):
+        yield said
+
+
+def recorded(write: Callable[[str, str], None]) -> None:
+    """Inside `using`, ``write(engine, why)`` is called with what is given or ``auto``
+    takes, now or as soon as it does; with ``auto`` where it takes both."""
+    if len(_stack) > 1:
+        _stack[-1].write = write
+        _stack[-1].told()
 
 
 def of_built_in(m: mujoco.MjModel) -> Engine:
@@ -121,7 +169,9 @@ def _noted(found: Engine, why: str) -> Engine:
     choice = _stack[-1]
     if choice.tell is not None and found == "mujoco" and found not in choice.taken:
         choice.tell(f"engine: mujoco, native on all cores ({why})")
-    choice.taken.setdefault(found, why)
+    if found not in choice.taken:
+        choice.taken[found] = why
+        choice.told()
     return found
 
 

@@ -34,6 +34,8 @@ _REST = (
     mujoco.mjtState.mjSTATE_PLUGIN,
     mujoco.mjtState.mjSTATE_PLASTIC,
 )
+# What calls have raised, which jax passes on as a text only.
+failures: list[Exception] = []
 _KEPT = 8  # batches kept for each model: chunks of a few sizes, on each device
 _RECORDED = 2**25  # numbers recorded at once, 256 MB
 
@@ -433,7 +435,15 @@ class _Call:
             values: fields of the model.
             given: the others, those of `_OWN`.
         """
-        values, given = self._numbers(values), self._numbers(given)
+        try:
+            return self._called(self._numbers(values), self._numbers(given))
+        except Exception as error:
+            failures.append(error)
+            raise
+
+    def _called(
+        self, values: dict[str, np.ndarray], given: dict[str, np.ndarray]
+    ) -> tuple[np.ndarray, ...]:
         mj = self.template.mj
         fields = {name: np.ndim(nominal_field(mj, name)) for name in values}
         lead = _together({**values, **given}, {**fields, **_OWN})

@@ -1,4 +1,6 @@
+import json
 import os
+import re
 import subprocess
 import sys
 from importlib.metadata import version
@@ -10,7 +12,10 @@ import pytest
 
 import envs
 from easi_jax.devices import runtime
+from easi_jax.io.runs.folder import RunFolder
 from easi_jax.simulation.step import control_step
+from train import info
+from train._command import main
 from train.info import measures
 
 ROOT = Path(__file__).parents[2]
@@ -37,6 +42,23 @@ def test_fresh_process_has_every_measure_in_force():
     assert version("mujoco-mjx") in found.stdout
     assert "quiet imports" in found.stdout
     assert "│ NO" not in found.stdout
+
+
+def test_a_run_says_its_engine_and_why(tmp_path, capsys):
+    with RunFolder.open(tmp_path / "run", {}, command="train.easi"):
+        show = ("--run", str(tmp_path / "run"))
+        main(info.Config, info.run, name="train.info", args=show)
+        assert "not known" in capsys.readouterr().out
+    why = "29 degrees of freedom on a CPU"
+    text = json.dumps({"engine": "mujoco", "why": why})
+    (tmp_path / "run" / "engine.json").write_text(text)
+    main(info.Config, info.run, name="train.info", args=show)
+    said = capsys.readouterr().out
+    assert re.search(r"engine +│ mujoco", said) and re.search(rf"why +│ {why}", said)
+    with pytest.raises(SystemExit) as left:
+        none = ("--run", str(tmp_path))
+        main(info.Config, info.run, name="train.info", args=none)
+    assert left.value.code == 2 and "holds no run" in capsys.readouterr().err
 
 
 def test_what_the_environment_took_away_is_shown():

@@ -125,14 +125,17 @@ class RunFolder:
             if not resumed:
                 head = {"format": FORMAT, "command": command, "config": plain}
                 run.write_json(_CONFIG, head)  # first: from now on it holds a run
-                if engine.taken() is not None:
-                    run.write_json(_ENGINE, {"engine": engine.taken()})
             if not (folder / "versions.json").exists():
                 run.write_json("versions.json", versions())
+            if not (folder / _ENGINE).exists():
+                engine.recorded(run._write_engine)
         except BaseException:
             _release(lock)
             raise
         return run
+
+    def _write_engine(self, name: str, why: str) -> None:
+        self.write_json(_ENGINE, {"engine": name, "why": why})
 
     def write_json(self, name: str, value: Any) -> Path:
         """Writes ``value`` as JSON into the folder, atomically."""
@@ -198,8 +201,9 @@ def read_config(folder: Path) -> dict[str, Any]:
     return _read_head(folder)["config"]
 
 
-def engine_of(folder: Path) -> str | None:
-    """The engine that the run in a folder simulates with; None where it does not say.
+def engine_of(folder: Path) -> tuple[str, str] | None:
+    """The engine that the run in a folder simulates with, and why; None where it does
+    not say.
 
     Raises:
         UserError: a file that says something else.
@@ -211,7 +215,7 @@ def engine_of(folder: Path) -> str | None:
     name = found.get("engine") if isinstance(found, dict) else None
     if name not in engine.CHOICES:
         raise UserError(f"{path} names no engine: --overwrite deletes the run")
-    return str(name)
+    return str(name), str(found.get("why", ""))
 
 
 def _as_mapping(config: Any) -> dict[str, Any]:

@@ -232,9 +232,61 @@ def test_auto_takes_mujoco_where_mjx_lacks_something(tmp_path: Path) -> None:
         assert len(said) == 1 and "MJX" in said[0]
         with RunFolder.open(tmp_path / "run", {"a": 1}, command="x"):
             pass
-    assert engine_of(tmp_path / "run") == "mujoco"
+    name, why = engine_of(tmp_path / "run") or ("", "")
+    assert name == "mujoco" and why in said[0]
     assert engine_of(tmp_path) is None
     assert Simulator(small, ParameterSpace(())).engine == "mjx"
+
+
+def test_what_auto_takes_later_is_stored_too(tmp_path: Path) -> None:
+    """A command may open its folder before it makes its simulator."""
+    parts = [
+        _model(),
+        _model(xml=_ARM.replace("<motor ", '<motor delay="0.02" nsample="8" ')),
+    ]
+    with engine.using("auto"), RunFolder.open(tmp_path / "run", {}, command="x"):
+        assert engine_of(tmp_path / "run") is None
+        assert Simulator(parts[0], ParameterSpace(())).engine == "mjx"
+        assert engine_of(tmp_path / "run") == ("mjx", "a small robot")
+        assert Simulator(parts[1], ParameterSpace(())).engine == "mujoco"
+        name, why = engine_of(tmp_path / "run") or ("", "")
+        assert name == "auto" and "mjx: a small robot; mujoco: " in why
+    given = RunFolder.open(tmp_path / "given", {}, command="x")
+    with given, engine.using("mujoco"):
+        engine.recorded(given._write_engine)
+    assert engine_of(tmp_path / "given") == ("mujoco", "--engine mujoco")
+
+
+class _Failing:
+    """Reads nothing: it raises, as a plugin may, or numpy without memory."""
+
+    fields = ("qpos",)
+    size = 1
+
+    def __call__(self, *given: np.ndarray) -> np.ndarray:
+        raise MemoryError("no room for\n 300 simulations")
+
+
+def test_a_call_that_fails_is_one_line() -> None:
+    m = _model()
+    line = "the engine mujoco failed in a simulation: MemoryError: no room for\n 300"
+    with pytest.raises(engine.EngineError, match=line), engine.using("mujoco"):
+        simulator = Simulator(m, ParameterSpace(()), 0.02)
+        model, state = simulator.base.mjx, simulator.start(*jnp.zeros((2, 2)))
+        run = jax.jit(lambda u: native.run(model, state, u, read=_Failing())[2])
+        jax.block_until_ready(run(jnp.zeros((1, 2))))
+    # What fails next is not taken for it.
+    with pytest.raises(jax.errors.JaxRuntimeError), engine.using("mujoco"):
+        raise jax.errors.JaxRuntimeError("something else")
+
+
+def test_outside_of_a_choice_auto_chooses_and_says() -> None:
+    lacking = _model(xml=_ARM.replace("<motor ", '<motor delay="0.02" nsample="8" '))
+    with engine.chosen("auto") as said:
+        assert Simulator(lacking, ParameterSpace(())).engine == "mujoco"
+    assert len(said) == 1 and "MJX" in said[0]
+    with engine.using("mjx"), engine.chosen("auto"):
+        assert engine.of_built_in(lacking) == "mjx"
 
 
 def test_a_delay_of_mujoco_is_simulated_over_steps() -> None:
