@@ -71,6 +71,12 @@ class _Batch:
         # Set before the first write: rows are shared with what is bound.
         self.first = self.batch.state[:1].copy()
 
+    def expanded(self) -> dict[str, np.ndarray]:
+        """Fields that have a row for each simulation; those derived from others have
+        where these were not always nominal."""
+        found = ((n, self.batch.expanded(n)) for n in mujoco_batch.MODEL_FIELDS)
+        return {name: rows for name, rows in found if rows is not None}
+
     def component(self, part: mujoco.mjtState) -> np.ndarray:
         offset, size = self.batch._component(part)
         return self.batch.state[:, offset : offset + size]
@@ -88,7 +94,6 @@ class _Host:
         self.mj = template.mj
         self._lock = threading.Lock()
         self._free: list[_Batch] = []
-        self._derived: dict[tuple[str, ...], tuple[str, ...]] = {}
 
     @cached_property
     def _pairs(self) -> dict[frozenset[int], int]:
@@ -133,20 +138,14 @@ class _Host:
             except mujoco_batch.SimulationError as error:
                 models.failed[error.ids] = True
         if not own:
-            for name in self._expanded(fields, models):
-                rows = models.batch.expanded(name)
-                b.batch.expand(name)[...] = rows[which]
+            found = models.expanded()
+            for name in {**b.expanded(), **found}:
+                rows = found.get(name)
+                nominal = nominal_field(self.mj, name)
+                b.batch.expand(name)[...] = nominal if rows is None else rows[which]
             b.failed = models.failed[which]
         b.written = key
         return b
-
-    def _expanded(self, fields: tuple[str, ...], models: _Batch) -> tuple[str, ...]:
-        """Fields that have values of their own, those derived from others included."""
-        if fields not in self._derived:
-            every = mujoco_batch.MODEL_FIELDS
-            found = (n for n in every if models.batch.expanded(n) is not None)
-            self._derived[fields] = tuple(found)
-        return self._derived[fields]
 
     # Simulation --------------------------------------------------------------
 

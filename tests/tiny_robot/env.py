@@ -52,10 +52,10 @@ class Tiny(Robot):
         )
     }
 
-    def __init__(self) -> None:
+    def __init__(self, xml: str = XML) -> None:
         super().__init__(
             {"gear": "actuator.motor.gear", "damping": "joint.hinge.damping"},
-            mujoco.MjModel.from_xml_string(XML),
+            mujoco.MjModel.from_xml_string(xml),
         )
 
     def reset(self, model: Model, key: jax.Array) -> EnvState:

@@ -163,6 +163,23 @@ def test_steps_agree_with_the_replay_and_any_number_of_threads(
     np.testing.assert_allclose(qvel, found[0][1], atol=1e-4)
 
 
+def test_models_leave_nothing_to_the_next_ones() -> None:
+    """Where a model is nominal, nothing that follows from it has a row of its own."""
+    m = _model()
+    space = ParameterSpace((declare(m, "mass", "body.fore.mass"),))
+    simulator = Simulator(m, space, 0.02, engine="mujoco")
+    seg = _segments(m, 3, 4)
+    nominal, other = (np.array([[mass]]) for mass in (m.body("fore").mass[0], 2.0))
+    run = jax.jit(lambda t: open_loop.predict(simulator, simulator.model(t), seg))
+    found = [np.asarray(run(jnp.asarray(t[0]))[1]) for t in (nominal, other, nominal)]
+    np.testing.assert_array_equal(found[0], found[2])
+    assert np.abs(found[1] - found[0]).max() > 0.1
+    (fresh,) = native._host(simulator.base.mjx.template)._free
+    assert "body_subtreemass" in fresh.expanded()
+    rows = fresh.expanded()["body_subtreemass"]
+    np.testing.assert_allclose(rows, np.tile(m.body_subtreemass, (3, 1)), rtol=1e-6)
+
+
 @pytest.fixture(scope="module")
 def effects_on_both() -> dict[str, Any]:
     """Predictions by engine, a row for each of `_EFFECTS`."""
