@@ -32,12 +32,14 @@ from easi_jax.model.effects import Effects
 from easi_jax.model.joint_space import dofs, scalar_places, turns_fully
 from easi_jax.model.mjx_model import Model, for_every_effect
 from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation import native_step
 from easi_jax.simulation.logged import Logged
 from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.step import Physics, arrived_step
 
 BLOCK = 16  # windows
 _ITEMS = 4  # that a core works on together: many requests ask for few
+_NATIVE_ITEMS = 16  # a call costs as much as hundreds of steps of a small robot
 _ACCELERATOR_ITEMS = 256
 _ROW = 0.01  # s of it at a time
 
@@ -59,6 +61,20 @@ def opened(m: mujoco.MjModel) -> mujoco.MjModel:
 
 
 _PLAY = fields_that_act("drive")
+# What is left out of a program, the quickest one first: a window takes the first that
+# holds all that it has. On native MuJoCo a window is one call unless something depends
+# on the state; drag of bodies is one more call a physics step.
+_LEFT_OUT = {
+    "mjx": (_PLAY, ()),
+    "mujoco": (
+        native_step.STATE_DEPENDENT,
+        (*_PLAY, "resistance"),
+        _PLAY,
+        (),
+    ),
+}
+# Numbers that do nothing where the others of their effect are neutral.
+_DETAILS = ("rotor", "cycles", "phase", "stribeck")
 
 
 def _fields(layout: Layout) -> tuple[str, ...]:
@@ -113,7 +129,10 @@ class Predictor:
         self.largest = np.where(self.wrapped, np.minimum(moved, np.pi), moved)
         self._scalar = scalar_places(m).T
         self._mesh = make_mesh()
+        engine = self.simulator.engine
         self._items = _ITEMS if on_cpu() else _ACCELERATOR_ITEMS
+        if engine == "mujoco":
+            self._items = _NATIVE_ITEMS
         # By powers of two, so that the program of one log often serves the next.
         self._room = 1 << (self.blocks - 1).bit_length()
         self._data = self._placed(windows)
@@ -123,17 +142,19 @@ class Predictor:
         )
         self._delay_steps = math.ceil(latest / dt - 1e-9) + 1
         self._fields = _fields(layout)
-        # The second is for the few predictions in which a drive has play.
-        self._programs = tuple(
-            jax.jit(partial(self._sharded, play), compiler_options=options)
-            for play, options in (
-                (False, fast_loops() | quick_compile()),
-                (True, quick_compile()),
-            )
-        )
-        self._compiled: list[Callable[[], Any]] = []
-        width = [i for i, c in enumerate(layout.columns) if c.field == "width"]
-        self._width = self.own + np.array(width, int)
+        # Columns that each program has not, but for the details of effects.
+        self._without: dict[tuple[str, ...], np.ndarray] = {}
+        for left_out in reversed(_LEFT_OUT[engine]):
+            told = [
+                self.own + i
+                for i, c in enumerate(layout.columns)
+                if c.field in left_out and c.field not in _DETAILS
+            ]
+            # Where a program is no quicker than the next, it is not made.
+            if not left_out or told:
+                self._without[left_out] = np.array(told, int)
+        self._without = dict(reversed(self._without.items()))
+        self._compiled: dict[tuple[str, ...], Callable[[], Any]] = {}
 
     def _placed(self, windows: WindowSet) -> tuple[jax.Array, ...]:
         """The windows in blocks, on all devices; the last is repeated to fill them."""
@@ -194,17 +215,17 @@ class Predictor:
         theirs = [getattr(windows, f).shape[1:] for f in parts]
         if mine != theirs or len(windows) > self.capacity:
             raise ValueError("windows of another shape, or more than there is room for")
-        self._program(False)
+        self._program(())
         other = copy.copy(self)
         other.windows = windows
         other._data = other._placed(windows)
         return other
 
-    def model(self, x: jax.Array, play: bool = True) -> Model:
-        """The model of a vector ``(n,)``; pure. ``play``: whether drives may have."""
+    def model(self, x: jax.Array, left_out: tuple[str, ...] = ()) -> Model:
+        """The model of a vector ``(n,)``, fields ``left_out`` neutral in it; pure."""
         e = self.layout.effects(x[self.own :])
         model = self.simulator.model(x[: self.own])
-        present = tuple(f for f in self._fields if play or f not in _PLAY)
+        present = tuple(f for f in self._fields if f not in left_out)
         return model.replace(
             mjx=effects.with_effects(model.mjx, e, present),
             effects=e,
@@ -226,8 +247,8 @@ class Predictor:
         commands = start + step[:-1]
         return Rows(np.round(readings).astype(int), np.round(commands).astype(int))
 
-    def _program(self, play: bool) -> Any:
-        """One of the two, compiled: for an arm each takes a minute, so side by side."""
+    def _program(self, left_out: tuple[str, ...]) -> Any:
+        """A compiled one. For an arm MJX's take a minute each, so side by side."""
         if not self._compiled:
             batch = self._items * self._mesh.size
             like = (
@@ -235,34 +256,36 @@ class Predictor:
                 np.zeros(batch, np.int32),
                 np.zeros((batch, BLOCK, 2 * self.nv), np.float32),
             )
-            # Where no drive can have play, the first alone.
-            programs = self._programs[: 1 + (len(self._width) > 0)]
-            lowered = [p.lower(*like, *self._data) for p in programs]
-            self._compiled = [started(p.compile) for p in lowered]
-        return self._compiled[play]()
+            for out in self._without:
+                # Play is for few predictions.
+                quick = quick_compile() | (fast_loops() if out else {})
+                program = jax.jit(partial(self._sharded, out), compiler_options=quick)
+                lowered = program.lower(*like, *self._data)
+                self._compiled[out] = started(lowered.compile)
+        return self._compiled[left_out]()
 
     def _sharded(
         self,
-        play: bool,
+        left_out: tuple[str, ...],
         x: jax.Array,
         block: jax.Array,
         moved: jax.Array,
         *windows: jax.Array,
     ) -> jax.Array:
         def local(items: tuple[jax.Array, ...], *data: jax.Array) -> jax.Array:
-            return jax.vmap(lambda *i: self._block(play, data, *i))(*items)
+            return jax.vmap(lambda *i: self._block(left_out, data, *i))(*items)
 
         return sharded_map(local, self._mesh, (x, block, moved), *windows)
 
     def _block(
         self,
-        play: bool,
+        left_out: tuple[str, ...],
         data: tuple[jax.Array, ...],
         x: jax.Array,
         block: jax.Array,
         moved: jax.Array,
     ) -> jax.Array:
-        model = self.model(x, play)
+        model = self.model(x, left_out)
         return jax.vmap(lambda w, d: self._window(model, w, d))(
             tuple(a[block] for a in data), moved
         )
@@ -300,7 +323,10 @@ class Predictor:
             state = arrived_step(model, state, u)
             return state, state.qpos
 
-        _, qs = jax.lax.scan(step, physics, arrived[len(past) :])
+        sent, at_once = arrived[len(past) :], None
+        if simulator.engine == "mujoco":
+            at_once = native_step.replay(model, physics, sent)
+        qs = at_once[0] if at_once else jax.lax.scan(step, physics, sent)[1]
         # From the start, so that readings are plain numbers also where q is not.
         zero = jnp.zeros(nv)
         difference = jax.vmap(simulator.difference, (None, None, 0, None))
@@ -378,13 +404,14 @@ class Predictor:
             whole[:, : moved.shape[1]] = moved
             offsets = whole.reshape(shape)
         out = np.empty((items, BLOCK, self.steps, self.nv), np.float32)
-        loose = (vectors[:, self._width] > 0).any(1)
-        for play in (False, True):
-            chosen = np.flatnonzero(loose == play)
-            if not len(chosen):
+        neutral, left = self.neutral.astype(np.float32), np.ones(items, bool)
+        for left_out, columns in self._without.items():
+            fits = left & (vectors[:, columns] == neutral[columns]).all(1)
+            left &= ~fits
+            if not fits.any():
                 continue
-            program = self._program(play)
-            for part in self._batches(chosen):
+            program = self._program(left_out)
+            for part in self._batches(np.flatnonzero(fits)):
                 args = vectors[part], which[part], offsets[part]
                 got = program(*args, *self._data)
                 out[part] = np.asarray(got)

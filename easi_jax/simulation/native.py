@@ -59,13 +59,14 @@ class _Batch:
     Attributes:
         size: number of simulations.
         fields: names of the fields that vary.
-        written: bytes of what they hold, and of which simulation has which.
+        written: bytes of the fields' values, by name, and of ``which`` simulation has
+            which row of them.
         failed: simulations whose model MuJoCo could not complete, ``(size,)`` bool.
     """
 
     def __init__(self, mj: mujoco.MjModel, size: int, fields: tuple[str, ...]) -> None:
         self.size, self.fields = size, fields
-        self.written: tuple[Any, ...] | None = None
+        self.written: dict[str, bytes] = {}
         self.failed = np.zeros(size, bool)
         self.batch = mujoco_batch.Batch(mj, size, _threads())
         # Set before the first write: rows are shared with what is bound.
@@ -102,10 +103,12 @@ class _Host:
 
     # Models ------------------------------------------------------------------
 
-    def _taken(self, key: tuple[Any, ...], size: int, fields: tuple[str, ...]) -> Any:
+    def _taken(
+        self, written: dict[str, bytes], size: int, fields: tuple[str, ...]
+    ) -> _Batch:
         with self._lock:
             fits = [b for b in self._free if (b.size, b.fields) == (size, fields)]
-            same = [b for b in fits if b.written == key]
+            same = [b for b in fits if b.written == written]
             if same or fits:
                 found = (same or fits)[-1]
                 self._free.remove(found)
@@ -121,30 +124,34 @@ class _Host:
         self, fields: tuple[str, ...], values: Sequence[np.ndarray], which: np.ndarray
     ) -> _Batch:
         """A batch in which simulation i has row ``which[i]`` of values ``(P, ...)``."""
-        key = (*(v.tobytes() for v in values), which.tobytes())
-        b = self._taken(key, len(which), fields)
-        if b.written == key or not fields:
-            b.written = key
+        written = {f: v.tobytes() for f, v in zip(fields, values, strict=True)}
+        written["which"] = which.tobytes()
+        b = self._taken(written, len(which), fields)
+        if b.written == written:
             return b
-        count = len(values[0])
+        count = len(values[0]) if fields else 0
         own = count == b.size and np.array_equal(which, np.arange(count))
-        models = b if own else _Batch(self.mj, count, fields)
+        models = b if own or not fields else _Batch(self.mj, count, fields)
+        changed = fields
+        if own and b.written.get("which") == written["which"]:
+            changed = [f for f in fields if b.written[f] != written[f]]
         for name, rows in zip(fields, values, strict=True):
-            models.batch.expand(name)[...] = rows
-        models.failed[:] = False
-        if any(name in _SET_CONST or name.startswith("opt.") for name in fields):
+            if name in changed:
+                models.batch.expand(name)[...] = rows
+        if any(name in _SET_CONST or name.startswith("opt.") for name in changed):
+            models.failed[:] = False
             try:
                 models.batch.set_const()
             except mujoco_batch.SimulationError as error:
                 models.failed[error.ids] = True
-        if not own:
+        if models is not b:
             found = models.expanded()
             for name in {**b.expanded(), **found}:
                 rows = found.get(name)
                 nominal = nominal_field(self.mj, name)
                 b.batch.expand(name)[...] = nominal if rows is None else rows[which]
             b.failed = models.failed[which]
-        b.written = key
+        b.written = written
         return b
 
     # Simulation --------------------------------------------------------------

@@ -23,6 +23,8 @@ from easi_jax.simulation import native
 # Effects in the step that are the same at every state.
 _STEADY = ("coulomb", "damping", "stiffness", "spring", "constant", "force")
 _IN_STEPS = (*fields_that_act("step"), *fields_that_act("drive"), "slip", "give")
+# Those for which MuJoCo is called once a physics step.
+STATE_DEPENDENT = tuple(f for f in _IN_STEPS if f not in _STEADY)
 
 
 @flax.struct.dataclass
