@@ -215,8 +215,7 @@ class Predictor:
         theirs = [getattr(windows, f).shape[1:] for f in parts]
         if mine != theirs or len(windows) > self.capacity:
             raise ValueError("windows of another shape, or more than there is room for")
-        self._program(())
-        other = copy.copy(self)
+        other = copy.copy(self)  # the compiled programs are of both
         other.windows = windows
         other._data = other._placed(windows)
         return other
@@ -249,14 +248,14 @@ class Predictor:
 
     def _program(self, left_out: tuple[str, ...]) -> Any:
         """A compiled one. For an arm MJX's take a minute each, so side by side."""
-        if not self._compiled:
+        if left_out not in self._compiled:
             batch = self._items * self._mesh.size
             like = (
                 np.zeros((batch, len(self.neutral)), np.float32),
                 np.zeros(batch, np.int32),
                 np.zeros((batch, BLOCK, 2 * self.nv), np.float32),
             )
-            for out in self._without:
+            for out in self._without if self.simulator.engine == "mjx" else [left_out]:
                 # Play is for few predictions.
                 quick = quick_compile() | (fast_loops() if out else {})
                 program = jax.jit(partial(self._sharded, out), compiler_options=quick)

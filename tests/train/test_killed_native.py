@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 
 import jax
+import mujoco
 import numpy as np
 import pytest
 
@@ -30,12 +31,18 @@ def make():
     return Tiny("""{_ROUGH}""")
 '''
 _UDR = ("--env-steps", 1200, "--eval-episodes", 2, "--chunk", 12, "--target", "gear*.5")
-_EASI = (
-    *("--generations", 4, "--population", 8, "--trajectories", 4, "--no-refine"),
+_SEARCH = (
+    *("--generations", 4, "--search-chunk", 2, "--population", 8, "--no-refine"),
     *("--set", "segments=16", "real_batch=64", "discriminator_updates=2"),
-    *("--search-chunk", 2, "--eval-episodes", 2),
-    *("--target", "gear*.5"),
 )
+_EASI = (
+    *_SEARCH,
+    *("--trajectories", 4, "--eval-episodes", 2, "--target", "gear*.5"),
+)
+_PARAMETERS = """parameters:
+  - {name: damping, address: joint.hinge.damping, initial: [0.05, 0.5]}
+  - {name: dry, address: joint.hinge.frictionloss, initial: [0.1, 1.0]}
+"""
 _LAST = 24  # steps of training
 
 
@@ -44,7 +51,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("native")
     (root / "env.py").write_text(_ENV)
     _call(udr, root, root / "udr", *_UDR)
-    _call(easi, root, root / "easi", "--udr", root / "udr", *_EASI)
     return root
 
 
@@ -79,15 +85,47 @@ def test_training(runs: Path, tmp_path: Path) -> None:
     assert told[0]["returns"] == told[1]["returns"]
 
 
+@pytest.mark.slow
 @pytest.mark.fault("killed (signal 9), then resumed")
-def test_search(runs: Path, tmp_path: Path) -> None:
-    whole, copy = runs / "easi", tmp_path / "easi"
-    shutil.copytree(whole, copy)
-    last = "search/step_000000000004"
-    for lost in (last, "estimate", "final", "policy_EASI", "policy_UDR"):
-        shutil.rmtree(copy / "checkpoints" / lost)
-    for name in ("results.json", "distribution.json", "report.html"):
-        (copy / name).unlink()
-    _call(easi, runs, copy, "--udr", runs / "udr", *_EASI, "--resume")
+def test_search_with_policies(runs: Path, tmp_path: Path) -> None:
+    whole, copy = tmp_path / "whole", tmp_path / "easi"
+    given = "--udr", runs / "udr", *_EASI
+    _call(easi, runs, whole, *given)
+    _kill_in_search(whole, copy)
+    _call(easi, runs, copy, *given, "--resume")
     for name in ("distribution.json", "results.json"):
         assert (copy / name).read_text() == (whole / name).read_text(), name
+
+
+def _kill_in_search(whole: Path, copy: Path) -> None:
+    """As a kill in the second chunk of the search would have left it."""
+    shutil.copytree(whole, copy)
+    shutil.rmtree(copy / "checkpoints" / "search" / "step_000000000004")
+    for stage in (copy / "checkpoints").iterdir():
+        if stage.name != "search":
+            shutil.rmtree(stage)
+    for name in ("results.json", "distribution.json", "report.html"):
+        (copy / name).unlink(missing_ok=True)
+
+
+@pytest.mark.fault("killed (signal 9), then resumed")
+def test_search_of_logs(tmp_path: Path) -> None:
+    m = mujoco.MjModel.from_xml_string(_ROUGH)
+    d, rows = mujoco.MjData(m), ["time,qpos.hinge,ctrl.motor"]
+    m.dof_damping[:] = 0.2
+    for k in range(150):
+        d.ctrl[:] = np.sin(0.2 * k)
+        rows.append(f"{0.02 * k:.6g},{d.qpos[0]:.7f},{d.ctrl[0]:.7f}")
+        mujoco.mj_step(m, d)
+    files = {"model": "m.xml", "parameters": "p.yaml", "data": "log.csv"}
+    texts = (_ROUGH, _PARAMETERS, "\n".join(rows) + "\n")
+    given: list[object] = ["--engine", "mujoco", *_SEARCH]
+    for (option, name), text in zip(files.items(), texts, strict=True):
+        (tmp_path / name).write_text(text)
+        given += [f"--{option}", tmp_path / name]
+    whole, copy = tmp_path / "whole", tmp_path / "copy"
+    command(easi, "--out", whole, *given)
+    _kill_in_search(whole, copy)
+    command(easi, "--out", copy, *given, "--resume")
+    name = "distribution.json"
+    assert (copy / name).read_text() == (whole / name).read_text()

@@ -1,0 +1,53 @@
+"""Predictions by native MuJoCo: few calls, and the same whichever way they go."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from easi_jax.gap.candidates import places
+from easi_jax.gap.effect_vector import Layout
+from easi_jax.gap.predictor import Predictor
+from easi_jax.gap.scales import scales_of
+from easi_jax.gap.window_set import window_set
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation import engine, native
+from tests.easi_jax.gap.test_late_readings import ARM, DT, STEPS, recorded
+
+
+def test_a_window_is_one_call_unless_an_effect_depends_on_the_state(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    m = mujoco.MjModel.from_xml_string(ARM.format(""))
+    run = recorded(m, (0.0,))
+    found = places(m, scales_of(m, [run]))
+    layout = Layout(m, found)
+    windows = window_set([run], 0.05, 0.0)
+    assert windows is not None
+    with engine.using("mujoco"):
+        p = Predictor(m, ParameterSpace(()), layout, windows, DT)
+    steps = p.steps * STEPS
+    calls = []
+    called = native._Call._called
+
+    def counted(self: object, *args: object) -> object:
+        calls.append(1)
+        return called(self, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(native._Call, "_called", counted)
+
+    def predicted(**fields: float) -> tuple[np.ndarray, int]:
+        x = p.neutral.copy()
+        for i, c in enumerate(layout.columns):
+            x[i] = fields.get(c.field, x[i])
+        calls.clear()
+        return p.errors(x[None])[0], len(calls)
+
+    steady, few = predicted(coulomb=0.05)
+    stepped, many = predicted(coulomb=0.05, drag=1e-12)
+    dragged, _ = predicted(coulomb=0.05, drag=0.02)
+    both, most = predicted(coulomb=0.05, drag=1e-12, resistance=1e-12)
+    assert few <= p.devices and many == few * steps and most == 2 * many
+    # Where they go step by step, states are rounded to single precision after each.
+    np.testing.assert_allclose(stepped, steady, atol=2e-5)
+    np.testing.assert_allclose(both, stepped, atol=2e-5)
+    assert np.abs(dragged - steady).max() > 1e-3
