@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import jax
 import mujoco
@@ -12,7 +13,7 @@ import pytest
 from easi_jax.io.runs import checkpoints
 from easi_jax.io.runs.folder import engine_of
 from easi_jax.pipeline.stages import Pipeline, PipelineConfig, seed_keys
-from easi_jax.simulation import engine
+from easi_jax.simulation import engine, native
 from tests.commands import command
 from tests.tiny_robot.env import XML, Tiny
 from train import easi, udr
@@ -108,8 +109,11 @@ def _kill_in_search(whole: Path, copy: Path) -> None:
         (copy / name).unlink(missing_ok=True)
 
 
-@pytest.mark.fault("killed (signal 9), then resumed")
-def test_search_of_logs(tmp_path: Path) -> None:
+@pytest.mark.fault("an engine that fails in a run")
+def test_search_of_logs_in_which_the_engine_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What was written stays, and goes on to the same end."""
     m = mujoco.MjModel.from_xml_string(_ROUGH)
     d, rows = mujoco.MjData(m), ["time,qpos.hinge,ctrl.motor"]
     m.dof_damping[:] = 0.2
@@ -125,7 +129,21 @@ def test_search_of_logs(tmp_path: Path) -> None:
         given += [f"--{option}", tmp_path / name]
     whole, copy = tmp_path / "whole", tmp_path / "copy"
     command(easi, "--out", whole, *given)
-    _kill_in_search(whole, copy)
+    steps = native._Host.steps
+
+    def failing(self: native._Host, *args: Any) -> Any:
+        if any(copy.glob("checkpoints/search/step_*")):
+            raise MemoryError("no room for 8 simulations")
+        return steps(self, *args)
+
+    capsys.readouterr()
+    with monkeypatch.context() as patched, pytest.raises(SystemExit) as stop:
+        patched.setattr(native._Host, "steps", failing)
+        command(easi, "--out", copy, *given)
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert stop.value.code == 2
+    assert line.startswith("error: the engine mujoco failed in a simulation: MemoryErr")
+    assert f"{copy} keeps all up to the last checkpoint" in line
     command(easi, "--out", copy, *given, "--resume")
     name = "distribution.json"
     assert (copy / name).read_text() == (whole / name).read_text()
