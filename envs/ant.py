@@ -7,7 +7,8 @@ restitution: the floor's contact damping takes its place (at 40 1/s and a stiffn
 the floor; an episode ends before the torso could.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -173,27 +174,35 @@ class FootLoads:
     """Reads force [N] and torque [N m] of the floor on each foot, ``(24,)``.
 
     Attributes:
-        contacts: for each foot, which contact of the simulation is its own.
+        feet: geoms.
         bodies: for each foot, its body, in whose frame the loads are.
+        mj_model: theirs.
     """
 
-    contacts: tuple[int, ...]
+    feet: tuple[int, ...]
     bodies: tuple[int, ...]
+    mj_model: mujoco.MjModel = field(compare=False, repr=False)
 
     @classmethod
     def of(cls, m: mujoco.MjModel) -> "FootLoads":
-        """Finds the contacts of the feet; the floor comes first in every pair."""
+        """Of the four feet."""
+        feet = [m.geom(f"{leg}_foot") for leg in LEGS]
+        bodies = tuple(int(f.bodyid[0]) for f in feet)
+        return cls(tuple(int(f.id) for f in feet), bodies, m)
+
+    @cached_property
+    def contacts(self) -> tuple[int, ...]:
+        """For each foot, which contact of MJX is its own; the floor comes first in
+        every pair."""
         with jax.ensure_compile_time_eval():
-            put = mjx.put_model(m, own_device(), impl="jax")
+            put = mjx.put_model(self.mj_model, own_device(), impl="jax")
 
             def found() -> jax.Array:
                 data: Any = mjx.collision(put, mjx.make_data(put, own_device()))
                 return data._impl.contact.geom
 
             pairs = np.asarray(jax.jit(found)())  # the compiler drops all else
-        feet = [m.geom(f"{leg}_foot") for leg in LEGS]
-        contacts = [int(np.flatnonzero(pairs[:, 1] == f.id)[0]) for f in feet]
-        return cls(tuple(contacts), tuple(int(f.bodyid[0]) for f in feet))
+        return tuple(int(np.flatnonzero(pairs[:, 1] == g)[0]) for g in self.feet)
 
     @property
     def native(self) -> "NativeFootLoads":
