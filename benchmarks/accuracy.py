@@ -62,7 +62,7 @@ def _compare(env: Any, config: Config) -> dict[str, list[list[float]]]:
     import jax.numpy as jnp
     import numpy as np
 
-    from benchmarks.physics import random_commands
+    from benchmarks.engines import random_commands
     from easi_jax.simulation.simulator import Simulator
 
     count = max(1, round(TIMES[-1] / env.dt))

@@ -14,18 +14,22 @@ there. `easi_jax.simulation.engine` chooses by these figures.
 import dataclasses
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from benchmarks._common import RESULTS
+from benchmarks._common import RESULTS, markdown_table
+from benchmarks._page import met
 from train._command import main, say
 
 ROBOTS = ("cartpole", "ant", "ballbalance", "go2")
 PROGRAMS = ("rollout", "mjx", "mujoco", "mjx.step", "warp")
 KINDS = ("replay", "policy", "search")
 STEPS = {"cartpole": 200, "ant": 50, "ballbalance": 5, "go2": 25}  # control steps
+# What `auto` shall reach: of mujoco.rollout's steps, and seconds of a search.
+RATIOS = {"cartpole": 5.0, "ant": 0.9, "ballbalance": 0.9, "go2": 0.9}
+SECONDS = {"ant": 40, "ballbalance": 120, "go2": 110}
 GENERATIONS = 50
 INDIVIDUALS = 300  # of a search
 SEARCHED = {
@@ -126,12 +130,22 @@ def run(config: Config) -> None:
         for cell in natives:
             rates[cell] += native_rates(cell, config)
         for cell, measured in rates.items():
-            row = {**named(cell), "steps_per_s": measured, **figures[cell]}
+            row = {**named(cell), "auto": _automatic(robot)}
+            row |= {"steps_per_s": measured, **figures[cell]}
             add_row(config.out, {**row, "versions": versions()})
             say(
                 f"{cell.robot}, {cell.program}, {cell.kind}, {cell.population:,}: "
                 f"{np.median(measured):,.0f} physics steps/s {figures[cell]}"
             )
+
+
+def _automatic(robot: str) -> str:
+    """The engine that ``auto`` takes here."""
+    from easi_jax.simulation import engine
+    from envs import make
+
+    with engine.using("auto"):
+        return make(robot).simulator.engine
 
 
 def _compiled(make: Callable[[], Any]) -> tuple[Callable[[], Any], dict[str, float]]:
@@ -356,6 +370,80 @@ def _warp(env: Any, first: Any) -> Callable[..., Any]:
         return jax.jit(jax.vmap(one)).lower(datas, ctrl), (datas, ctrl)
 
     return lower
+
+
+def paragraphs(rows: Iterable[Any]) -> list[str]:
+    """What the page of results says of the lines of ``engines.jsonl``."""
+    import numpy as np
+
+    by_device: dict[str, dict[_Cell, Any]] = {}
+    for r in rows:
+        cell = _Cell(*(r[f.name] for f in dataclasses.fields(_Cell)))
+        where = f"{r['device']}, {r['versions']['runtime']['cores']} cores"
+        by_device.setdefault(where, {})[cell] = r
+    said = [
+        "`python -m benchmarks.engines`: every individual a model of its own, beside "
+        "`mujoco.rollout` on the same cores in the same run, from a reset, with random "
+        "commands; float32 (`mjx`) beside float64. Medians; all timings are in the "
+        "file. What `auto` takes is marked. A policy is a network that acts on "
+        "observations; its steps are compared with `mujoco.rollout` without one.",
+    ]
+    for where, cells in by_device.items():
+        table = []
+        for cell, r in sorted(cells.items(), key=lambda x: _place(x[0])):
+            if cell.kind == "search" or cell.program == "rollout":
+                continue
+            chosen = cell.program == r.get("auto", "mjx")
+            rate, goal, ratio = float(np.median(r["steps_per_s"])), "", ""
+            plain = dataclasses.replace(cell, program="rollout", kind="replay")
+            if plain in cells:
+                share = rate / float(np.median(cells[plain]["steps_per_s"]))
+                ratio = f"{share:.2f}"
+                least = RATIOS[cell.robot]
+                goal = f"{least:g}, {met(share >= least)}" if chosen else ""
+            first = sum(r[k] for k in ("trace_s", "compile_s", "first_call_s"))
+            name = f"**{cell.program}** (auto)" if chosen else cell.program
+            what = (cell.robot, cell.kind, f"{cell.population:,}", name)
+            table.append((*what, f"{rate:,.0f}", ratio, goal, f"{first:.1f} s"))
+        said += [
+            f"On {where}:",
+            markdown_table(
+                (
+                    *("robot", "what", "individuals", "engine", "physics steps/s"),
+                    *("of rollout", "goal", "until the first result"),
+                ),
+                table,
+            ),
+        ]
+        found = [(c, r) for c, r in cells.items() if c.kind == "search"]
+        if found:
+            said += [
+                f"Searches of {GENERATIONS} generations of {INDIVIDUALS}, 200 control "
+                "steps (Ballbalance: 50), after compilation:",
+                markdown_table(
+                    ("robot", "engine", "search", "goal", "trace and compile"),
+                    [
+                        _searched(c, r)
+                        for c, r in sorted(found, key=lambda x: _place(x[0]))
+                    ],
+                ),
+            ]
+    return said
+
+
+def _place(cell: _Cell) -> tuple[Any, ...]:
+    order = (ROBOTS.index(cell.robot), KINDS.index(cell.kind))
+    return *order, cell.population, PROGRAMS.index(cell.program)
+
+
+def _searched(cell: _Cell, r: Any) -> tuple[str, ...]:
+    on_cpu = r["device"] == "cpu"
+    seconds, most = r["first_call_s"], SECONDS.get(cell.robot) if on_cpu else 60
+    chosen = cell.program == r.get("auto", "mjx")
+    goal = f"{most} s, {met(seconds < most)}" if most and chosen else ""
+    name = f"**{cell.program}** (auto)" if chosen else cell.program
+    before = r["trace_s"] + r["compile_s"]
+    return cell.robot, name, f"{seconds:.1f} s", goal, f"{before:.0f} s"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Speed of the search, against native MuJoCo in the same run, and compile times.
+"""A search of Cartpole by its parts, and compile times.
 
 python -m benchmarks.speed
 """
@@ -16,7 +16,7 @@ from train._command import main, say, show_table
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Times physics, a generation, the whole search and compilation."""
+    """Times a generation, the whole search and compilation."""
 
     population: int = 300
     """Individuals."""
@@ -24,8 +24,6 @@ class Config:
     """Control steps of a rollout."""
     generations: int = 50
     """Generations of the timed search."""
-    repeats: int = 5
-    """Timings; the median is reported, all are written."""
     stress: int = 10
     """Fresh processes that step a large batch under a time limit."""
     stress_batch: int = 2048
@@ -179,30 +177,16 @@ def run(config: Config) -> None:
 
         say(json.dumps(_compile(config)))
         return
-    import numpy as np
-
     from benchmarks._common import write_result
-    from benchmarks.physics import native_rates, search_rates
-    from envs import make
 
     with tempfile.TemporaryDirectory() as cache:
         cold, cached = (_compile_in(cache) for _ in range(2))
-    env, size = make("cartpole"), (config.population, config.steps, config.repeats)
-    native = native_rates(env, *size)
-    physics, _ = search_rates(env, *size)
-    again = native_rates(env, *size)
-    native_rate = float(np.median(native + again))
-    rate = float(np.median(physics))
     search = _generations(config)
     stress = _stress(config)
     path = write_result(
         "speed",
         "python -m benchmarks.speed",
         config,
-        native_steps_per_s=native + again,
-        search_steps_per_s=physics,
-        ratio=rate / native_rate,
-        ratio_goal=4.0,
         search=search,
         search_goal_s=60.0,
         outside_goal_s=0.25,
@@ -213,9 +197,6 @@ def run(config: Config) -> None:
         "Cartpole on this machine",
         ("figure", "measured", "goal"),
         [
-            ("physics steps/s, search", f"{rate:,.0f}", ""),
-            ("physics steps/s, native, all cores", f"{native_rate:,.0f}", ""),
-            ("ratio", f"{rate / native_rate:.2f}", "4"),
             ("search [s]", f"{min(search['search_s']):.1f}", "60"),
             (
                 "a generation outside physics [s]",

@@ -8,7 +8,6 @@ not run is named as not run.
 """
 
 import dataclasses
-import math
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 from benchmarks import (
     coverage_summary,
     crash_summary,
+    engines,
     gap_summary,
     lines,
     paper_tables,
@@ -29,13 +29,11 @@ from benchmarks._page import Section, each_of, met, percent, shown, table
 from benchmarks.accuracy import ROBOTS as ACCURATE
 from benchmarks.devices import SAME, STEPS
 from benchmarks.export import GOAL
-from benchmarks.physics import GOALS
 from benchmarks.recovery import CASES
 from benchmarks.robots import STARTS
 from train._command import main, say
 
 FACTORS = (0.25, 0.5, 2, 4)
-SUBSTEPS = 4  # physics steps in a control step of Cartpole: 0.02 s of 0.005 s
 KNOWN = 0.02  # Cramer-Rao standard deviation below which a parameter must be found
 SEARCH_GOALS = {"ant_200": 180, "go2_200": 480, "ballbalance_50": 480}  # s
 ROBOTS = ("ant", "ballbalance", "go2", "go2_parameters_full")
@@ -67,21 +65,11 @@ def run(config: Config) -> None:
 
 
 def _speed(r: Any) -> list[str]:
-    search, size = r["search"], r.get("config")
+    search = r["search"]
     best, outside = min(search["search_s"]), search["outside_physics_per_generation_s"]
     done = [s["finished"] for s in r["stress"]]
-    inside = []
-    if size:
-        steps = math.prod(size[k] for k in ("population", "steps", "generations"))
-        rate = SUBSTEPS * steps / min(search["physics_s"])
-        native = float(np.median(r["native_steps_per_s"]))
-        what = "the same inside a search, pieces of one control step"
-        inside = [(what, f"{rate / native:.2f} times")]
-    what = "physics of Cartpole beside native MuJoCo, rollouts of 200 control steps"
     outside_goal, all_done = met(outside <= 0.25), f"{sum(done)} of {len(done)}"
     rows = [
-        (what, f"{r['ratio']:.2f} times", "4", met(r["ratio"] >= 4)),
-        *inside,
         ("search of 50 x 300 x 200 [s]", f"{best:.1f}", "60", met(best < 60)),
         ("a generation outside physics [s]", f"{outside:.3f}", "0.25", outside_goal),
         *(
@@ -91,35 +79,8 @@ def _speed(r: Any) -> list[str]:
         ("large batches finished", all_done, "all", met(all(done))),
     ]
     return [
-        f"`{r['command']}`: Cartpole alone, on 2 cores, float32 beside native float64. "
-        "[The next table](#physics-of-every-robot) has another commit's figure for it, "
-        "and the other robots; until all are measured anew the lower figure stands.",
+        f"`{r['command']}`: Cartpole alone, on 2 cores.",
         markdown_table(("figure", "measured", "goal", ""), rows),
-    ]
-
-
-def _physics(found: dict[str, Any]) -> list[str]:
-    """Physics steps per second of every robot, and ways to run a step."""
-    rows, tried = [], []
-    for name, r in found.items():
-        native, ours = (
-            float(np.median(r[f"{k}_steps_per_s"])) for k in ("native", "search")
-        )
-        goal = f"{r['ratio_goal']:g}, {met(r['ratio'] >= r['ratio_goal'])}"
-        told = (f"{ours:,.0f}", f"{native:,.0f}", f"{r['ratio']:.2f}", goal)
-        rows.append((name, *told, f"{r['compile_s']:.0f} s"))
-        for label, v in r["variants"].items():
-            share = f"{float(np.median(v['steps_per_s'])) / native:.2f}"
-            tried.append((name, label, share, f"{v['compile_s']:.0f} s"))
-    head = ("robot", "steps/s", "native", "ratio", "goal", "trace and compile")
-    return [
-        "`python -m benchmarks.physics`: a population of 300, each a model of its own, "
-        "against `mujoco.rollout` on the same cores, float32 beside "
-        "its float64; medians, all timings in the "
-        "files.",
-        markdown_table(head, rows),
-        "Other ways to run a step that were tried (ratio to native):",
-        markdown_table(("robot", "step", "ratio", "trace and compile"), tried),
     ]
 
 
@@ -430,13 +391,8 @@ def _real(r: Any) -> list[str]:
 
 
 SECTIONS = (
-    Section("## Speed", "speed.json", "speed", _speed),
-    Section(
-        "## Physics of every robot",
-        {name: f"physics_{name}.json" for name in GOALS},
-        "physics --robots {name}",
-        _physics,
-    ),
+    Section("## Speed", "engines.jsonl", "engines", engines.paragraphs),
+    Section("", "speed.json", "speed", _speed),
     Section(
         "",
         {name: f"accuracy_{name}.json" for name in ACCURATE},

@@ -50,19 +50,21 @@ def test_of_several_sources_what_is_missing_is_named(tmp_path: Path) -> None:
     assert dataclasses.replace(section, source="c.jsonl", optional=True)(tmp_path) == []
 
 
-@pytest.mark.parametrize(("ratio", "said"), [(5.0, "| 4 | met |"), (2.0, "**missed**")])
-def test_goals_are_judged(tmp_path: Path, ratio: float, said: str) -> None:
-    result = {
-        "command": "python -m benchmarks.speed",
-        "ratio": ratio,
-        "search": {"search_s": [7.0, 6.0], "outside_physics_per_generation_s": 0.01},
-        "compile": {"cold": {"trace_s": 1.0, "compile_s": 2.0}},
-        "stress": [{"finished": True, "seconds": 1.0}],
-    }
-    result["compile"]["cached"] = result["compile"]["cold"]
-    (tmp_path / "speed.json").write_text(json.dumps(result))
-    row = page(tmp_path).split("native MuJoCo")[1].splitlines()[0]
+@pytest.mark.parametrize(("share", "said"), [(5.5, "5, met"), (2.0, "**missed**")])
+def test_goals_are_judged(tmp_path: Path, share: float, said: str) -> None:
+    same = {"device": "cpu", "devices": 2, "robot": "cartpole", "kind": "replay"}
+    same |= {"population": 300, "auto": "mjx", "first_call_s": 1.0}
+    same |= {"trace_s": 2.0, "compile_s": 3.0, "versions": {"runtime": {"cores": 2}}}
+    rows = [
+        {**same, "program": "rollout", "steps_per_s": [90.0, 100.0, 110.0]},
+        {**same, "program": "mjx", "steps_per_s": [100 * share]},
+    ]
+    text = "".join(json.dumps(row) + "\n" for row in rows)
+    (tmp_path / "engines.jsonl").write_text(text)
+    (row,) = [x for x in page(tmp_path).splitlines() if x.startswith("| cartpole")]
+    assert f"| **mjx** (auto) | {100 * share:,.0f} | {share:.2f} |" in row
     assert said in row
+    assert "| 6.0 s |" in row
 
 
 def case(

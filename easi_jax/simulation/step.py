@@ -211,7 +211,7 @@ def substep(model: Any, state: Physics, ctrl: jax.Array, wide: bool = False) -> 
     return Physics(d.qpos, qvel, d.act, d.qacc_warmstart, sensed, (), rotor)
 
 
-# What is too large to be written out (benchmarks/physics.py) takes the wide solver.
+# What is too large to be written out (benchmarks/engines.py) takes the wide solver.
 _batched_substep = scalarized(substep, otherwise=partial(substep, wide=True))
 
 
