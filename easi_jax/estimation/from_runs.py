@@ -10,7 +10,7 @@ import numpy as np
 
 from easi_jax.data.segments import to_device
 from easi_jax.devices import distributed
-from easi_jax.devices.mesh import placed
+from easi_jax.devices.mesh import make_mesh, placed, replicated
 from easi_jax.devices.runtime import quick_compile
 from easi_jax.estimation.pieces import effective_noise, few, segments_from_runs
 from easi_jax.estimation.posterior import Estimate, estimate, polished, widened
@@ -118,10 +118,11 @@ def ready_finish(
 
     def errors(found: Any, pieces: Any) -> Any:
         model = simulator.model(space.to_si(found.fit))
-        starts = shift_start(simulator, pieces, found.delta)
+        # Whole on every device: one of them calls native MuJoCo, out here.
+        starts = replicated(shift_start(simulator, pieces, found.delta), mesh)
         return open_loop.errors_from(simulator, model, starts, pieces)
 
-    n = space.size
+    n, mesh = space.size, search.mesh or make_mesh()
     like = placed((jnp.zeros(n), jnp.eye(n), pieces, hidden, _ROBUST, False))
     fitted = jax.jit(finish).lower(*like).compile(quick_compile())
     if more:
