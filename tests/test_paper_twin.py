@@ -1,6 +1,7 @@
 """The twins that stand for the paper's hardware: what they share, what they add."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,12 @@ def reset(env: Any, key: jax.Array) -> Any:
     return jax.jit(lambda k: env.reset(env.model(), k))(key)
 
 
+@cache
+def first(name: str) -> Any:
+    """Where the robot's episodes begin here."""
+    return reset(ENVS[name], jax.random.key(0)).physics
+
+
 GENTLE = {"cartpole": 0.15, "go2": 0.15}
 STRONG = {"cartpole": 0.2, "go2": 0.6}  # of 40 N m/rad: to the motors' limits
 
@@ -39,7 +46,7 @@ def begin(
     env: Any, size: dict[str, float] = GENTLE
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A start, and commands that change every 0.1 s."""
-    physics = reset(env, jax.random.key(0)).physics
+    physics = first(env.name)
     rng = np.random.default_rng(0)
     center = 0.0 if env.name == "cartpole" else env.mj_model.key_ctrl[0]
     ctrl = center + rng.uniform(-1, 1, (5, env.mj_model.nu)) * size[env.name]

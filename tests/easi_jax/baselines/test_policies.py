@@ -121,7 +121,10 @@ def test_a_range_that_holds_the_target_mends_a_poor_policy(poor: Practice) -> No
         Udr(0.5).fit(poor, none, Budget(), jax.random.key(1))
 
 
-@pytest.mark.parametrize("method", [Udr(), Oracle(), FineTune(2_000, 200)])
+@pytest.mark.parametrize(
+    "method",
+    [Udr(), pytest.param(Oracle(), marks=pytest.mark.slow), FineTune(2_000, 200)],
+)
 def test_a_training_takes_what_the_budget_says(method: Any, poor: Practice) -> None:
     none: Any = None
     got = method.fit(poor, none, Budget(trained=600), jax.random.key(1))

@@ -285,7 +285,7 @@ def shapes(places: Any, sizes: Any, masses: Any) -> mujoco.MjModel:
     )
 
 
-@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("order", [1, pytest.param(-1, marks=pytest.mark.slow)])
 def test_length_and_mass(order: int) -> None:
     """Of every solid, in either order, as the compiler has it."""
     kinds, axes, sizes, longer, lengths, masses, heavier = zip(*SHAPES, strict=True)

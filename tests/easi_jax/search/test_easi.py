@@ -332,7 +332,9 @@ def test_the_servo_is_found(source: str) -> None:
         assert info.std[-1, 0] < 0.5 * info.std[0, 0]
 
 
-@pytest.mark.parametrize("start", [(2.0, 4.0), (0.1, 0.15)])
+@pytest.mark.parametrize(
+    "start", [(2.0, 4.0), pytest.param((0.1, 0.15), marks=pytest.mark.slow)]
+)
 def test_the_servo_is_found_from_far_away(start: tuple[float, float]) -> None:
     """All that is measured is then beyond the population's own spread."""
     space = ParameterSpace(
