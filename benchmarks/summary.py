@@ -23,6 +23,7 @@ from benchmarks import (
     parity,
     rivals_summary,
     scaling_summary,
+    strangers,
 )
 from benchmarks._common import RESULTS, markdown_table
 from benchmarks._page import Section, each_of, met, percent, shown, table
@@ -411,6 +412,7 @@ SECTIONS = (
         _found,
     ),
     Section("## A robot of one's own", "own_robot.json", "own_robot", _own_robot),
+    Section("", "strangers.json", "strangers", strangers.paragraphs),
     Section(
         *("## Policies of the other robots", "policies_*.json", "policies", _policies)
     ),
