@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import (
+    compile_times,
     coverage_summary,
     crash_summary,
     engines,
@@ -438,6 +439,10 @@ SECTIONS = (
     Section("", "transfer_kp_*_joint*.json", "transfer --joint 10", _joint),
     Section("## Real cart-pole", "real_cartpole.json", "real_cartpole", _real),
     Section(*("## MuJoCo's features", "parity.json", "parity", parity.paragraphs)),
+    Section(
+        *("## Time to compile the physics", "compile_times.json", "compile_times"),
+        compile_times.paragraphs,
+    ),
     Section("## Hostile and broken files", "fuzz.json", "fuzz", _fuzz),
     Section("## Exported policies", "export.json", "export", _export),
     Section(

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Protocol
+from typing import Any, Protocol
 
 
 class Steps(Protocol):
@@ -11,6 +11,17 @@ class Steps(Protocol):
     def advance(self, n: int = 1) -> None:
         """``n`` steps are done."""
         ...
+
+
+# ``wait(work, seconds)``: what ``work`` returns, which takes about so long; None: it is
+# not known how long.
+Wait = Callable[[Callable[[], Any], float | None], Any]
+
+
+def at_once(work: Callable[[], Any], seconds: float | None) -> Any:
+    """What ``work`` returns; nothing is shown."""
+    del seconds
+    return work()
 
 
 # ``progress(stage, total)``: a context for as long as the stage lasts.

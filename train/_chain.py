@@ -128,12 +128,14 @@ class Chunked:
         self._training_chunk = training_chunk(chunk, setup.pipe.trainer.config)
         self._search_chunk = search_chunk
         self._compiled: dict[Any, Any] = {}
+        self._begun = set[Any]()
 
     def stage(
         self, name: str, total: int, init: Any, step: Any, *args: Any
     ) -> tuple[Any, None]:
         """As `Runner.stage`; what was told is in the run's metrics."""
         from easi_jax.devices.runtime import fast_loops
+        from easi_jax.simulation.compile_time import expected
 
         pipe, seeds = self._setup.pipe, self._setup.seeds
         if name == "search":
@@ -160,7 +162,9 @@ class Chunked:
             self._notes,
             check,
             per_step,
+            None if step in self._begun else expected(pipe.simulator),
         )
+        self._begun.add(step)
         return state, None
 
     def kept(self, name: str, fun: Callable[..., Any], *args: Any) -> Any:

@@ -10,6 +10,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, NoReturn, Protocol, TypeVar
 
@@ -19,6 +20,10 @@ from train._options import EngineOptions
 _Config = TypeVar("_Config")
 
 LOG_SECONDS = 10.0
+_LOOK = 0.2  # s, between two looks at what compiles
+_SHORT = 5.0  # s; of what compiles faster nothing is said
+_LONG = 60.0  # s; beyond, it is said what compiles no physics
+_HINT = " (--engine mujoco compiles no physics)"
 _NUMBER = re.compile(r"[-+]?\d|nan|-?inf|$")
 _PLACE = re.compile(r",? at (?:DOF|ACTUATOR) \d+|\s*Time = .*", re.DOTALL)
 USER_ERROR = 2
@@ -37,6 +42,18 @@ class Progress(Protocol):
 
     def advance(self, n: int = 1, **fields: float | int | str) -> None:
         """``n`` steps are done; ``fields`` are the numbers worth watching.
+
+        Raises:
+            KeyboardInterrupt: where the command was told to stop.
+        """
+        ...
+
+    def compile(self, work: Callable[[], Any], seconds: float | None) -> Any:
+        """What ``work`` returns, whose first part is to compile.
+
+        Args:
+            work: runs beside, so that an interrupt need not wait for it.
+            seconds: that it takes, about; None: shown as any other step.
 
         Raises:
             KeyboardInterrupt: where the command was told to stop.
@@ -196,8 +213,34 @@ def progress(
         yield _Log(name, meter, patience)
 
 
+def compiled(name: str, work: Callable[[], Any], seconds: float | None) -> Any:
+    """As `Progress.compile`, of a stage that consists of nothing else."""
+    if seconds is None or seconds < _SHORT:
+        return work()
+    with progress(name, 1) as shown:
+        result = shown.compile(work, seconds)
+        shown.advance()
+    return result
+
+
+def _beside(work: Callable[[], Any], look: Callable[[], None]) -> Any:
+    """What ``work`` returns; ``look`` is called now and then until it does."""
+    pool = ThreadPoolExecutor(1)
+    found = pool.submit(work)
+    pool.shutdown(wait=False)
+    while not found.done():
+        _interrupt.check()
+        look()
+        wait([found], _LOOK)
+    return found.result()
+
+
 class Meter:
-    """Rate and time left; the first chunk, which compiles, is left out of both."""
+    """Rate and time left; the first chunk, which compiles, is left out of both.
+
+    Attributes:
+        expected: seconds until it is compiled, about; None: not known.
+    """
 
     def __init__(
         self, total: int, done: int = 0, clock: Callable[[], float] = time.monotonic
@@ -208,6 +251,7 @@ class Meter:
         self._begin = clock()
         self._first: tuple[int, float] | None = None
         self._last = self._begin
+        self.expected: float | None = None
 
     def advance(self, n: int) -> None:
         """``n`` further steps are done."""
@@ -241,6 +285,10 @@ class Meter:
         count = f"{self.done}/{self.total}"
         if self.done >= self.total:
             return f"{count}  {duration(self.elapsed)} in all"
+        if self._first is None and self.expected is not None:
+            hint = _HINT if self.expected > _LONG else ""
+            took, of = duration(self.elapsed), duration(self.expected)
+            return f"{count}  compiling, {took} of about {of}{hint}"
         if self.rate is None or self.left is None:
             return f"{count}  {duration(self.elapsed)} so far"
         return f"{count}  {self.rate:.3g}/s  {duration(self.left)} left"
@@ -257,6 +305,9 @@ class _Silent:
     def advance(self, n: int = 1, **fields: float | int | str) -> None:
         _interrupt.check()
 
+    def compile(self, work: Callable[[], Any], seconds: float | None) -> Any:
+        return work()
+
 
 class _Log:
     def __init__(self, name: str, meter: Meter, patience: float) -> None:
@@ -268,7 +319,15 @@ class _Log:
     def advance(self, n: int = 1, **fields: float | int | str) -> None:
         _interrupt.check()
         self._meter.advance(n)
-        ended = self._meter.done >= self._meter.total and self._shown
+        self._show(fields, self._meter.done >= self._meter.total and self._shown)
+
+    def compile(self, work: Callable[[], Any], seconds: float | None) -> Any:
+        if seconds is None or _many():
+            return work()
+        self._meter.expected = seconds
+        return _beside(work, lambda: self._show({}, False))
+
+    def _show(self, fields: dict[str, float | int | str], ended: bool) -> None:
         if ended or self._meter.elapsed >= self._next:
             self._shown = True
             self._next = self._meter.elapsed + LOG_SECONDS
@@ -310,6 +369,12 @@ def _bar(name: str, meter: Meter, patience: float) -> Iterator[Progress]:
             bar.update(task, advance=n, values=_fields(fields))
             if meter.elapsed >= patience:
                 bar.start()
+
+        def compile(self, work: Callable[[], Any], seconds: float | None) -> Any:
+            if seconds is None or _many():
+                return work()
+            meter.expected = seconds
+            return _beside(work, lambda: None)  # the bar moves by itself
 
     try:
         if patience == 0:
@@ -366,6 +431,13 @@ def _heard() -> bool:
     from easi_jax.devices import distributed
 
     return distributed.leader()
+
+
+def _many() -> bool:
+    """Whether several processes share this run: they begin programs in one order."""
+    from easi_jax.devices import distributed
+
+    return distributed.count() > 1
 
 
 def _parted(error: BaseException) -> bool:

@@ -93,6 +93,7 @@ def _search(
     from easi_jax.devices.runtime import fast_loops, quick_compile
     from easi_jax.estimation.from_runs import search_data
     from easi_jax.pipeline.stages import seed_keys
+    from easi_jax.simulation.compile_time import expected
     from train._stages import jit_chunks, run_stage, search_check, search_rows
 
     data = search_data(problem)
@@ -111,5 +112,6 @@ def _search(
         search_rows(seeds, search.space.names, search.space.to_si),
         problem.notes,
         search_check(seeds, search.space.names, search.config.population),
+        seconds=expected(problem.simulator),
     )
     return states

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -25,6 +26,7 @@ def run_stage(
     notes: list[str] | None = None,
     check: Callable[[int, Any], None] | None = None,
     per_step: int = 1,
+    seconds: float | None = None,
 ) -> Any:
     """Takes ``total`` steps in chunks and returns the last state.
 
@@ -40,6 +42,7 @@ def run_stage(
         check: ``check(first_step, info)`` raises where going on is useless; called
             before the checkpoint is written.
         per_step: what the metrics count in one of these steps, such as control steps.
+        seconds: that the first chunk takes to compile, about; None: not known.
     """
     import jax
 
@@ -65,7 +68,8 @@ def run_stage(
     with progress(name, total, done) as meter:
         while done < total:
             n = min(chunk, total - done)
-            state, info = advance(state, n)
+            state, info = meter.compile(partial(advance, state, n), seconds)
+            seconds = None
             state = placed(state)
             info = jax.device_get(distributed.local(info))
             if check is not None:

@@ -1,9 +1,10 @@
 """``python -m train.evaluate``: test a trained policy in any target."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 
-from train._command import main, say, show_table
+from train._command import compiled, main, say, show_table
 from train._options import EngineOptions
 
 _FPS = 25  # frames per second of a video, about
@@ -48,6 +49,7 @@ def run(config: Config) -> None:
     from easi_jax.io.files import atomic_write, to_json
     from easi_jax.io.report.video import check_video, render, write_video
     from easi_jax.pipeline.stages import Pipeline, PipelineConfig, target_parameters
+    from easi_jax.simulation.compile_time import expected
     from train._effects import effect_notes, read_given
     from train._robots import check_seeds, load_policies
 
@@ -66,8 +68,9 @@ def run(config: Config) -> None:
     key = jax.random.key(config.seed)
     keys = jax.random.split(key, len(saved["seeds"]))
     target = jnp.asarray(theta, jnp.float32)
+    play = partial(jax.jit(pipe.play), saved["policies"], target, keys)
     returns, motion = map(
-        np.asarray, jax.jit(pipe.play)(saved["policies"], target, keys)
+        np.asarray, compiled("physics", play, expected(pipe.simulator))
     )
     rows = [
         (s, f"{r.mean():.1f}", f"{r.std():.1f}", f"{r.min():.1f}")

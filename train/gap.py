@@ -2,7 +2,7 @@
 
 from functools import partial
 
-from train._command import main, progress, say
+from train._command import compiled, main, progress, say
 from train._gap_config import Config
 
 _PATIENCE = 5.0  # s; a stage that takes no longer shows no progress
@@ -39,6 +39,7 @@ def run(config: Config) -> None:
         tell=say,
         fixed=problem.fixed,
         progress=partial(progress, patience=_PATIENCE),
+        wait=partial(compiled, "physics"),
     )
     with RunFolder.open(
         config.out,

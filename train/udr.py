@@ -72,6 +72,7 @@ def run(config: Config) -> None:
         target_parameters,
     )
     from easi_jax.rl.presets import algorithm_of
+    from easi_jax.simulation.compile_time import expected
     from envs import open_env
     from train._results import per_seed_json
     from train._stages import jit_chunks, run_stage, training_curve, training_rows
@@ -114,6 +115,7 @@ def run(config: Config) -> None:
             training_rows(config.seeds, training.steps_per_iteration),
             notes,
             per_step=training.steps_per_iteration,
+            seconds=expected(pipe.simulator),
         )
         policies = pipe.policies(states)
         returns, motion = jax.jit(pipe.play)(policies, target, keys["evaluate"])

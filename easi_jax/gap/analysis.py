@@ -45,7 +45,7 @@ from easi_jax.gap.window_set import join, reach, spread, window_set
 from easi_jax.io.runs.step_cache import key_of
 from easi_jax.model.joint_space import is_hinge, scalar_dofs
 from easi_jax.model.parameters import ParameterSpace
-from easi_jax.progress import Progress, silent
+from easi_jax.progress import Progress, Wait, at_once, silent
 from easi_jax.simulation.logged import Logged
 
 _FITTED = (32, 96)  # windows that fits see
@@ -88,6 +88,7 @@ class Analysis:
         tell: Tell = lambda _: None,
         fixed: Mapping[str, float] | None = None,
         progress: Progress = silent,
+        wait: Wait = at_once,
     ) -> None:
         self.m, self.space, self.tell = mj_model, space, tell
         self.fixed = dict(fixed or {})
@@ -125,6 +126,7 @@ class Analysis:
             dt,
             fixed,
             Logged.of(self.runs),
+            wait,
         )
         self.fit_blocks = np.arange(len(repeated) // BLOCK)
         self.held_blocks = np.arange(len(repeated) // BLOCK, self.predictor.blocks)

@@ -32,7 +32,9 @@ from easi_jax.model.effects import Effects
 from easi_jax.model.joint_space import dofs, scalar_places, turns_fully
 from easi_jax.model.mjx_model import Model, for_every_effect
 from easi_jax.model.parameters import ParameterSpace
+from easi_jax.progress import Wait, at_once
 from easi_jax.simulation import native_step
+from easi_jax.simulation.compile_time import expected
 from easi_jax.simulation.logged import Logged
 from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.step import Physics, arrived_step
@@ -108,9 +110,11 @@ class Predictor:
         dt: float,
         fixed: Mapping[str, float] | None = None,
         logged: Logged | None = None,
+        wait: Wait = at_once,
     ) -> None:
         """``fixed``: what the machine has and MJCF cannot say, by address; ``logged``:
-        states of the log that the windows are from."""
+        states of the log that the windows are from; ``wait`` shows what compiles."""
+        self._wait = wait
         self.simulator = Simulator(
             opened(mj_model), space, dt, fixed=fixed, logged=logged
         )
@@ -261,6 +265,8 @@ class Predictor:
                 program = jax.jit(partial(self._sharded, out), compiler_options=quick)
                 lowered = program.lower(*like, *self._data)
                 self._compiled[out] = started(lowered.compile)
+            seconds = expected(self.simulator, len(self._fields) - len(left_out))
+            self._wait(self._compiled[left_out], seconds)
         return self._compiled[left_out]()
 
     def _sharded(

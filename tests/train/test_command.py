@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Literal
@@ -262,6 +263,61 @@ def test_rate_leaves_out_the_chunk_that_compiles():
     now[0] = 66.0  # time left falls between chunks as well
     assert meter.left == pytest.approx(4.0)
     assert meter.summary() == "30/40  2/s  0:04 left"
+
+
+def test_compiling_is_told_with_the_time_that_it_takes():
+    now = [0.0]
+    meter = Meter(total=50, clock=lambda: now[0])
+    meter.expected = 40.0
+    now[0] = 12.0
+    assert meter.summary() == "0/50  compiling, 0:12 of about 0:40"
+    meter.expected = 90.0
+    assert meter.summary() == (
+        "0/50  compiling, 0:12 of about 1:30 (--engine mujoco compiles no physics)"
+    )
+    meter.advance(10)
+    assert meter.summary() == "10/50  0:12 so far"
+
+
+def test_what_compiles_is_told_before_and_while_it_does(capsys, monkeypatch):
+    monkeypatch.setattr(_command, "_LOOK", 0.01)
+    monkeypatch.setattr(_command, "LOG_SECONDS", 0.05)
+    work = lambda: time.sleep(0.2) or "done"  # noqa: E731
+    assert _command.compiled("physics", work, 7.0) == "done"
+    first, *between, last = capsys.readouterr().err.splitlines()
+    assert first == "physics  0/1  compiling, 0:00 of about 0:07"
+    assert between and all("compiling" in line for line in between)
+    assert last == "physics  1/1  0:00 in all"
+    assert _command.compiled("physics", work, None) == "done"
+    assert _command.compiled("physics", work, 1.0) == "done"
+    assert not capsys.readouterr().err
+
+
+def test_a_failure_to_compile_is_not_lost():
+    def work():
+        raise UserError("no such thing")
+
+    with pytest.raises(UserError, match="no such thing"):
+        _command.compiled("physics", work, 60.0)
+
+
+def test_ctrl_c_does_not_wait_for_the_compiler(capsys):
+    ended, begin = threading.Event(), time.monotonic()
+
+    def work():
+        signal.raise_signal(signal.SIGINT)
+        ended.wait(timeout=20)
+
+    def run(config):
+        with progress("search", total=4) as shown:
+            shown.compile(work, 60.0)
+
+    with pytest.raises(SystemExit) as exit_:
+        _call(run, "--out", "a")
+    ended.set()
+    assert exit_.value.code == 130 and time.monotonic() - begin < 10
+    assert "interrupted" in capsys.readouterr().err
+    _call(_nothing, "--out", "a")  # the next command has not been told to stop
 
 
 def test_duration():

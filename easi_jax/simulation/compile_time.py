@@ -1,0 +1,71 @@
+"""How long the physics of MJX will take to compile, before it is compiled."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from easi_jax.devices.runtime import on_cpu
+from easi_jax.model.contact_pairs import pair_ids
+
+if TYPE_CHECKING:
+    from easi_jax.simulation.simulator import Simulator
+
+# Seconds of one core: for any program, and besides for each square of the degrees of
+# freedom, pair of geoms and kind of effect (benchmarks/results/compile_times.json, of
+# arms with up to six joints).
+CONSTANTS = (1.23, 0.421, 3.12, 0.057)
+
+
+@dataclass(frozen=True)
+class Size:
+    """What the time to compile depends on.
+
+    Attributes:
+        joints: degrees of freedom.
+        pairs: of geoms that are compiled.
+        effects: kinds of effects.
+    """
+
+    joints: int
+    pairs: int
+    effects: int
+
+
+def size_of(simulator: "Simulator") -> Size:
+    """The size of a simulator of MJX."""
+    base = simulator.base
+    effects = len(base.present or ()) if base.effects is not None else 0
+    return Size(simulator.mj_model.nv, len(pair_ids(base.mjx)), effects)
+
+
+def fitted(sizes: Sequence[Size], seconds: Sequence[float]) -> list[float]:
+    """The constants that fit times best, as shares of each; none is negative."""
+    from scipy.optimize import nnls
+
+    times = np.asarray(seconds, float)
+    rows = np.array([_terms(s) for s in sizes])
+    found, _ = nnls(rows / times[:, None], np.ones(len(times)))
+    return [float(x) for x in found]
+
+
+def _terms(s: Size) -> tuple[float, ...]:
+    return 1.0, s.joints**2, s.pairs, s.effects
+
+
+def expected_of(size: Size) -> float:
+    """Seconds that a program of this size takes to compile on one core."""
+    return float(np.dot(CONSTANTS, _terms(size)))
+
+
+def expected(simulator: "Simulator", effects: int | None = None) -> float | None:
+    """Seconds until a program that simulates is compiled; None where that was not
+    measured (accelerators), or there is no physics to compile (``mujoco``).
+
+    ``effects`` are how many kinds it has; None: those of the simulator.
+    """
+    if simulator.engine != "mjx" or not on_cpu():
+        return None
+    size = size_of(simulator)
+    return expected_of(size if effects is None else replace(size, effects=effects))
