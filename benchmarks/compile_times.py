@@ -22,7 +22,7 @@ from train._command import main, say
 # Joints, pairs of capsules, effects.
 CASES = (
     *((1, 0, 0), (2, 0, 0), (1, 2, 0), (2, 4, 0), (2, 0, 2), (4, 0, 0)),
-    *((4, 4, 0), (4, 0, 2), (6, 0, 0), (6, 4, 0)),
+    *((4, 4, 0), (4, 0, 2), (6, 0, 0), (6, 4, 0), (12, 0, 0), (12, 4, 0)),
 )
 _STEPS, _BATCH = 50, 128
 _EFFECTS = ("drag.j", "lag.a")
@@ -48,9 +48,10 @@ def run(config: Config) -> None:
     rows = []
     for joints, pairs, effects in CASES:
         size, seconds = compiled(joints, pairs, effects)
-        rows.append({**dataclasses.asdict(size), "seconds": round(seconds, 2)})
-        say(f"{size}: {seconds:.1f} s")
-    sizes = [Size(r["joints"], r["pairs"], r["effects"]) for r in rows]
+        row = {**dataclasses.asdict(size), "effects": effects}
+        rows.append({**row, "seconds": round(seconds, 2)})
+        say(f"{rows[-1]}")
+    sizes = [Size(r["joints"], r["pairs"]) for r in rows]
     constants = fitted(sizes, [r["seconds"] for r in rows])
     command = command_of("benchmarks.compile_times", config)
     path = write_result(
@@ -127,7 +128,7 @@ def paragraphs(result: dict[str, Any]) -> list[str]:
     from easi_jax.simulation.compile_time import Size, expected_of
 
     rows = [
-        {**r, "told": expected_of(Size(r["joints"], r["pairs"], r["effects"]))}
+        {**r, "told": expected_of(Size(r["joints"], r["pairs"]))}
         for r in result["rows"]
     ]
     columns = {

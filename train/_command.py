@@ -23,7 +23,7 @@ LOG_SECONDS = 10.0
 _LOOK = 0.2  # s, between two looks at what compiles
 _SHORT = 5.0  # s; of what compiles faster nothing is said
 _LONG = 60.0  # s; beyond, it is said what compiles no physics
-_HINT = " (--engine mujoco compiles no physics)"
+_HINT = "; --engine mujoco compiles none"
 _NUMBER = re.compile(r"[-+]?\d|nan|-?inf|$")
 _PLACE = re.compile(r",? at (?:DOF|ACTUATOR) \d+|\s*Time = .*", re.DOTALL)
 USER_ERROR = 2
@@ -53,7 +53,8 @@ class Progress(Protocol):
 
         Args:
             work: runs beside, so that an interrupt need not wait for it.
-            seconds: that it takes, about; None: shown as any other step.
+            seconds: that its physics take to compile, about; where they are few, or
+                None, it is as any other step.
 
         Raises:
             KeyboardInterrupt: where the command was told to stop.
@@ -239,7 +240,7 @@ class Meter:
     """Rate and time left; the first chunk, which compiles, is left out of both.
 
     Attributes:
-        expected: seconds until it is compiled, about; None: not known.
+        expected: seconds that its physics take to compile, about; None: not known.
     """
 
     def __init__(
@@ -288,7 +289,7 @@ class Meter:
         if self._first is None and self.expected is not None:
             hint = _HINT if self.expected > _LONG else ""
             took, of = duration(self.elapsed), duration(self.expected)
-            return f"{count}  compiling, {took} of about {of}{hint}"
+            return f"{count}  compiling, {took} (physics: about {of}{hint})"
         if self.rate is None or self.left is None:
             return f"{count}  {duration(self.elapsed)} so far"
         return f"{count}  {self.rate:.3g}/s  {duration(self.left)} left"
@@ -322,7 +323,7 @@ class _Log:
         self._show(fields, self._meter.done >= self._meter.total and self._shown)
 
     def compile(self, work: Callable[[], Any], seconds: float | None) -> Any:
-        if seconds is None or _many():
+        if seconds is None or seconds < _SHORT or _many():
             return work()
         self._meter.expected = seconds
         return _beside(work, lambda: self._show({}, False))
@@ -371,7 +372,7 @@ def _bar(name: str, meter: Meter, patience: float) -> Iterator[Progress]:
                 bar.start()
 
         def compile(self, work: Callable[[], Any], seconds: float | None) -> Any:
-            if seconds is None or _many():
+            if seconds is None or seconds < _SHORT or _many():
                 return work()
             meter.expected = seconds
             return _beside(work, lambda: None)  # the bar moves by itself

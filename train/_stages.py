@@ -42,7 +42,7 @@ def run_stage(
         check: ``check(first_step, info)`` raises where going on is useless; called
             before the checkpoint is written.
         per_step: what the metrics count in one of these steps, such as control steps.
-        seconds: that the first chunk takes to compile, about; None: not known.
+        seconds: that its physics take to compile, about; None: not known.
     """
     import jax
 

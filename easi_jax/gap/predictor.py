@@ -265,8 +265,7 @@ class Predictor:
                 program = jax.jit(partial(self._sharded, out), compiler_options=quick)
                 lowered = program.lower(*like, *self._data)
                 self._compiled[out] = started(lowered.compile)
-            seconds = expected(self.simulator, len(self._fields) - len(left_out))
-            self._wait(self._compiled[left_out], seconds)
+            self._wait(self._compiled[left_out], expected(self.simulator))
         return self._compiled[left_out]()
 
     def _sharded(

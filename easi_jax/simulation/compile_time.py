@@ -1,7 +1,7 @@
 """How long the physics of MJX will take to compile, before it is compiled."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,10 +12,10 @@ from easi_jax.model.contact_pairs import pair_ids
 if TYPE_CHECKING:
     from easi_jax.simulation.simulator import Simulator
 
-# Seconds of one core: for any program, and besides for each square of the degrees of
-# freedom, pair of geoms and kind of effect (benchmarks/results/compile_times.json, of
-# arms with up to six joints).
-CONSTANTS = (1.23, 0.421, 3.12, 0.057)
+# Seconds of one core: for any program, and besides for each degree of freedom to the
+# power of 1.5 and pair of geoms (benchmarks/results/compile_times.json, of arms with up
+# to twelve joints). Effects take no time that could be measured.
+CONSTANTS = (0.62, 0.901, 3.21)
 
 
 @dataclass(frozen=True)
@@ -25,19 +25,15 @@ class Size:
     Attributes:
         joints: degrees of freedom.
         pairs: of geoms that are compiled.
-        effects: kinds of effects.
     """
 
     joints: int
     pairs: int
-    effects: int
 
 
 def size_of(simulator: "Simulator") -> Size:
     """The size of a simulator of MJX."""
-    base = simulator.base
-    effects = len(base.present or ()) if base.effects is not None else 0
-    return Size(simulator.mj_model.nv, len(pair_ids(base.mjx)), effects)
+    return Size(simulator.mj_model.nv, len(pair_ids(simulator.base.mjx)))
 
 
 def fitted(sizes: Sequence[Size], seconds: Sequence[float]) -> list[float]:
@@ -51,7 +47,7 @@ def fitted(sizes: Sequence[Size], seconds: Sequence[float]) -> list[float]:
 
 
 def _terms(s: Size) -> tuple[float, ...]:
-    return 1.0, s.joints**2, s.pairs, s.effects
+    return 1.0, s.joints**1.5, s.pairs
 
 
 def expected_of(size: Size) -> float:
@@ -59,13 +55,10 @@ def expected_of(size: Size) -> float:
     return float(np.dot(CONSTANTS, _terms(size)))
 
 
-def expected(simulator: "Simulator", effects: int | None = None) -> float | None:
+def expected(simulator: "Simulator") -> float | None:
     """Seconds until a program that simulates is compiled; None where that was not
     measured (accelerators), or there is no physics to compile (``mujoco``).
-
-    ``effects`` are how many kinds it has; None: those of the simulator.
     """
     if simulator.engine != "mjx" or not on_cpu():
         return None
-    size = size_of(simulator)
-    return expected_of(size if effects is None else replace(size, effects=effects))
+    return expected_of(size_of(simulator))

@@ -270,10 +270,10 @@ def test_compiling_is_told_with_the_time_that_it_takes():
     meter = Meter(total=50, clock=lambda: now[0])
     meter.expected = 40.0
     now[0] = 12.0
-    assert meter.summary() == "0/50  compiling, 0:12 of about 0:40"
+    assert meter.summary() == "0/50  compiling, 0:12 (physics: about 0:40)"
     meter.expected = 90.0
     assert meter.summary() == (
-        "0/50  compiling, 0:12 of about 1:30 (--engine mujoco compiles no physics)"
+        "0/50  compiling, 0:12 (physics: about 1:30; --engine mujoco compiles none)"
     )
     meter.advance(10)
     assert meter.summary() == "10/50  0:12 so far"
@@ -285,7 +285,7 @@ def test_what_compiles_is_told_before_and_while_it_does(capsys, monkeypatch):
     work = lambda: time.sleep(0.2) or "done"  # noqa: E731
     assert _command.compiled("physics", work, 7.0) == "done"
     first, *between, last = capsys.readouterr().err.splitlines()
-    assert first == "physics  0/1  compiling, 0:00 of about 0:07"
+    assert first == "physics  0/1  compiling, 0:00 (physics: about 0:07)"
     assert between and all("compiling" in line for line in between)
     assert last == "physics  1/1  0:00 in all"
     assert _command.compiled("physics", work, None) == "done"

@@ -24,7 +24,7 @@ RESULT = Path(__file__).parents[3] / "benchmarks" / "results" / "compile_times.j
 
 
 def test_the_fit_finds_what_made_the_times() -> None:
-    sizes = [Size(j, p, e) for j in (1, 3, 6) for p in (0, 4) for e in (0, 2)]
+    sizes = [Size(j, p) for j in (1, 3, 6) for p in (0, 4)]
     times = [expected_of(s) for s in sizes]
     np.testing.assert_allclose(fitted(sizes, times), CONSTANTS, rtol=1e-6)
 
@@ -33,7 +33,7 @@ def test_the_constants_are_those_of_the_committed_measurement() -> None:
     told = json.loads(RESULT.read_text())
     assert told["constants"] == pytest.approx(CONSTANTS, rel=0.02, abs=0.01)
     rows = told["rows"]
-    sizes = [Size(r["joints"], r["pairs"], r["effects"]) for r in rows]
+    sizes = [Size(r["joints"], r["pairs"]) for r in rows]
     times = [r["seconds"] for r in rows]
     assert told["constants"] == pytest.approx(fitted(sizes, times))
     off = np.array([expected_of(s) for s in sizes]) / times
@@ -46,8 +46,7 @@ def test_pairs_that_are_left_out_cost_nothing_and_native_compiles_none() -> None
     still = Logged(np.zeros((2, 2)), np.zeros((2, 2)), np.zeros((2, 2)))
     every = Simulator(m, space)
     fewer = Simulator(m, space, logged=still)
-    fixed = Simulator(m, space, fixed={"effect.drag.j0": 0.1, "effect.lag.a1": 0.01})
-    assert size_of(every) == Size(2, len(pair_ids(m)), 0) and pair_ids(m)
-    assert size_of(fewer) == Size(2, 0, 0) and size_of(fixed).effects == 2
-    assert (expected(fewer) or 0) < (expected(every) or 0) < (expected(fixed) or 0)
+    assert size_of(every) == Size(2, len(pair_ids(m))) and pair_ids(m)
+    assert size_of(fewer) == Size(2, 0)
+    assert (expected(fewer) or 0) < (expected(every) or 0)
     assert expected(Simulator(m, space, engine="mujoco")) is None
