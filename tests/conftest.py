@@ -40,6 +40,12 @@ LONGEST = (
     *("train/test_easi_from_logs.py", "envs/test_registry.py", "train/test_gap.py"),
     *("train/test_gap_shared.py", "train/test_gap_set.py", "train/test_gap_pairs.py"),
     *("examples/test_your_own_robot.py", "train/test_every_robot.py"),
+    *("train/test_effects_option.py", "train/test_gap_details.py"),
+    *("easi_jax/search/test_easi.py", "easi_jax/baselines/test_baselines.py"),
+    "easi_jax/estimation/test_differences.py",
+    "easi_jax/estimation/test_levenberg_marquardt.py",
+    "easi_jax/estimation/test_profile_score.py",
+    *("easi_jax/estimation/test_polish.py", "test_paper_twin.py"),
     *("easi_jax/model/test_found_effects.py", "easi_jax/estimation/test_posterior.py"),
 )
 
