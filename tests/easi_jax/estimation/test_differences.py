@@ -33,13 +33,28 @@ def problem(cartpole: Cartpole, trajectories: Segments) -> Any:
 
 def normal(problem: Any, free_starts: bool, unit: Any = None) -> Normal:
     simulator, space, pieces = problem
-    paired = PairedFit(simulator, space, pieces, NOISE, None, free_starts)
     if unit is None:
         off = np.where(np.arange(space.size) % 2, 0.9, 1.1)
         unit = space.to_unit(jnp.asarray(off * space.nominal))
     delta = 1e-3 * jnp.ones((pieces.count, 4))
-    run = jax.jit(lambda u, d: paired.normal(u, d, step_weights(pieces, NOISE)))
-    return run(unit, delta)
+    run = program(simulator, space, free_starts, simulator.by_differences)
+    return run(pieces, unit, delta)
+
+
+@cache
+def program(
+    simulator: Simulator, space: ParameterSpace, free_starts: bool, differences: bool
+) -> Callable[..., Normal]:
+    """Compiled once for all pieces. The simulator says when it is traced, which is at
+    once, whether it goes by ``differences``."""
+    assert simulator.by_differences == differences
+
+    @jax.jit
+    def run(pieces: Segments, unit: jax.Array, delta: jax.Array) -> Normal:
+        paired = PairedFit(simulator, space, pieces, NOISE, None, free_starts)
+        return paired.normal(unit, delta, step_weights(pieces, NOISE))
+
+    return run
 
 
 @pytest.fixture(scope="module")
