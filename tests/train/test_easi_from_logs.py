@@ -303,7 +303,7 @@ def test_bad_input_is_one_line(spoil, files, capsys):
 def test_what_mjx_lacks_is_one_line_with_that_engine(files, capsys):
     delayed = 'joint="hinge" delay="0.02" nsample="4"/>'
     edit(files["model"], 'joint="hinge"/>', delayed)
-    refuse(capsys, arguments(files, "--engine", "mjx"), "history", "--engine mujoco")
+    refuse(capsys, arguments(files, "--engine", "mjx"), "nsample", "--engine mujoco")
     assert not files["out"].exists()
 
 
