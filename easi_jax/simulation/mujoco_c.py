@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-from collections.abc import Iterator
 from functools import reduce
 from typing import Any
 
@@ -14,11 +13,6 @@ import numpy as np
 from easi_jax.model.addresses import open_gates, resolve
 from easi_jax.simulation.simulator import Simulator
 
-# What `mj_setConst` computes, and the compiler.
-_DERIVED = {
-    *("body_subtreemass", "body_invweight0", "dof_invweight0", "dof_M0"),
-    *("tendon_invweight0", "actuator_acc0", "cam_poscom0", "stat.meaninertia"),
-}
 _MOVE = 0.1  # of an initial range, which shows what a parameter sets
 
 
@@ -36,39 +30,43 @@ class InMujoco:
     """
 
     def __init__(self, simulator: Simulator) -> None:
+        m, fixed = simulator.mj_model, simulator.fixed
+        # MuJoCo C leaves out of a simple body's inertia what is zero.
+        lost = {
+            w.parameter
+            for w in resolve(m, (*simulator.space.addresses, *((a,) for a in fixed)))
+            if w.row.moves_center and _simple(m, w)
+        }
+        count = simulator.space.size
+        self._kept = [k for k in range(count) if k not in lost]
+        names = [simulator.space.names[k] for k in self._kept]
         # A space of its own: jax keeps arrays that it has once seen as doubles.
-        space = dataclasses.replace(simulator.space)
-        every = (*space.addresses, *((a,) for a in simulator.fixed))
-        self.base = open_gates(simulator.mj_model, [a for p in every for a in p])
+        space = dataclasses.replace(simulator.space.select(names))
+        lasting = [a for k, a in enumerate(fixed) if count + k not in lost]
+        every = [a for given in simulator.space.addresses for a in given]
+        self.base = open_gates(m, [*every, *fixed])
         with jax.enable_x64(True):
-            double = simulator.rebuilt(space=space)
-            first = double.base.mjx
-            unit = jnp.full(space.size, 0.5)
-            moved = double.model(space.to_si(unit)).mjx
-            names = [n for n in _leaves(moved) if n not in _DERIVED]
-            changed = [n for n in names if _get(moved, n) is not _get(first, n)]
+            double = Simulator(
+                *(m, space, simulator.dt),
+                torque_speed=simulator.base.torque_speed,
+                fixed={a: fixed[a] for a in lasting},
+                engine="mujoco",
+            )
+            self.base.opt.timestep = double.base.mjx.template.mj.opt.timestep
+            _set(self.base, double.base.mjx.changed)
 
             def written(unit: jax.Array) -> dict[str, jax.Array]:
                 low, high = space.bounds
-                si = jnp.clip(space.to_si(unit), low, high)
-                model = double.model(si).mjx
-                return {n: _get(model, n) for n in changed}
+                return double.model(jnp.clip(space.to_si(unit), low, high)).mjx.changed
 
+            # Compiled: one by one the same writes are hundreds of small programs.
             self._written = jax.jit(written)
-            _set(self.base, {n: _get(first, n) for n in names})
-            ways = np.concatenate([np.zeros((1, space.size)), np.eye(space.size)])
-            tried = [self._values(0.5 + _MOVE * way) for way in ways]
+            ways = np.concatenate([np.zeros((1, count)), np.eye(count)])
+            first, *tried = [self._values(0.5 + _MOVE * way) for way in ways]
         self.reaches = np.array(
-            [
-                any(np.any(tried[0][n] != other[n]) for n in changed)
-                for other in tried[1:]
-            ],
+            [any(np.any(first[n] != x) for n, x in other.items()) for other in tried],
             bool,
         )
-        for w in resolve(simulator.mj_model, space.addresses):
-            # MuJoCo C, too, leaves out of such a body's inertia what is zero.
-            if w.row.moves_center and _simple(simulator.mj_model, w):
-                self.reaches[w.parameter] = False
 
     def at(self, unit: np.ndarray) -> mujoco.MjModel:
         """The model at unit coordinates ``(n,)``, inside the physical bounds."""
@@ -78,24 +76,8 @@ class InMujoco:
         return m
 
     def _values(self, unit: np.ndarray) -> dict[str, np.ndarray]:
-        found = self._written(jnp.asarray(unit, jnp.float64))
+        found = self._written(jnp.asarray(unit[self._kept], jnp.float64))
         return {n: np.asarray(v) for n, v in found.items()}
-
-
-def _leaves(tree: Any, prefix: str = "") -> Iterator[str]:
-    """Names of the arrays of an `mjx.Model` that an `MjModel` has, too."""
-    for field in dataclasses.fields(tree):
-        value, name = getattr(tree, field.name), prefix + field.name
-        if field.name == "_impl":
-            continue
-        if dataclasses.is_dataclass(value):
-            yield from _leaves(value, f"{name}.")
-        elif isinstance(value, jax.Array):
-            yield name
-
-
-def _get(tree: Any, name: str) -> Any:
-    return reduce(getattr, name.split("."), tree)
 
 
 def _set(m: mujoco.MjModel, values: dict[str, Any]) -> None:
