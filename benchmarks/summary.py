@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import (
+    commands,
     compile_times,
     coverage_summary,
     crash_summary,
@@ -439,6 +440,7 @@ SECTIONS = (
     Section("", "transfer_kp_*_joint*.json", "transfer --joint 10", _joint),
     Section("## Real cart-pole", "real_cartpole.json", "real_cartpole", _real),
     Section(*("## MuJoCo's features", "parity.json", "parity", parity.paragraphs)),
+    *commands.SECTIONS,
     Section(
         *("## Time to compile the physics", "compile_times.json", "compile_times"),
         compile_times.paragraphs,

@@ -2,6 +2,7 @@
 
 import importlib.util
 import inspect
+import numbers
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -61,7 +62,8 @@ def load(path: Path, *, engine: str = "auto") -> Any:
     ``examples/my_robot/env.py``. ``engine``: as for `make`.
 
     Raises:
-        UserError: no such file, an error in it, or an environment that lacks something.
+        UserError: no such file, an error in it, or an environment that lacks something
+            or in which no policy can act.
     """
     if path.suffix != ".py":
         raise UserError(f"--env {path}: give a Python file (.py) that defines make()")
@@ -92,6 +94,14 @@ def load(path: Path, *, engine: str = "auto") -> Any:
             f"--env {path}: the environment that make() returns lacks "
             f"{', '.join(missing)} (template: examples/my_robot/env.py)"
         )
+    for name in ("obs_size", "action_size", "episode_length"):
+        count = getattr(env, name)
+        if not isinstance(count, numbers.Integral) or int(count) < 1:
+            hint = " (its model has no actuators)" * (env.mj_model.nu == 0)
+            raise UserError(
+                f"--env {path}: {name} is {count!r}: a policy needs a whole number "
+                f"from 1{hint * (name == 'action_size')}"
+            )
     return env
 
 

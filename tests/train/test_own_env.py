@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.commands import ENV
+from benchmarks.parity_models import feature_models
 from easi_jax.errors import UserError
 from envs import load, open_env
 from train import easi, evaluate, udr
@@ -37,6 +39,16 @@ def test_a_broken_file_gets_one_line(text: str, said: str, tmp_path: Path) -> No
         load(_file(tmp_path, text))
     message = str(caught.value)
     assert said in message and str(tmp_path) in message and "\n" not in message
+
+
+def test_a_robot_that_nothing_drives_has_no_policy(tmp_path: Path) -> None:
+    """With action_size = nu = 0 `train.udr` ended in a traceback, its folder begun."""
+    model, out = tmp_path / "m.xml", tmp_path / "udr"
+    model.write_text(feature_models()["solver PGS"])
+    env = _file(tmp_path, ENV.format(model=str(model)))
+    with pytest.raises(UserError, match="action_size is 0: .* has no actuators"):
+        udr.run(udr.Config(env=env, out=out))
+    assert not out.exists()
 
 
 def test_a_missing_file_and_another_kind_of_file(tmp_path: Path) -> None:
