@@ -15,6 +15,7 @@ import contextlib
 import dataclasses
 import io
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -28,15 +29,16 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from benchmarks._cells import Share, add_row, run_cells
+from benchmarks._cells import Share, add_row, read_rows, run_cells, shard
 from benchmarks._common import RESULTS, commits_of
 from benchmarks._page import Section, load, table
 from benchmarks.parity_models import feature_models
-from train._command import INTERRUPTED, USER_ERROR, main
+from train._command import INTERRUPTED, USER_ERROR, main, say
 
 COMMANDS = ("parameters", "easi", "udr", "evaluate")
 FILES, REFUSED, FAILED = "files", "one line", "TRACEBACK"
 LATE = "too long"
+_CRASHES = {signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL}
 _LATE_STATUS = 75  # of a process whose model took too long
 # Programs run for a moment only, so that they need not be fast.
 _QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
@@ -89,22 +91,41 @@ def run(config: Config) -> None:
     words = [sys.executable, "-m", "benchmarks.commands", *given]
     env = {**os.environ, "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {_QUICK}"}
     root, status = RESULTS.parents[1], _LATE_STATUS
-    while status == _LATE_STATUS:
+    while status == _LATE_STATUS or -status in _CRASHES:
         status = subprocess.run(words, cwd=root, env=env, check=False).returncode
+        if -status in _CRASHES:
+            add_row(config.out, _crashed(config, signal.Signals(-status).name))
     if status:
         raise SystemExit(status)
+
+
+def _crashed(config: Config, name: str) -> dict[str, Any]:
+    """The line of the model at which a process was ended by a signal."""
+    from easi_jax.io.runs.versions import versions
+
+    part, parts = shard(config.shard)
+    done = {r["key"] for r in read_rows(config.out)}
+    mine = [config.only] if config.only else [c.key for c in cells()]
+    key = next(k for k in mine[part - 1 :: parts] if k not in done)
+    end = {"outcome": FAILED, "said": f"the process ended by {name}", "seconds": 0.0}
+    row = {"key": key, "engine": "", "commands": {"?": end}, "versions": versions()}
+    say(f"{key}: {_told(row)}")
+    return row
 
 
 def cells() -> list[Cell]:
     """All models, those of one kind as far apart as can be; first those that MJX
     deviates on, which compile no physics."""
-    kinds: defaultdict[str, list[Cell]] = defaultdict(list)
-    for name in feature_models():
-        kinds[name.split()[0]].append(Cell(name))
     known = load(RESULTS, "parity.json") or {"features": {}}
     native = {n for n, r in known["features"].items() if r["engine"] == "mujoco"}
-    found = [c for row in zip_longest(*kinds.values()) for c in row if c]
-    return sorted(found, key=lambda c: c.key not in native)
+    found: list[Cell] = []
+    for now in (True, False):
+        kinds: defaultdict[str, list[Cell]] = defaultdict(list)
+        for name in feature_models():
+            if (name in native) == now:
+                kinds[name.split()[0]].append(Cell(name))
+        found += [c for row in zip_longest(*kinds.values()) for c in row if c]
+    return found
 
 
 def _work(config: Config) -> None:

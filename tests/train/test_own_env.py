@@ -46,7 +46,7 @@ def test_a_robot_that_nothing_drives_has_no_policy(tmp_path: Path) -> None:
     model, out = tmp_path / "m.xml", tmp_path / "udr"
     model.write_text(feature_models()["solver PGS"])
     env = _file(tmp_path, ENV.format(model=str(model)))
-    with pytest.raises(UserError, match="action_size is 0: .* has no actuators"):
+    with pytest.raises(UserError, match=r"action_size is 0: .* has no actuators"):
         udr.run(udr.Config(env=env, out=out))
     assert not out.exists()
 
