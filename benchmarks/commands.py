@@ -251,16 +251,17 @@ def _outcome(kind: str, line: str, since: float) -> dict[str, Any]:
 
 
 def write_recording(model: Path, log: Path) -> None:
-    """Two seconds by MuJoCo C, pushed at the start, commands that wave in their range.
-    What no engine runs is recorded without its motion."""
+    """Two seconds by MuJoCo C, pushed at the start, commands that wave in their range;
+    also of what no engine here runs."""
     import mujoco
     import numpy as np
 
     from easi_jax.io.logs.columns import log_columns
     from easi_jax.io.logs.tables import write_table
-    from easi_jax.io.models.completed import as_read
+    from easi_jax.io.models.completed import named
 
-    m = as_read(model).compile()
+    spec = mujoco.MjSpec.from_file(str(model))
+    m = named(spec, spec.compile())
     d, columns, rows = mujoco.MjData(m), log_columns(m), []
     d.qvel[:] = _PUSH
     low, high = np.where(m.actuator_ctrllimited, m.actuator_ctrlrange.T, [[-1], [1]])

@@ -45,6 +45,13 @@ def test_files_a_line_and_a_traceback(tmp_path: Path) -> None:
     assert _outcome(idle, missing, "--model", model)[1] == "no none.yaml"
 
 
+def test_what_no_engine_runs_is_recorded(tmp_path: Path) -> None:
+    model, log = tmp_path / "m.xml", tmp_path / "log.csv"
+    model.write_text(feature_models()["flag sleep enabled"])
+    commands.write_recording(model, log)
+    assert len(log.read_text().splitlines()) == 251
+
+
 @pytest.mark.parametrize("name", ["actuator motor", "ball limit", "solver PGS"])
 def test_a_recording_of_a_model_is_read_as_a_log(name: str, tmp_path: Path) -> None:
     from easi_jax.io.logs.reader import read_logs
