@@ -26,6 +26,7 @@ from benchmarks import (
     rivals_summary,
     scaling_summary,
     strangers,
+    where_tests_spend,
 )
 from benchmarks._common import RESULTS, markdown_table
 from benchmarks._page import Section, each_of, met, percent, shown, table
@@ -455,6 +456,7 @@ SECTIONS = (
     *paper_tables.SECTIONS,
     *rivals_summary.SECTIONS,
     *scaling_summary.SECTIONS,
+    *where_tests_spend.SECTIONS,
     Section("## Lines by package", "lines.json", "lines", lines.paragraphs),
 )
 

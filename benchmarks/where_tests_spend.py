@@ -19,7 +19,8 @@ from typing import Any
 
 import pytest
 
-from benchmarks._common import markdown_table, write_result
+from benchmarks._common import write_result
+from benchmarks._page import Section, table
 from train._command import main, say
 
 FOLDER = "EASI_JAX_TEST_TIMES"  # environment variable: where workers write their rows
@@ -138,9 +139,48 @@ def run(config: Config) -> None:
         slowest=slowest,
         files=dict(sorted(by_file.items(), key=lambda item: -item[1]["seconds"])),
     )
-    table = [(row["test"], row["seconds"]) for row in slowest]
-    say(markdown_table(("test", "s"), table))
+    say(table(slowest, {"test": "{test}", "s": "{seconds}"}))
     say(f"{len(rows)} tests in {wall:.0f} s, exit status {status}: {path}")
+
+
+def _spending(found: dict[str, Any]) -> list[str]:
+    said = []
+    for name, r in found.items():
+        t = r["total"]
+        said += [
+            f"{name}: {r['tests']} default tests in {r['wall']:.0f} s with 2 workers, "
+            f"{t['jaxpr_trace'] + t['jaxpr_to_mlir_module']:.0f} s of tracing and "
+            f"lowering, {t['backend_compile']:.0f} s of compiling. The slowest, with "
+            "what is made for the first test of a file:",
+            table(r["slowest"], {"test": "`{test}`", "s": "{seconds}"}),
+        ]
+    return said
+
+
+def _runs(rows: list[dict[str, Any]]) -> list[str]:
+    columns = {
+        "command": "`{command}`",
+        "commit": "{commit}",
+        "passed, failed": "{passed}, {failed}",
+        "pytest": "{pytest_s:.0f} s",
+        "in all": "{seconds:.0f} s",
+        "other work on the cores": "{load}",
+    }
+    return [
+        "In a fresh clone, with nothing cached, on 2 cores (goal 600 s):",
+        table(rows, columns),
+    ]
+
+
+SECTIONS = (
+    Section("## Time of the tests", "test_runs.jsonl", "where_tests_spend", _runs),
+    Section(
+        "",
+        {"Before": "test_times_before.json", "Now": "test_times.json"},
+        "where_tests_spend",
+        _spending,
+    ),
+)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """The engine `mujoco`: native MuJoCo, called from compiled programs."""
 
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,13 @@ _EFFECTS: dict[str, dict[str, float]] = {
         "effect.slip.floor/tip": 0.5,
     },
 }
+# Every two of them that share no number.
+_PAIRS = [
+    (a, b)
+    for a, b in itertools.combinations(list(_EFFECTS)[1:-1], 2)
+    if not {*_EFFECTS[a]} & {*_EFFECTS[b]}
+]
+_ROWS = [*_EFFECTS.values(), *({**_EFFECTS[a], **_EFFECTS[b]} for a, b in _PAIRS)]
 
 
 def _model(integrator: str = "implicitfast", xml: str = _ARM) -> mujoco.MjModel:
@@ -182,7 +190,7 @@ def test_models_leave_nothing_to_the_next_ones() -> None:
 
 @pytest.fixture(scope="module")
 def effects_on_both() -> dict[str, Any]:
-    """Predictions by engine, a row for each of `_EFFECTS`."""
+    """Predictions by engine, a row for each of `_ROWS`."""
     m = _model()
     places = sorted({a for numbers in _EFFECTS.values() for a in numbers})
     spread = [f"effect.spread.{a.split('.')[2]}" for a in places if ".mass." in a]
@@ -202,8 +210,8 @@ def effects_on_both() -> dict[str, Any]:
         for a in places
     )
     space = ParameterSpace(parameters)
-    rows = np.tile(np.asarray(space.nominal, float), (len(_EFFECTS), 1))
-    for row, numbers in zip(rows, _EFFECTS.values(), strict=True):
+    rows = np.tile(np.asarray(space.nominal, float), (len(_ROWS), 1))
+    for row, numbers in zip(rows, _ROWS, strict=True):
         for address, value in numbers.items():
             row[places.index(address)] = value
     seg = _segments(m, 4, 6)
@@ -219,11 +227,31 @@ def test_every_effect_is_the_same_on_both(
     effects_on_both: dict[str, Any], effect: str
 ) -> None:
     row = list(_EFFECTS).index(effect)
-    (q, v), (q_c, v_c) = effects_on_both["mjx"], effects_on_both["mujoco"]
-    moved = np.abs(v_c[row] - v_c[0]).max()
+    moved, apart, apart_q = _differences(effects_on_both, row)
     assert moved > 0.01, "the effect changes too little to be compared"
-    assert np.abs(v[row] - v_c[row]).max() < 0.02 * moved + 2e-3
-    assert np.abs(q[row] - q_c[row]).max() < 5e-4
+    assert apart < 0.02 * moved + 2e-3
+    assert apart_q < 5e-4
+
+
+def test_every_pair_of_effects_is_the_same_on_both(
+    effects_on_both: dict[str, Any],
+) -> None:
+    apart = []
+    for row, pair in enumerate(_PAIRS, len(_EFFECTS)):
+        moved, v, q = _differences(effects_on_both, row)
+        if not (v < 0.02 * moved + 2e-3 and q < 5e-4):
+            apart.append((pair, moved, v, q))
+    assert not apart
+    assert len(_PAIRS) > 200
+
+
+def _differences(both: dict[str, Any], row: int) -> tuple[float, float, float]:
+    """How far effects move velocities; between the engines, velocities and positions:
+    the largest."""
+    (q, v), (q_c, v_c) = both["mjx"], both["mujoco"]
+    pairs = ((v_c[row], v_c[0]), (v[row], v_c[row]), (q[row], q_c[row]))
+    moved, apart, apart_q = (float(np.abs(a - b).max()) for a, b in pairs)
+    return moved, apart, apart_q
 
 
 def test_what_diverges_is_not_a_number_and_alone() -> None:
