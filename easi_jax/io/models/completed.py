@@ -38,8 +38,8 @@ def new_names(m: mujoco.MjModel) -> tuple[dict[int, str], dict[int, str]]:
         },
         {m.joint(j).name for j in range(m.njnt)},
     )
-    actuators = {}
-    for a in range(m.nu):
+    actuators, drives = {}, range(len(m.actuator_trntype))  # not nu: <pid> has several
+    for a in drives:
         kind = _TARGETS.get(mujoco.mjtTrn(int(m.actuator_trntype[a])))
         target = int(m.actuator_trnid[a, 0])
         if m.actuator(a).name:
@@ -47,7 +47,7 @@ def new_names(m: mujoco.MjModel) -> tuple[dict[int, str], dict[int, str]]:
         named = joints.get(target) if kind == "joint" else None
         name = named or (_called(m, kind, target) if kind else f"drive{a}")
         actuators[a] = f"{name}_actuator"
-    return joints, _unique(actuators, {m.actuator(a).name for a in range(m.nu)})
+    return joints, _unique(actuators, {m.actuator(a).name for a in drives})
 
 
 def _called(m: mujoco.MjModel, kind: str, i: int) -> str:

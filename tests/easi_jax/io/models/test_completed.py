@@ -10,7 +10,7 @@ import easi_jax
 from easi_jax.errors import UserError
 from easi_jax.io.logs.columns import log_columns
 from easi_jax.io.logs.reader import first_pose, read_logs
-from easi_jax.io.models.completed import held_joint, names_note
+from easi_jax.io.models.completed import held_joint, names_note, new_names
 from easi_jax.io.models.mjcf import read_mjcf
 from easi_jax.io.models.repaired_mjcf import deviations, repaired_model
 from easi_jax.model.effect_numbers import EffectEntry
@@ -182,3 +182,13 @@ def test_held_base_in_a_command(
     assert joints(given.mj_model) == JOINTS[1:]
     assert given.mj_model.body("base").pos[2] == 1  # of the key frame
     capsys.readouterr()
+
+
+def test_an_actuator_of_several_commands_gets_one_name() -> None:
+    m = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body name='arm'><joint name='hinge'/><geom size='.1'/>"
+        "</body></worldbody><actuator><pid joint='hinge' kp='5' ki='1' kv='.1'/>"
+        "</actuator></mujoco>"
+    )
+    assert m.nu > 1 == len(m.actuator_trntype)
+    assert new_names(m) == ({}, {0: "hinge_actuator"})
