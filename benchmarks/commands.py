@@ -261,6 +261,10 @@ def write_recording(model: Path, log: Path) -> None:
     from easi_jax.io.models.completed import named
 
     spec = mujoco.MjSpec.from_file(str(model))
+    m = spec.compile()
+    if m.nu != len(m.actuator_trntype):  # no column for several commands of a drive
+        for drive in list(spec.actuators):
+            spec.delete(drive)
     m = named(spec, spec.compile())
     d, columns, rows = mujoco.MjData(m), log_columns(m), []
     d.qvel[:] = _PUSH

@@ -161,8 +161,9 @@ def _runs(rows: list[dict[str, Any]]) -> list[str]:
     columns = {
         "command": "`{command}`",
         "commit": "{commit}",
-        "passed, failed": "{passed}, {failed}",
-        "pytest": "{pytest_s:.0f} s",
+        "passed": "{passed}",
+        "failed": "{failed}",
+        "pytest": lambda r: f"{r['pytest_s']:.0f} s" if r["pytest_s"] else "",
         "in all": "{seconds:.0f} s",
         "other work on the cores": "{load}",
     }
