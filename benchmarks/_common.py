@@ -86,19 +86,20 @@ def wander(env: Any) -> Callable[[Any, Any], Any]:
     return act
 
 
-def first_start(words: Sequence[str], folder: Path, limit: float) -> float:
-    """Seconds of ``python`` with ``words`` from the repository's root, in a process
-    and, in ``folder``, a compilation cache of its own."""
+def first_start(words: Sequence[str], cache: Path, limit: float) -> tuple[float, str]:
+    """Seconds of ``python`` with ``words`` from the repository's root, in a process of
+    its own with the compilation cache ``cache``, and what it printed."""
     begin = time.monotonic()
-    subprocess.run(
+    done = subprocess.run(
         [sys.executable, *words],
         cwd=Path(__file__).parents[1],
-        env={**os.environ, "JAX_COMPILATION_CACHE_DIR": str(folder / "cache")},
-        stdout=subprocess.DEVNULL,
+        env={**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache)},
+        stdout=subprocess.PIPE,
+        text=True,
         timeout=limit,
         check=True,
     )
-    return time.monotonic() - begin
+    return time.monotonic() - begin, done.stdout
 
 
 def _without_home(value: Any) -> Any:

@@ -99,17 +99,15 @@ def run(config: Config) -> None:
         {k: r[k] for k in named(_Cell("", "", "", 0))} for r in read_rows(config.out)
     ]
     for robot in config.robots:
-        sized = [(k, n) for k in config.kinds for n in config.populations]
-        sized = [x for x in sized if x[0] != "search"]
-        sized += [(k, INDIVIDUALS) for k in config.kinds if k == "search"]
         cells = [
             cell
-            for kind, n in sized
+            for kind in config.kinds
+            for n in ((INDIVIDUALS,) if kind == "search" else config.populations)
             for program in config.programs
             if named(cell := _Cell(robot, program, kind, n)) not in done
             and (program in ("mjx", "mujoco") or kind == "replay")
         ]
-        compiled = []
+        compiled, automatic = [], _automatic(robot) if cells else ""
         with ThreadPoolExecutor(config.at_once) as pool:
             for cell in (c for c in cells if c.program != "rollout"):
                 make, steps = _program(cell)
@@ -130,7 +128,7 @@ def run(config: Config) -> None:
         for cell in natives:
             rates[cell] += native_rates(cell, config)
         for cell, measured in rates.items():
-            row = {**named(cell), "auto": _automatic(robot)}
+            row = {**named(cell), "auto": automatic}
             row |= {"steps_per_s": measured, **figures[cell]}
             add_row(config.out, {**row, "versions": versions()})
             say(
@@ -159,7 +157,7 @@ def _compiled(make: Callable[[], Any]) -> tuple[Callable[[], Any], dict[str, flo
     return (lambda: program(*args)), seconds
 
 
-def native_rates(cell: Any, config: Any) -> list[float]:
+def native_rates(cell: _Cell, config: Config) -> list[float]:
     """Physics steps per second of ``mujoco.rollout`` on all cores, from a reset."""
     import copy
 
@@ -310,8 +308,6 @@ def _search(env: Any, population: int, segments: int) -> Any:
 
 
 def _mjx_step(env: Any, first: Any) -> Callable[..., Any]:
-    import dataclasses as dc
-
     import jax
     from mujoco import mjx
 
@@ -324,7 +320,7 @@ def _mjx_step(env: Any, first: Any) -> Callable[..., Any]:
 
         def inner(state: Any, ctrl: Any) -> Any:
             d = mjx.step(model.mjx, physics.data_at(model, state, ctrl))
-            after = dc.replace(
+            after = dataclasses.replace(
                 state, qpos=d.qpos, qvel=d.qvel, warmstart=d.qacc_warmstart
             )
             return after, None

@@ -86,7 +86,7 @@ def timed(case: Path, folder: Path) -> tuple[float, dict]:
         *("--data", *map(str, sorted(case.glob("run*.csv")))),
         *("--out", str(folder / "gap")),
     ]
-    seconds = first_start(words, folder, _LIMIT)
+    seconds, _ = first_start(words, folder / "cache", _LIMIT)
     return seconds, json.loads((folder / "gap" / "gap.json").read_text())
 
 

@@ -38,7 +38,7 @@ def run(config: Config) -> None:
             *("--held-out", str(EXAMPLE / "moves.csv")),
             *("--out", str(out)),
         ]
-        seconds = first_start(words, Path(folder), _LIMIT)
+        seconds, _ = first_start(words, Path(folder) / "cache", _LIMIT)
         found = json.loads((out / "distribution.json").read_text())
     truth = runpy.run_path(str(ROOT / EXAMPLE / "make_log.py"))["TRUTH"]
     first = found["seeds"]["0"]

@@ -4,11 +4,12 @@ python -m benchmarks.speed
 """
 
 import dataclasses
-import os
+import json
 import subprocess
 import sys
 import tempfile
 import time
+from pathlib import Path
 from typing import Any
 
 from train._command import main, say, show_table
@@ -157,24 +158,16 @@ def _stress(config: Config) -> list[dict[str, Any]]:
 
 
 def _compile_in(cache: str) -> dict[str, float]:
-    import json
+    from benchmarks._common import first_start
 
-    done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.speed", "--phase", "compile"],
-        env={**os.environ, "JAX_COMPILATION_CACHE_DIR": cache},
-        timeout=600,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return json.loads(done.stdout.strip().splitlines()[-1])
+    words = ("-m", "benchmarks.speed", "--phase", "compile")
+    printed = first_start(words, Path(cache), 600)[1]
+    return json.loads(printed.strip().splitlines()[-1])
 
 
 def run(config: Config) -> None:
     """Times everything in one run."""
     if config.phase == "compile":
-        import json
-
         say(json.dumps(_compile(config)))
         return
     from benchmarks._common import write_result

@@ -11,9 +11,6 @@ its own with nothing cached; the engine is what ``auto`` takes. Results go to
 
 import dataclasses
 import json
-import os
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -177,7 +174,7 @@ def _times(config: Config) -> dict[str, Any]:
 
 def run(config: Config) -> None:
     """Times each machine in a process of its own."""
-    from benchmarks._common import command_of, write_result
+    from benchmarks._common import command_of, first_start, write_result
     from easi_jax.errors import UserError, nearest
 
     for name in config.machines:
@@ -195,16 +192,9 @@ def run(config: Config) -> None:
             given = ["--phase", name, "--began", str(time.time())]
             for key in ("population", "generations", "engine"):
                 given += [f"--{key}", str(getattr(config, key))]
-            done = subprocess.run(
-                [sys.executable, "-m", "benchmarks.strangers", *given],
-                cwd=ROOT,
-                env={**os.environ, "JAX_COMPILATION_CACHE_DIR": cache},
-                stdout=subprocess.PIPE,
-                text=True,
-                timeout=_LIMIT,
-                check=True,
-            )
-        found[name] = json.loads(done.stdout.strip().splitlines()[-1])
+            words = ("-m", "benchmarks.strangers", *given)
+            printed = first_start(words, Path(cache), _LIMIT)[1]
+        found[name] = json.loads(printed.strip().splitlines()[-1])
         say(f"{name}: {found[name]}")
     path = write_result(
         "strangers",

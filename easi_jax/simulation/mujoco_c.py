@@ -48,7 +48,6 @@ class InMujoco:
         with jax.enable_x64(True):
             double = Simulator(
                 *(m, space, simulator.dt),
-                torque_speed=simulator.base.torque_speed,
                 fixed={a: fixed[a] for a in lasting},
                 engine="mujoco",
             )
