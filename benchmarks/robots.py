@@ -1,14 +1,14 @@
-"""Searches on one robot: their time, what they recover, what memory they take.
+"""Searches on one robot: what they recover, and what memory they take.
 
     python -m train.udr --robot ant --seeds 0 1 --out results/udr_ant
     python -m benchmarks.robots --udr results/udr_ant
 
 The policy of ``train.udr`` records in the nominal robot, without noise; the search
 never sees that robot's parameters. ``recovery``: the search, then the least-squares
-finish, from UDR's range and from ranges that exclude the truth. ``time``: a search of
-50 generations of 300 individuals, compiled before. ``memory``: a generation of 4,096.
-``buffer``: SAC with a full replay buffer of a million transitions, with its checkpoint.
-Time and memory do not depend on how well the policy was trained.
+finish, from UDR's range and from ranges that exclude the truth. ``memory``: a
+generation of 4,096. ``buffer``: SAC with a full replay buffer of a million transitions,
+with its checkpoint. Memory does not depend on how well the policy was trained. What a
+search takes is timed by ``benchmarks.engines``.
 """
 
 import dataclasses
@@ -24,21 +24,20 @@ STARTS: dict[str, tuple[float, float] | None] = {
     "low": (0.05, 0.5),
     "high": (2.0, 4.0),
 }
-STEPS = {"ballbalance": 50}  # control steps of an individual in the timed search
-PARTS = ("recovery", "time", "memory", "buffer")
+PARTS = ("recovery", "memory", "buffer")
 BUFFER = 1_000_000  # transitions
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Times searches of a robot and recovers its known parameters."""
+    """Recovers known parameters of a robot, and measures memory."""
 
     udr: Path = Path("results/udr")
     """Run folder of train.udr."""
     option: tuple[str, ...] = ()
     """Options of the built-in robot in place of those of the run."""
     part: str = "recovery"
-    """What to run: recovery, time, memory or buffer."""
+    """What to run: recovery, memory or buffer."""
     starts: tuple[str, ...] = tuple(STARTS)
     """Where searches start: within, low, high."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
@@ -53,9 +52,6 @@ class Config:
     """Individuals."""
     generations: int = 50
     """Generations."""
-    steps: int | None = None
-    """Control steps of an individual in the timed search; 200 (ballbalance: 50) where
-    not given."""
 
 
 def run(config: Config) -> None:
@@ -76,9 +72,7 @@ def run(config: Config) -> None:
     if config.option:
         env = open_env(env.name, None, config.option)
     label = "_".join([env.name, *(o.replace("=", "_") for o in option)])
-    if config.part == "time":
-        _time(config, env, saved, label)
-    elif config.part == "memory":
+    if config.part == "memory":
         _memory(config, env, saved, label)
     elif config.part == "buffer":
         _buffer(config, env, label)
@@ -151,45 +145,6 @@ def _searched(pipe: Any, demos: Any, keys: Any, policies: Any) -> Any:
         .compile()
     )
     return compiled, state, time.monotonic() - begin
-
-
-def _time(config: Config, env: Any, saved: Any, label: str) -> None:
-    import jax
-
-    from benchmarks._common import command_of, write_result
-
-    steps = config.steps or STEPS.get(env.name, 200)
-    pipe = _pipe(
-        config,
-        env,
-        segments=steps,
-        population=config.population,
-        generations=config.generations,
-    )
-    keys, policies, demos = _demonstrations(pipe, saved, config.seeds[:1])
-    compiled, state, seconds = _searched(pipe, demos, keys, policies)
-    begin = time.monotonic()
-    jax.block_until_ready(compiled(state, demos, policies))
-    ran = time.monotonic() - begin
-    say(
-        f"{label}: {config.generations} generations of {config.population} x {steps} "
-        f"steps in {ran:.0f} s, compiled in {seconds:.0f} s, peak {peak_gib():.1f} GiB"
-    )
-    usual = (Config.generations, Config.population)
-    short = "" if (config.generations, config.population) == usual else "_short"
-    path = write_result(
-        f"search_{label}_{steps}{short}",
-        command_of("benchmarks.robots", config),
-        config,
-        robot=env.name,
-        steps=steps,
-        generations=config.generations,
-        population=config.population,
-        search_s=ran,
-        trace_and_compile_s=seconds,
-        peak_gib=peak_gib(),
-    )
-    say(f"written: {path}")
 
 
 def _memory(config: Config, env: Any, saved: Any, label: str) -> None:

@@ -39,7 +39,6 @@ from train._command import main, say
 
 FACTORS = (0.25, 0.5, 2, 4)
 KNOWN = 0.02  # Cramer-Rao standard deviation below which a parameter must be found
-SEARCH_GOALS = {"ant_200": 180, "go2_200": 480, "ballbalance_50": 480}  # s
 ROBOTS = ("ant", "ballbalance", "go2", "go2_parameters_full")
 
 
@@ -104,25 +103,6 @@ def _accuracy(found: dict[str, Any]) -> list[str]:
         "time step would change:",
         markdown_table(head, rows),
     ]
-
-
-def _times(found: dict[str, Any]) -> list[str]:
-    def goal(r: Any) -> str:
-        most = SEARCH_GOALS.get(f"{r['robot']}_{r['steps']}")
-        return f"{most} s, {met(r['search_s'] < most)}" if most else ""
-
-    columns = {
-        "robot": "{robot}",
-        "generations x individuals x control steps": (
-            "{generations} x {population} x {steps}"
-        ),
-        "search": "{search_s:.0f} s",
-        "goal": goal,
-        "trace and compile": "{trace_and_compile_s:.0f} s",
-        "peak GiB": "{peak_gib:.1f}",
-    }
-    made = "`python -m benchmarks.robots --udr RUN --part time`"
-    return [made, table(found.values(), columns)]
 
 
 def _memory(found: dict[str, Any]) -> list[str]:
@@ -404,10 +384,9 @@ SECTIONS = (
         _accuracy,
     ),
     Section(
-        *("## Searches on the other robots", "search_*.json", "robots --part time"),
-        _times,
+        *("## Searches on the other robots", "memory_*.json", "robots --part memory"),
+        _memory,
     ),
-    Section("", "memory_*.json", "robots --part memory", _memory),
     Section(
         "",
         {(r, s): f"robots_{r}_{s}.json" for r in ROBOTS for s in STARTS},
