@@ -139,11 +139,12 @@ def fast_loops() -> dict[str, Any]:
     """``compiler_options`` of ``jax.jit`` for programs that simulate for long.
 
     They take longer to compile and, on CPU, simulate about twice as fast; from jaxlib
-    0.11 on there are no others.
+    0.11 on there are no others. Empty where the environment says how far to optimize.
     """
     import jax
 
-    return {_EMITTERS: True} if _known(_EMITTERS, jax.__version_info__) else {}
+    own = _level_chosen() or not _known(_EMITTERS, jax.__version_info__)
+    return {} if own else {_EMITTERS: True}
 
 
 def quick_compile() -> dict[str, Any]:
@@ -151,11 +152,14 @@ def quick_compile() -> dict[str, Any]:
 
     On CPU, LLVM then does less: half the time to compile, and simulations as fast as
     before (measured with jaxlib 0.10.2: predictions of a cart-pole, 30.3 and 29.2 s,
-    with `fast_loops` 18.8 and 18.7 s).
+    with `fast_loops` 18.8 and 18.7 s). Empty where the environment says how far to
+    optimize.
     """
-    import jax
+    return {_LEVEL: 1} if on_cpu() and not _level_chosen() else {}
 
-    return {_LEVEL: 1} if jax.default_backend() == "cpu" else {}
+
+def _level_chosen() -> bool:
+    return _LEVEL in os.environ.get("XLA_FLAGS", "")
 
 
 def _known(flag: str, version: tuple[int, ...]) -> bool:

@@ -96,10 +96,13 @@ def test_each_lost_measure_is_a_no(change, printed, name):
     assert [row[0] for row in rows if row[1] == "NO"] == [name]
 
 
-@pytest.mark.skipif(
+_known_jax = pytest.mark.skipif(
     jax.__version_info__[:2] != (0, 10), reason="flags of this jax are unknown"
 )
-def test_a_batch_of_simulations_runs_in_one_piece():
+
+
+@_known_jax
+def test_a_batch_of_simulations_runs_in_one_piece(monkeypatch):
     """Else each step of each substep is many calls, and takes five times as long."""
     env = envs.make("cartpole")
     simulator = env.simulator
@@ -113,9 +116,19 @@ def test_a_batch_of_simulations_runs_in_one_piece():
         return jax.lax.scan(lambda s, _: (step(s), None), states, None, length=20)[0]
 
     program = go.lower(batch, jnp.zeros(simulator.mj_model.nu))
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
     text = program.compile(runtime.fast_loops()).as_text()
     assert text is not None
     assert "xla_cpu_small_call" in text
+
+
+@_known_jax
+def test_who_says_how_far_to_optimize_is_not_overruled(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=2")
+    assert runtime.fast_loops() == runtime.quick_compile() == {}
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+    assert runtime.fast_loops() == {"xla_cpu_use_fusion_emitters": True}
+    assert runtime.quick_compile() == {"xla_backend_optimization_level": 1}
 
 
 _LOOP = """
@@ -129,9 +142,7 @@ print("xla_cpu_small_call" in go.lower(jnp.ones({size})).compile().as_text())
 """
 
 
-@pytest.mark.skipif(
-    jax.__version_info__[:2] != (0, 10), reason="flags of this jax are unknown"
-)
+@_known_jax
 @pytest.mark.parametrize(
     ("before", "size", "one_piece"),
     [
