@@ -106,6 +106,7 @@ def read_log(
     paths: PathLike | Sequence[PathLike],
     model: mujoco.MjModel,
     mapping: PathLike | None = None,
+    unmeasured: Sequence[str] = (),
 ) -> Log:
     """Reads measured logs (CSV, NPZ, Parquet) of the machine that ``model`` describes.
 
@@ -113,6 +114,8 @@ def read_log(
         paths: one file or several.
         model: names of joints, actuators and sensors.
         mapping: mapping file (YAML) for logs with foreign column names.
+        unmeasured: joints without a sensor, by name or pattern; ``all``: whatever a
+            log lacks.
 
     Returns:
         ``runs``, SI units, and ``notes`` on all that a user should know of them.
@@ -120,7 +123,7 @@ def read_log(
     Raises:
         UserError: a file that cannot be used.
     """
-    return read_logs(paths, model, mapping)
+    return read_logs(paths, model, mapping, unmeasured)
 
 
 @dataclass(frozen=True, eq=False)

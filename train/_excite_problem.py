@@ -210,7 +210,7 @@ def _from_data(
     from easi_jax.gap.scales import scales_of
     from easi_jax.io.logs.reader import read_logs
 
-    log = read_logs(list(config.data), m, config.mapping)
+    log = read_logs(list(config.data), m, config.mapping, config.unmeasured)
     notes += log.notes
     runs, changed = to_common_step(log.runs)
     notes += changed

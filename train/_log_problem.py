@@ -52,10 +52,11 @@ def read_runs(config: Any, mj_model: Any, horizon: float) -> "MeasuredRuns":
     fit_files = [p for p in config.data if os.path.realpath(p) not in kept_out]
     if not fit_files:
         raise UserError("--held-out names all of --data: leave a log to fit")
-    log = read_logs(fit_files, mj_model, config.mapping)
+    how = config.mapping, config.unmeasured
+    log = read_logs(fit_files, mj_model, *how)
     held = None
     if config.held_out:
-        held = read_logs(list(config.held_out), mj_model, config.mapping)
+        held = read_logs(list(config.held_out), mj_model, *how)
     return measured_runs(mj_model, log, held, horizon)
 
 

@@ -113,8 +113,13 @@ class RunOptions:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BaseOptions:
-    """How the machine stood while logs were recorded."""
+    """How the machine stood while logs were recorded, and what of it was measured."""
 
     held_base: bool = False
     """The base was held (in a stand): remove the model's free joint. The base stays at
     its first logged pose, or else at that of the first key frame or of the model."""
+    unmeasured: tuple[str, ...] = ()
+    """Joints that no sensor measured, by name or pattern (*_play); all: whatever a log
+    lacks. Their positions and velocities are then unknown at the start of every
+    prediction. Joints that the model itself places (coupled to a measured one, held by
+    an equality, play beside one) need not be named."""

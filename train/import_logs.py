@@ -88,6 +88,7 @@ def run(config: Config) -> None:
             episodes=config.episodes,
         ),
         slack=config.command_slack,
+        unmeasured=config.unmeasured,
         allow_nan=config.allow_nan,
         extension=config.format,
         overwrite=config.overwrite,

@@ -145,7 +145,7 @@ def _information(config: Config, m: Any, proposals: list[Any]) -> Any:
     from easi_jax.simulation.logged import Logged
     from easi_jax.simulation.simulator import Simulator
 
-    log = read_logs(list(config.data), m, config.mapping)
+    log = read_logs(list(config.data), m, config.mapping, config.unmeasured)
     noise = pooled_noise(log.runs)
     runs, notes = to_common_step(log.runs)
     for note in (*log.notes, *notes):

@@ -112,7 +112,7 @@ def split_at_resets(
 def _derived(run: Run) -> np.ndarray:
     """Which velocities were derived from the positions, ``(nv,)``."""
     if run.qvel_measured:
-        return np.zeros(run.qvel.shape[1], bool)
+        return run.hidden
     return (run.qvel == fitted_velocity(run.qpos, run.dt, run.configuration)).all(0)
 
 
@@ -236,7 +236,7 @@ def true_readings(
 
 def trusted_velocity(run: Run) -> np.ndarray:
     """Velocities ``(T, nv)``: those measured where they are the positions' derivative,
-    else that derivative.
+    else that derivative, and that of the guess where hidden.
 
     They are where they agree with the fitted one (within a tenth of its RMS or three
     times its noise), or where they integrate to the positions from row to row (within
@@ -252,7 +252,7 @@ def trusted_velocity(run: Run) -> np.ndarray:
     moved = run.configuration.difference(run.qpos[:-1], run.qpos[1:]) / run.dt
     between = 0.5 * (run.qvel[:-1] + run.qvel[1:])
     agrees |= _rms(between - moved) <= _AGREES * _rms(moved)
-    return np.where(agrees, run.qvel, fitted)
+    return np.where(agrees & ~run.hidden, run.qvel, fitted)
 
 
 def _rms(x: np.ndarray) -> np.ndarray:

@@ -71,8 +71,9 @@ def split_held_out(
 
 
 def _reach(m: mujoco.MjModel, run: Run) -> np.ndarray:
-    """Largest drive forces and speeds but for two rows in 1,000, ``(nu + nv,)``."""
-    return np.percentile(exertion(m, run), _REACHED, axis=0)
+    """Largest drive forces and measured speeds but for two rows in 1,000."""
+    measured = np.concatenate([np.ones(m.nu, bool), ~run.hidden])
+    return np.percentile(exertion(m, run)[:, measured], _REACHED, axis=0)
 
 
 def _unlike(reach: np.ndarray, held: set[int]) -> float:

@@ -10,6 +10,7 @@ from easi_jax.data.cleaning import split_at_resets, to_common_step, without_odd_
 from easi_jax.data.holdout import split_held_out
 from easi_jax.data.noise import pooled_noise
 from easi_jax.data.recording import Log, Run, check_run
+from easi_jax.data.unmeasured import measured_alike
 
 _FEW_ROWS = 30  # of a run say little of its noise
 
@@ -21,7 +22,7 @@ class MeasuredRuns:
     Attributes:
         recorded: those to fit, as they were recorded.
         noise: standard deviations of positions and velocities [m, rad, m/s, rad/s],
-            ``(2 nv,)``.
+            ``(2 nv,)``; infinite where hidden, which is the same in all runs.
         fit, held: runs, cleaned.
         held_name: which data are held out.
         notes: what a user should know of the data, one line each.
@@ -51,19 +52,23 @@ def measured_runs(
     Raises:
         UserError: runs that do not fit the model; too few rows to hold some out.
     """
-    for run in (*log.runs, *(held_out.runs if held_out else ())):
+    everything = (*log.runs, *(held_out.runs if held_out else ()))
+    for run in everything:
         check_run(run, mj_model)
     notes = [*log.notes, *(held_out.notes if held_out else ()), *_states(mj_model)]
+    alike, unused = measured_alike(mj_model, everything)
+    notes += unused
+    recorded, kept_out = alike[: len(log.runs)], alike[len(log.runs) :]
     # Before interpolation, which would smooth the noise.
-    noise = pooled_noise(log.runs)
+    noise = pooled_noise(recorded)
     parts: list[Sequence[Run]] = []
-    for given in (log.runs, held_out.runs if held_out else ()):
+    for given in (recorded, kept_out):
         cut, leaps = split_at_resets(given, noise)
         notes += leaps
         parts.append(cut)
-    if parts[0] != list(log.runs):
+    if parts[0] != recorded:
         # Bad readings have no part in the noise, where there are rows enough.
-        noise = pooled_noise([r for r in parts[0] if len(r) > _FEW_ROWS] or log.runs)
+        noise = pooled_noise([r for r in parts[0] if len(r) > _FEW_ROWS] or recorded)
     runs, changed = to_common_step([*parts[0], *parts[1]])
     notes += changed
     runs, odd = without_odd_ends(runs, noise)
@@ -73,7 +78,7 @@ def measured_runs(
         fit, held, name = split_held_out(mj_model, fit, horizon)
     else:
         name = ", ".join(run.name for run in held)
-    return MeasuredRuns(log.runs, noise, fit, held, name, notes)
+    return MeasuredRuns(tuple(recorded), noise, fit, held, name, notes)
 
 
 def _states(m: mujoco.MjModel) -> list[str]:

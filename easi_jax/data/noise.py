@@ -27,7 +27,8 @@ def estimate_noise(run: Run) -> np.ndarray:
     coarser than that, their few levels make a median jump, and the mean absolute value
     counts. Never below what the resolution makes, ``step / sqrt(12)``. Velocities: the
     same where they were measured, else the positions' noise through the quadratic fit.
-    Where rows were interpolated, what that has smoothed is made up for.
+    Where rows were interpolated, what that has smoothed is made up for. What is hidden
+    has no readings: infinite.
     """
     steps = run.configuration.difference(run.qpos[:-1], run.qpos[1:])
     sigma = _difference_noise(steps, 1, np.median, _MAD)
@@ -47,7 +48,7 @@ def estimate_noise(run: Run) -> np.ndarray:
         )
     else:
         speed = sigma * _fit_gain(len(run), run.dt)
-    return np.concatenate([sigma, speed])
+    return np.where(np.tile(run.hidden, 2), np.inf, np.concatenate([sigma, speed]))
 
 
 def _difference_noise(
@@ -97,5 +98,6 @@ def _fit_gain(rows: int, dt: float) -> float:
 
 
 def pooled_noise(runs: Sequence[Run]) -> np.ndarray:
-    """Median over runs of `estimate_noise`, ``(2 nv,)``."""
+    """Median over runs of `estimate_noise`, ``(2 nv,)``; the same must be hidden in
+    all of them."""
     return np.median([estimate_noise(run) for run in runs], axis=0)

@@ -27,11 +27,14 @@ class Run:
         time: measured time, s, ``(T,)``.
         qpos: positions, m, rad and unit quaternions (w x y z), ``(T, nq)``.
         qvel: velocities, m/s and rad/s, ``(T, nv)``.
-        qvel_measured: True where every velocity comes from the log; else those
-            that are missing are derived from the positions.
+        qvel_measured: True where every velocity comes from the log, hidden ones
+            aside; else those that are missing are derived from the positions.
         ctrl: command sent from this row to the next, ``(T, nu)``.
         sensors: readings by sensor name, ``(T, dim)``; NaN where there was none.
         configuration: where quaternions lie in ``qpos``.
+        hidden: degrees of freedom that nobody measured, ``(nv,)`` bool; whole joints.
+            Their ``qpos`` and ``qvel`` are a guess (`easi_jax.data.unmeasured`). None
+            are hidden where it is not given.
         stamps: times of the rows as they were recorded [s]; None where they were even,
             and nothing was interpolated.
         sent: mean over each step of the commands held in it, ``(T, nu)``; None where
@@ -50,6 +53,12 @@ class Run:
     sensors: Mapping[str, np.ndarray] = field(default_factory=dict)
     stamps: np.ndarray | None = None
     sent: np.ndarray | None = None
+    hidden: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+
+    def __post_init__(self) -> None:
+        if not len(self.hidden):
+            nothing = np.zeros(self.configuration.nv, bool)
+            object.__setattr__(self, "hidden", nothing)
 
     def __len__(self) -> int:
         """Number of rows, T."""
@@ -81,6 +90,14 @@ def check_run(run: Run, mj_model: mujoco.MjModel) -> None:
     sizes = {"time": (), "qpos": (mj_model.nq,), "qvel": (mj_model.nv,)}
     for name, size in {**sizes, "ctrl": (mj_model.nu,)}.items():
         checked_array(f"{run.name}: {name}", getattr(run, name), (len(run), *size))
+    hidden = np.asarray(run.hidden)
+    if hidden.shape != (mj_model.nv,) or hidden.dtype != bool:
+        raise UserError(
+            f"{run.name}: hidden has shape {hidden.shape} and type {hidden.dtype}: "
+            f"give ({mj_model.nv},) of bool"
+        )
+    if hidden.all():
+        raise UserError(f"{run.name}: no joint is measured: nothing can be determined")
     if not (math.isfinite(run.dt) and run.dt > 0):
         raise UserError(f"{run.name}: control step is {run.dt} s: give one above 0")
 

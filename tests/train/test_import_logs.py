@@ -509,6 +509,19 @@ def test_wrong_mappings(tmp_path: Path, refuse: Any, mapping: str, words: str) -
     assert words in refuse(path, mapping=mapping)
 
 
+def test_a_joint_without_a_sensor(
+    tmp_path: Path, model: Path, refuse: Any, capsys: Any
+) -> None:
+    path = torch_zip(tmp_path / "chirp_data.pt", pace())
+    mapping = "joints: {0: slider, 1: }"
+    assert "if joint pole has no sensor" in refuse(path, mapping=mapping)
+    given = path, "--unmeasured", "pole"
+    command(import_logs, *_arguments(tmp_path, model, given, mapping))
+    assert "pole (--unmeasured)" in capsys.readouterr().out
+    log = tmp_path / "logs" / "chirp_data.csv"
+    assert log.read_text().startswith("time,qpos.slider,ctrl.drive")
+
+
 def test_topics(tmp_path: Path, refuse: Any) -> None:
     ros = bag()
     ros.text(0.0, "hello")

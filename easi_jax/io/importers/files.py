@@ -52,6 +52,7 @@ def import_recordings(
     *,
     mapping: LogMapping | None = None,
     selection: Selection | None = None,
+    unmeasured: Sequence[str] = (),
     slack: float = 0.0,
     allow_nan: bool = False,
     extension: Extension = "csv",
@@ -68,6 +69,8 @@ def import_recordings(
         out: folder; made if it is not there.
         mapping: names and units that differ.
         selection: what is read of each recording.
+        unmeasured: joints without a sensor, by name or pattern; ``all``: whatever a
+            recording lacks.
         slack: a command counts for a row if sent no later than this after it, s.
         allow_nan: keep rows with non-finite positions or commands.
         extension: of the logs.
@@ -93,11 +96,16 @@ def import_recordings(
                         "it with --overwrite"
                     )
                 table, notes = to_table(
-                    recording, mapping, mj_model, slack=slack, allow_nan=allow_nan
+                    recording,
+                    mapping,
+                    mj_model,
+                    unmeasured=unmeasured,
+                    slack=slack,
+                    allow_nan=allow_nan,
                 )
                 temporary = Path(staged) / target.name
                 write_table(temporary, table)
-                runs, more = _read_back(temporary, target, mj_model)
+                runs, more = _read_back(temporary, target, mj_model, unmeasured)
                 done[target] = Imported(
                     target, len(table["time"]), runs, (*notes, *more)
                 )
@@ -148,11 +156,14 @@ def _staging(out: Path) -> tempfile.TemporaryDirectory[str]:
 
 
 def _read_back(
-    temporary: Path, target: Path, mj_model: mujoco.MjModel
+    temporary: Path,
+    target: Path,
+    mj_model: mujoco.MjModel,
+    unmeasured: Sequence[str],
 ) -> tuple[int, list[str]]:
     """Number of runs, and the notes of the reader that other commands use."""
     try:
-        log = read_logs(temporary, mj_model)
+        log = read_logs(temporary, mj_model, None, unmeasured)
     except UserError as error:
         raise UserError(str(error).replace(str(temporary), str(target))) from None
     return len(log.runs), [n.removeprefix(f"{temporary}: ") for n in log.notes]

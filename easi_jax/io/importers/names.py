@@ -7,7 +7,7 @@ import mujoco
 
 from easi_jax.errors import UserError, nearest
 from easi_jax.io.importers.streams import Recording, Stream, listed
-from easi_jax.io.logs.columns import LogColumns, log_columns
+from easi_jax.io.logs.columns import LogColumns, hidden_joints, log_columns
 from easi_jax.io.logs.mapping import LogMapping
 from easi_jax.model.joint_space import FREE_WIDTH, joint_name, widths
 
@@ -24,13 +24,17 @@ class Use:
 
 
 def assign(
-    recording: Recording, mapping: LogMapping, model: mujoco.MjModel
+    recording: Recording,
+    mapping: LogMapping,
+    model: mujoco.MjModel,
+    unmeasured: Sequence[str] = (),
 ) -> tuple[list[Use], list[str]]:
     """Finds every channel's column.
 
     A channel that ``columns`` of the mapping names goes there. Positions and
     velocities go by their joint's name; commands by that of the actuator, or of the
-    joint that one actuator alone drives.
+    joint that one actuator alone drives. What becomes of ``unmeasured`` joints is as in
+    `easi_jax.io.logs.columns.hidden_joints`.
 
     Returns:
         Uses in the order of the log's columns, and the channels that have none.
@@ -39,7 +43,7 @@ def assign(
         UserError: a name that the model or the recording does not have, two channels
             for one column, or a column that the model needs and nothing gives.
     """
-    return _Assignment(recording, mapping, model).result()
+    return _Assignment(recording, mapping, model).result(unmeasured)
 
 
 class _Assignment:
@@ -53,7 +57,7 @@ class _Assignment:
         self.joints = [joint_name(model, i) for i in range(model.njnt)]
         self.actuators = [model.actuator(i).name for i in range(model.nu)]
 
-    def result(self) -> tuple[list[Use], list[str]]:
+    def result(self, unmeasured: Sequence[str]) -> tuple[list[Use], list[str]]:
         self._check_mapping()
         uses: dict[str, Use] = {}
         unused: list[str] = []
@@ -79,8 +83,16 @@ class _Assignment:
                     f'"{column}"'
                     f"{nearest(column, self.columns.known[2:])}"
                 )
+        positions, speeds = self.columns.positions, self.columns.joints
+        given = self.recording.path, uses, self.columns, self.model
+        hidden = {
+            name
+            for j in hidden_joints(*given, unmeasured)
+            for name in (*positions[j], *speeds[j])
+        }
+        uses = {c: use for c, use in uses.items() if c not in hidden}
         for column in (*self.columns.qpos, *self.columns.ctrl):
-            if column not in uses:
+            if column not in uses and column not in hidden:
                 raise self._missing(column, unused)
         ordered = [uses[c] for c in self.columns.known if c in uses]
         return ordered, unused
@@ -194,7 +206,10 @@ class _Assignment:
         entries = [n for s in self.recording.streams for n in s.names if s.role == role]
         hint = nearest(name, [e for e in entries if e in self.mapping.joints])
         others = f" (not used: {listed(unused)})" if unused and not hint else ""
+        groups = zip(self.joints, self.columns.positions, strict=True)
+        joint = next((j for j, group in groups if column in group), "")
+        option = f"; if joint {joint} has no sensor, give --unmeasured {joint}"
         return UserError(
             f'{self.recording.path}: nothing gives "{column}", which the model needs'
-            f"{hint}{others}"
+            f"{hint}{others}{option if joint else ''}"
         )

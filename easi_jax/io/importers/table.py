@@ -1,5 +1,6 @@
 """A recording's channels, at their own times, as rows of a log."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import mujoco
@@ -23,6 +24,7 @@ def to_table(
     mapping: LogMapping,
     model: mujoco.MjModel,
     *,
+    unmeasured: Sequence[str] = (),
     slack: float = 0.0,
     allow_nan: bool = False,
 ) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -32,6 +34,8 @@ def to_table(
     last one sent until then, or up to ``slack`` (s) later. Other positions,
     velocities and sensors are interpolated linearly. Rows before the first command,
     and where another stream pauses for more than three of its steps, are left out.
+    Joints that are ``unmeasured``, as for `easi_jax.io.logs.reader.read_logs`, get no
+    column.
 
     Raises:
         UserError: names that do not fit, time that is not finite or goes back,
@@ -39,7 +43,7 @@ def to_table(
             than two rows.
     """
     recording, notes = _without_repeats(recording)
-    uses, unused = assign(recording, mapping, model)
+    uses, unused = assign(recording, mapping, model, unmeasured)
     mapping.check_used({"time": None, **{use.column: None for use in uses}})
     notes += [f"not used: {listed(unused)}"] if unused else []
     times = _times(recording, mapping, uses)

@@ -247,6 +247,7 @@ def quaternion_orders(
     model: mujoco.MjModel,
     rows: Rows,
     stated: Collection[str],
+    hidden: Collection[int] = (),
 ) -> list[str]:
     """Notes on quaternions that look as if written x y z w.
 
@@ -255,6 +256,7 @@ def quaternion_orders(
         model: the machine.
         rows: those that are used.
         stated: joints of which the user has said the order.
+        hidden: joints that nobody measured.
 
     Raises:
         UserError: measured velocities agree with that order alone.
@@ -262,7 +264,8 @@ def quaternion_orders(
     notes: list[str] = []
     for i in range(model.njnt):
         name = joint_name(model, i)
-        if is_scalar(model, i) or name in stated or len(rows.time) < 2:
+        known = i in hidden or name in stated
+        if is_scalar(model, i) or known or len(rows.time) < 2:
             continue
         first = widths(model, i)[0] - 4
         at, dof = int(model.jnt_qposadr[i]) + first, dofs(model, i)[-3]
@@ -361,18 +364,26 @@ def _slope(x: np.ndarray, y: np.ndarray) -> float:
     return float(x @ y / (x @ x))
 
 
-def ranges(model: mujoco.MjModel, qpos: np.ndarray, ctrl: np.ndarray) -> list[str]:
+def ranges(
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    ctrl: np.ndarray,
+    hidden: Collection[int] = (),
+) -> list[str]:
     """Notes on positions beyond joint ranges and commands beyond control ranges.
 
     Args:
         model: the machine.
         qpos: rows that are used, ``(T, nq)``.
         ctrl: ``(T, nu)``.
+        hidden: joints that nobody measured.
     """
     notes: list[str] = []
     if not len(qpos):
         return notes
     for i, (q, _) in scalar_dofs(model).items():
+        if i in hidden:
+            continue
         hinge, name = is_hinge(model, i), joint_name(model, i)
         values, column = qpos[:, q], f"qpos.{joint_name(model, i)}"
         unit = "rad" if hinge else "m"
@@ -435,6 +446,7 @@ def still_base(path: Path, model: mujoco.MjModel, runs: Sequence[Run]) -> str:
     root = model.body_rootid[model.jnt_bodyid]
     qpos = np.concatenate([run.qpos for run in runs])
     spread = np.ptp(qpos, axis=0)
+    hidden = np.any([run.hidden for run in runs], axis=0)
     for j in range(model.njnt):
         at = int(model.jnt_qposadr[j])
         others = [
@@ -443,6 +455,7 @@ def still_base(path: Path, model: mujoco.MjModel, runs: Sequence[Run]) -> str:
             if k != j and root[k] == root[j] and is_scalar(model, k)
         ]
         free = widths(model, j)[0] == FREE_WIDTH
+        free &= not hidden[model.jnt_dofadr[j]]
         if not free or not others or spread[others].max() < _MOVING:
             continue
         most = spread[at : at + FREE_WIDTH].max()

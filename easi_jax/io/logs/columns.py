@@ -1,18 +1,21 @@
 """The columns that a model gives a log, and their check."""
 
+import fnmatch
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
 
+from easi_jax.data.unmeasured import placed_by_model
 from easi_jax.errors import UserError, nearest
 from easi_jax.io.logs.cure import cure
 from easi_jax.io.models.completed import held_joint
 from easi_jax.model.joint_space import FREE_WIDTH, given_name, numbered, widths
 
 _CHECKED = ("qpos.", "qvel.", "ctrl.")
+_ALL = "all"  # joints that a log lacks
 _LISTED = 5  # names in a message
 _AT_JOINT = (
     int(mujoco.mjtTrn.mjTRN_JOINT),
@@ -28,6 +31,7 @@ class LogColumns:
         qpos: in the order of ``qpos``, ``nq`` names.
         qvel: in the order of ``qvel``, ``nv`` names.
         ctrl: in the order of ``ctrl``, ``nu`` names.
+        positions: each joint's position columns.
         joints: each joint's velocity columns (all of them or none are given).
         free: names of free joints.
         held: columns of a held base's free joint, which the model no longer has: the
@@ -38,6 +42,7 @@ class LogColumns:
     qpos: tuple[str, ...]
     qvel: tuple[str, ...]
     ctrl: tuple[str, ...]
+    positions: tuple[tuple[str, ...], ...]
     joints: tuple[tuple[str, ...], ...]
     sensors: Mapping[str, tuple[str, ...]]
     free: tuple[str, ...] = ()
@@ -57,7 +62,7 @@ def log_columns(model: mujoco.MjModel) -> LogColumns:
         UserError: a joint or actuator without a name, names that make two columns
             one, or a model without joints.
     """
-    qpos: list[str] = []
+    positions: list[tuple[str, ...]] = []
     free: list[str] = []
     joints: list[tuple[str, ...]] = []
     for i in range(model.njnt):
@@ -71,9 +76,9 @@ def log_columns(model: mujoco.MjModel) -> LogColumns:
         size, dofs = widths(model, i)
         if size == FREE_WIDTH:
             free.append(name)
-        qpos += numbered(f"qpos.{name}", size)
+        positions.append(numbered(f"qpos.{name}", size))
         joints.append(numbered(f"qvel.{name}", dofs))
-    if not qpos:
+    if not positions:
         raise UserError("the model has no joint: there is nothing to log")
     ctrl: list[str] = []
     for i in range(model.nu):
@@ -92,9 +97,10 @@ def log_columns(model: mujoco.MjModel) -> LogColumns:
         if model.sensor(i).name
     }
     columns = LogColumns(
-        qpos=tuple(qpos),
+        qpos=tuple(name for names in positions for name in names),
         qvel=tuple(name for names in joints for name in names),
         ctrl=tuple(ctrl),
+        positions=tuple(positions),
         joints=tuple(joints),
         sensors=sensors,
         free=tuple(free),
@@ -115,13 +121,64 @@ def _held(model: mujoco.MjModel) -> tuple[str, ...]:
     return (*numbered(f"qpos.{name}", FREE_WIDTH), *numbered(f"qvel.{name}", 6))
 
 
+def hidden_joints(
+    path: Path | str,
+    names: Mapping[str, object],
+    columns: LogColumns,
+    model: mujoco.MjModel,
+    unmeasured: Sequence[str],
+) -> dict[int, str]:
+    """Joints without a reading in a file, and why that is no mistake.
+
+    Args:
+        path: the file, for messages.
+        names: its columns.
+        columns: of the model.
+        model: the machine.
+        unmeasured: names and patterns of joints that the user says nobody measured;
+            ``all``: whatever the file lacks.
+
+    Raises:
+        UserError: a name or pattern without a joint, or no joint is left.
+    """
+    joints = [given_name(model, j) for j in range(model.njnt)]
+    said = set[str]()
+    for pattern in unmeasured:
+        found = fnmatch.filter(joints, pattern)
+        if not found and pattern != _ALL:
+            raise UserError(
+                f'--unmeasured "{pattern}": the model has no such joint'
+                f"{nearest(pattern, joints)} (known: {', '.join(joints)})"
+            )
+        said.update(found)
+    lacking = [
+        j
+        for j, group in enumerate(columns.positions)
+        if any(name not in names for name in group)
+    ]
+    out = {j: "--unmeasured" for j, name in enumerate(joints) if name in said}
+    if _ALL in unmeasured:
+        out |= dict.fromkeys(lacking, "--unmeasured")
+    measured = set(range(model.njnt)).difference(out, lacking)
+    placed = placed_by_model(model, measured)
+    out |= {j: placed[j] for j in {*out, *lacking} if j in placed}
+    if len(out) == model.njnt:
+        raise UserError(
+            f"{path}: no joint is measured, so nothing can be determined: log the "
+            f"position of one (column {columns.qpos[0]} ...)"
+        )
+    return dict(sorted(out.items()))
+
+
 def check_columns(
     path: Path,
     names: Mapping[str, object],
     columns: LogColumns,
     model: mujoco.MjModel,
+    hidden: Collection[int] = (),
 ) -> list[str]:
-    """Checks a file's column names against the model's.
+    """Checks a file's column names against the model's, in which nobody measured the
+    joints ``hidden``.
 
     Returns:
         Names that are ignored, in the file's order.
@@ -131,9 +188,13 @@ def check_columns(
             without it is said), or a position, velocity or command has a name that
             the model does not know.
     """
-    missing = [
-        name for name in ("time", *columns.qpos, *columns.ctrl) if name not in names
+    needed = [
+        name
+        for j, group in enumerate(columns.positions)
+        if j not in hidden
+        for name in group
     ]
+    missing = [n for n in ("time", *needed, *columns.ctrl) if n not in names]
     if missing:
         known = set(columns.known)
         strangers = [name for name in names if name not in known]
@@ -161,6 +222,7 @@ def check_columns(
         raise UserError(
             f"{path}: no column {first}, which the model needs"
             f"{near}{more + ')' if more else ''}{lost}"
+            f"{_without_sensor(model, columns, missing)}"
         )
     ignored = [name for name in names if name not in columns.known]
     for name in ignored:
@@ -169,7 +231,9 @@ def check_columns(
                 f'{path}: the model has nothing for column "{name}"'
                 f"{nearest(name, columns.known)}"
             )
-    for group in columns.joints:
+    for j, group in enumerate(columns.joints):
+        if j in hidden:
+            continue
         given = [name for name in group if name in names]
         if given and len(given) < len(group):
             lacking = next(name for name in group if name not in names)
@@ -183,7 +247,8 @@ def check_columns(
 def _undetermined(
     model: mujoco.MjModel, columns: LogColumns, missing: Sequence[str]
 ) -> str:
-    """What a log cannot determine that has some of ``columns``, but not ``missing``.
+    """What a log can hardly determine that has some of ``columns``, but not
+    ``missing``.
 
     Nothing is said of a free joint, nor where all positions are missing, which are
     then named otherwise.
@@ -218,10 +283,32 @@ def _undetermined(
     if not any(said):
         return ""
     it = "it" if len(missing) == 1 else "them"
-    cure = f", or remove the joint{'s' * (len(joints) > 1)} from the model"
     return (
-        f"; without {it} nothing can be determined of "
-        f"{', '.join(filter(None, said))}: log {it}{cure * bool(joints)}"
+        f"; without {it} {'little' if joints else 'nothing'} can be determined of "
+        f"{', '.join(filter(None, said))}: log {it}"
+    )
+
+
+def _without_sensor(
+    model: mujoco.MjModel, columns: LogColumns, missing: Sequence[str]
+) -> str:
+    """The option for joints that have no sensor; nothing where all positions are
+    missing."""
+    lost = set(missing)
+    if lost.issuperset(columns.qpos):
+        return ""
+    joints = [
+        given_name(model, j)
+        for j, group in enumerate(columns.positions)
+        if lost.intersection(group)
+    ]
+    if not joints:
+        return ""
+    several = len(joints) > 1
+    given = " ".join(joints) if len(joints) <= _LISTED else _ALL
+    return (
+        f"; if {_listed('joint', joints)} {'have' if several else 'has'} no sensor, "
+        f"give --unmeasured {given}"
     )
 
 

@@ -5,6 +5,7 @@ The format is one table with a row per control step; see ``docs/your_own_robot.m
 
 import os
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -19,14 +20,26 @@ from easi_jax.data.resampling import (
     recordings,
     resampled,
 )
+from easi_jax.data.unmeasured import (
+    apart_from,
+    hidden_in_any,
+    joint_dofs,
+    measured_alike,
+    with_guess,
+)
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.errors import UserError
 from easi_jax.io.logs import checks as log_checks
-from easi_jax.io.logs.columns import LogColumns, check_columns, log_columns
+from easi_jax.io.logs.columns import (
+    LogColumns,
+    check_columns,
+    hidden_joints,
+    log_columns,
+)
 from easi_jax.io.logs.mapping import LogMapping, read_mapping
 from easi_jax.io.logs.tables import Table, read_table, write_table
 from easi_jax.io.models.completed import base_joint, held_body
-from easi_jax.model.joint_space import FREE_WIDTH, Configuration, numbered
+from easi_jax.model.joint_space import FREE_WIDTH, Configuration, given_name, numbered
 
 PathLike = str | os.PathLike[str]
 
@@ -38,6 +51,7 @@ def read_logs(
     paths: PathLike | Sequence[PathLike],
     mj_model: mujoco.MjModel,
     mapping: PathLike | None = None,
+    unmeasured: Sequence[str] = (),
 ) -> Log:
     """Reads logs of the machine ``mj_model`` describes.
 
@@ -49,10 +63,16 @@ def read_logs(
     unrolled where they jump by a turn. A few rows that repeat the time stamp of the
     row before are dropped.
 
+    A joint may lack its columns where ``unmeasured`` or the model itself allows it
+    (`easi_jax.data.unmeasured.placed_by_model`). What one of the files lacks is hidden
+    in all runs; its positions are then a guess that obeys the model.
+
     Args:
         paths: one or more files: ``.csv``, ``.npz`` or ``.parquet``.
         mj_model: names and ranges of joints, actuators and sensors.
         mapping: mapping file for all of ``paths``, for logs in a foreign format.
+        unmeasured: joints without a sensor, by name or pattern; ``all``: whatever a
+            log lacks. Columns of joints that are named are not read.
 
     Returns:
         At least one run, each of at least two rows; notes on all that a user
@@ -78,10 +98,11 @@ def read_logs(
     for path in files:
         alone = stems.count(path.stem) == 1
         name = path.stem if alone else path.as_posix()
-        reader = _Reader(mj_model, columns, names, path, name)
+        reader = _Reader(mj_model, columns, names, path, name, unmeasured)
         runs += reader.read()
         notes += reader.notes
-    return Log(tuple(runs), tuple(notes))
+    runs, more = measured_alike(mj_model, runs)
+    return Log(tuple(runs), (*notes, *more))
 
 
 def write_log(
@@ -121,11 +142,19 @@ def write_log(
     if velocities:
         blocks.append((columns.qvel, [run.qvel for run in chosen]))
     blocks.append((columns.ctrl, [run.ctrl for run in chosen]))
+    hidden = hidden_in_any(chosen)
+    left_out = {
+        name
+        for j in range(mj_model.njnt)
+        if hidden[mj_model.jnt_dofadr[j]]
+        for name in (*columns.positions[j], *columns.joints[j])
+    }
     for name in chosen[0].sensors:
         blocks.append((columns.sensors[name], [run.sensors[name] for run in chosen]))
     for names, arrays in blocks:
         values = np.concatenate(arrays)
         out |= dict(zip(names, values.T, strict=True))
+    out = {name: values for name, values in out.items() if name not in left_out}
     write_table(path, out, digits)
 
 
@@ -172,12 +201,15 @@ class _Reader:
         mapping: LogMapping,
         path: Path,
         name: str,
+        unmeasured: Sequence[str],
     ):
         self.model = model
         self.columns = columns
         self.mapping = mapping
         self.path = path
         self.name = name
+        self.unmeasured = unmeasured
+        self.hidden: dict[int, str] = {}  # joints, and why
         self.configuration = Configuration.of(model)
         self.notes: dict[str, None] = {}  # in order, each once
         self.uneven: list[tuple[float, str]] = []
@@ -189,7 +221,10 @@ class _Reader:
         table = self.mapping.rename(read_table(self.path))
         for text in table.notes:
             self.note(text)
-        ignored = check_columns(self.path, table.columns, self.columns, self.model)
+        given = self.path, table.columns, self.columns, self.model
+        self.hidden = hidden_joints(*given, self.unmeasured)
+        ignored = check_columns(*given, self.hidden)
+        table = self._without_hidden(table)
         index = [name for name in ignored if table.counts_rows(name)]
         for name in index:
             self.note(f'column "{name}" counts the rows (an index): ignored')
@@ -220,9 +255,13 @@ class _Reader:
             *notes,
             *more,
             *log_checks.quaternion_orders(
-                self.path, self.model, raw.take(good), self.mapping.quaternions
+                self.path,
+                self.model,
+                raw.take(good),
+                self.mapping.quaternions,
+                self.hidden,
             ),
-            *log_checks.ranges(self.model, qpos[good], raw.ctrl[good]),
+            *log_checks.ranges(self.model, qpos[good], raw.ctrl[good], self.hidden),
         ):
             self.note(text)
         runs: list[Run] = []
@@ -246,12 +285,37 @@ class _Reader:
             )
         estimated = [
             group[0].removesuffix(".0")
-            for group in self.columns.joints
-            if group[0] not in table.columns
+            for j, group in enumerate(self.columns.joints)
+            if group[0] not in table.columns and j not in self.hidden
         ]
         if estimated:
             self.note(f"velocities estimated from positions: {', '.join(estimated)}")
         return runs
+
+    def _without_hidden(self, table: Table) -> Table:
+        """``table`` without columns of hidden joints, of which is told."""
+        if not self.hidden:
+            return table
+        m, columns = self.model, self.columns
+        said = ", ".join(f"{given_name(m, j)} ({w})" for j, w in self.hidden.items())
+        self.note(
+            f"joints without a reading, whose start is unknown in every prediction: "
+            f"{said}"
+        )
+        apart = apart_from(m, joint_dofs(m, self.hidden))
+        if apart:
+            self.note(
+                f"only contacts and couplings tie {_names(m, apart)} to what is "
+                "measured: without them nothing is determined there"
+            )
+        groups = [(*columns.positions[j], *columns.joints[j]) for j in self.hidden]
+        names = [n for group in groups for n in group if n in table.columns]
+        if names:
+            self.note(
+                f"columns of joints without a reading not read: {', '.join(names)}"
+            )
+        kept = {n: c for n, c in table.columns.items() if n not in names}
+        return replace(table, columns=kept)
 
     def _arrays(self, table: Table) -> Rows:
         rows = table.rows("time")
@@ -286,10 +350,15 @@ class _Reader:
                 sensors[name] = block(names)
             elif given:
                 self.note(f"sensor {name} ignored: it has {len(names)} columns")
+        time, qpos = column("time"), block(self.columns.qpos)
+        for j in self.hidden:  # a guess follows, row by row
+            at = int(self.model.jnt_qposadr[j])
+            at = slice(at, at + len(self.columns.positions[j]))
+            qpos[:, at] = self.model.qpos0[at]
         return Rows(
-            time=column("time"),
+            time=time,
             label=label,
-            qpos=block(self.columns.qpos),
+            qpos=qpos,
             qvel=block(self.columns.qvel),
             ctrl=block(self.columns.ctrl),
             sensors=sensors,
@@ -387,24 +456,31 @@ class _Reader:
         ):
             self.note(text)
         given = np.isfinite(rows.qvel)
+        hidden = joint_dofs(self.model, self.hidden)
         columns_given = given.any(0)
         lacking = int(np.sum(~given[:, columns_given].all(1)))
         if lacking:
             self.note(f"{name}: velocities missing in {lacking} rows are estimated")
-        return Run(
+        run = Run(
             name=name,
             source=str(self.path),
             dt=dt,
             time=rows.time,
             qpos=rows.qpos,
             qvel=np.where(given, rows.qvel, fitted),
-            qvel_measured=bool(given.all()),
+            qvel_measured=bool(given[:, ~hidden].all()),
             ctrl=rows.ctrl,
             configuration=self.configuration,
             sensors=rows.sensors,
             stamps=stamps,
             sent=sent,
+            hidden=hidden,
         )
+        return with_guess(self.model, run)
+
+
+def _names(m: mujoco.MjModel, joints: Iterable[int]) -> str:
+    return ", ".join(given_name(m, j) for j in joints)
 
 
 __all__ = ["Log", "Run", "read_logs", "write_log"]

@@ -201,13 +201,14 @@ ARM = """<mujoco><option timestep=".01"/><worldbody>
     [
         (
             "qpos.elbow",
-            "without them nothing can be determined of joint elbow, drive bend, "
-            "bodies fore, hand: log them, or remove the joint from the model",
+            "without them little can be determined of joint elbow, drive bend, "
+            "bodies fore, hand: log them; if joint elbow has no sensor, give "
+            "--unmeasured elbow",
         ),
         (
             "qpos.wrist",
-            "without it nothing can be determined of joint wrist, drive turn, "
-            "body hand: log it, or remove the joint from the model",
+            "without it little can be determined of joint wrist, drive turn, "
+            "body hand: log it; if joint wrist has no sensor, give --unmeasured wrist",
         ),
         ("ctrl.lift", "without it nothing can be determined of drive lift: log it"),
     ],
@@ -333,6 +334,109 @@ def test_models_whose_parts_have_no_name():
         '</worldbody><actuator><motor joint="j"/></actuator></mujoco>'
     )
     assert "actuator 0 has no name" in failure("a.csv", model)
+
+
+# Joints without a reading
+
+
+@pytest.mark.parametrize("given", [("pole",), ("po*",), ("all",), ("pole", "all")])
+def test_a_joint_without_a_reading(tmp_path, cart, given):
+    columns = cart_columns()
+    columns["qvel.pole"] = np.ones(ROWS)
+    del columns["qpos.pole"]
+    log = read_logs(save(tmp_path / "a.csv", columns), cart, unmeasured=given)
+    (run,) = log.runs
+    assert run.hidden.tolist() == [False, True] and not run.qvel_measured
+    assert np.all(run.qpos[:, 1] == 0) and np.all(run.qvel[:, 1] == 0)
+    assert "pole (--unmeasured)" in said(log, "without a reading, whose start")
+    assert "qvel.pole" in said(log, "not read")
+    assert said(log, "estimated from positions").endswith(": qvel.slider")
+
+
+def test_columns_of_a_joint_that_is_named_are_not_read(tmp_path, cart):
+    path = save(tmp_path / "a.csv", cart_columns())
+    log = read_logs(path, cart, unmeasured=("pole",))
+    assert log.runs[0].hidden.tolist() == [False, True]
+    assert np.all(log.runs[0].qpos[:, 1] == 0)
+    assert "qpos.pole" in said(log, "not read")
+    assert not read_logs(path, cart, unmeasured=("all",)).runs[0].hidden.any()
+
+
+def test_what_one_log_lacks_is_hidden_in_all(tmp_path, cart):
+    columns = cart_columns()
+    a = save(tmp_path / "a.csv", columns)
+    del columns["qpos.pole"]
+    b = save(tmp_path / "b.csv", columns)
+    log = read_logs([a, b], cart, unmeasured=("all",))
+    assert [run.hidden.tolist() for run in log.runs] == [[False, True]] * 2
+    assert log.notes[-1].startswith("readings of pole are not used")
+
+
+def test_joints_that_the_model_places_need_no_word(tmp_path):
+    m = mujoco.MjModel.from_xml_string(
+        CART.replace(
+            "<actuator>",
+            '<equality><joint joint1="pole" joint2="slider" polycoef="0.1 2 0 0 0"/>'
+            "</equality><actuator>",
+        )
+    )
+    columns = cart_columns()
+    del columns["qpos.pole"]
+    log = read_logs(save(tmp_path / "a.csv", columns), m)
+    (run,) = log.runs
+    np.testing.assert_allclose(run.qpos[:, 1], 0.1 + 2 * run.qpos[:, 0], atol=1e-9)
+    assert "pole (coupled to slider)" in said(log, "without a reading, whose start")
+    # Both are missing, so neither is placed.
+    del columns["qpos.slider"]
+    text = failure(save(tmp_path / "b.csv", columns), m)
+    assert 'no column "qpos.slider"' in text
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ((), "; if joint pole has no sensor, give --unmeasured pole"),
+        (("slider", "all"), "no joint is measured, so nothing can be determined"),
+        (("pola",), 'has no such joint; did you mean "pole"? (known: slider, pole)'),
+    ],
+)
+def test_missing_joints_that_nobody_declared(tmp_path, cart, given, words):
+    columns = cart_columns()
+    columns["qpos.pol"] = columns.pop("qpos.pole")
+    text = failure(save(tmp_path / "a.csv", columns), cart, unmeasured=given)
+    assert words in text
+    if not given:
+        assert 'did you mean "qpos.pol"?' in text
+
+
+def test_a_base_without_a_reading(tmp_path, flyer):
+    columns = {k: v for k, v in flyer_columns().items() if "base" not in k}
+    path = save(tmp_path / "a.csv", columns)
+    text = failure(path, flyer)
+    assert '"qpos.base.0"' in text and "--held-base" in text
+    assert text.endswith("if joint base has no sensor, give --unmeasured base")
+    log = read_logs(path, flyer, unmeasured=("base",))
+    (run,) = log.runs
+    assert run.hidden.tolist() == [True] * 6 + [False] * 4
+    np.testing.assert_allclose(run.qpos[:, 3:7], np.tile([1.0, 0, 0, 0], (ROWS, 1)))
+    back = tmp_path / "b.csv"
+    write_log(back, flyer, run)
+    assert "base" not in back.read_text()
+    again = read_logs(back, flyer, unmeasured=("all",)).runs[0]
+    np.testing.assert_allclose(again.qpos, run.qpos, rtol=0, atol=1e-15)
+
+
+def test_trees_without_a_reading_are_told(tmp_path):
+    m = mujoco.MjModel.from_xml_string(
+        CART.replace(
+            "</worldbody>",
+            '<body name="ball"><freejoint name="ball"/><geom size=".1"/></body>'
+            "</worldbody>",
+        )
+    )
+    path = save(tmp_path / "a.csv", cart_columns())
+    log = read_logs(path, m, unmeasured=("ball",))
+    assert "tie ball to what is measured" in said(log, "only contacts")
 
 
 # Time and runs
