@@ -88,6 +88,5 @@ def _states(m: mujoco.MjModel) -> list[str]:
         return []
     return [
         f"drives with a state of their own (activation): {', '.join(names)}; logs do "
-        "not hold it, and every prediction begins with it at zero, so values found at "
-        "these drives, and effects that are named, may be wrong"
+        "not hold it, so it is unknown where a prediction begins"
     ]

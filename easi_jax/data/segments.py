@@ -21,6 +21,8 @@ class Segments:
         past: commands before the start, oldest first, ``(M, D, nu)``; what comes before
             a run's or an episode's first command is that command. () where no
             simulation has use for them.
+        act: activations of the start, ``(M, na)``, of a log a guess; () where the model
+            has none. Zero where they are left out.
     """
 
     qpos: Any
@@ -30,6 +32,7 @@ class Segments:
     next_qvel: Any
     weight: Any
     past: Any = ()
+    act: Any = ()
 
     @property
     def count(self) -> int:
@@ -62,10 +65,12 @@ def cut(
     horizon: int,
     every: int,
     past: int = 0,
+    act: np.ndarray | None = None,
 ) -> Segments | None:
     """Segments of one uninterrupted recording ``(T, ...)``, None if too short.
 
-    ``past``: how many commands before each start they hold.
+    ``past``: how many commands before each start they hold. ``act``: activations at
+    each row, ``(T, na)``.
     """
     starts = np.arange(0, len(qpos) - horizon, every)
     if not len(starts):
@@ -79,6 +84,7 @@ def cut(
         next_qvel=qvel[steps + 1],
         weight=np.ones(len(starts)),
         past=ctrl[np.maximum(starts[:, None] + np.arange(-past, 0), 0)] if past else (),
+        act=act[starts] if act is not None and act.shape[1] else (),
     )
 
 
@@ -122,6 +128,7 @@ def windows(
         next_qvel=flat(t.next_qvel[:, rows, 0]),
         weight=flat(t.weight[:, rows].min(-1)),
         past=jax.tree.map(flat, before),
+        act=jax.tree.map(lambda x: flat(x[:, starts]), t.act),
     )
 
 

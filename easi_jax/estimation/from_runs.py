@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from easi_jax.data.activations import activation_guess, activation_spread
 from easi_jax.data.segments import to_device
 from easi_jax.devices import distributed
 from easi_jax.devices.mesh import make_mesh, placed, replicated
@@ -55,6 +56,31 @@ def search_data(problem: Problem) -> SearchData:
     return SearchData(segments=to_device(pieces), noise=noise)
 
 
+def start_spread(problem: Problem, noise: jax.Array) -> jax.Array:
+    """What logs know of where a piece starts, standard deviations ``(2 nv + na,)``.
+
+    A reading is as good as its ``noise (2 nv,)``. Velocities that come from positions
+    say nothing that the rows of a piece do not say again, so they may be anything that
+    occurs; so may what is not measured, and activations
+    (`easi_jax.data.activations.activation_spread`).
+    """
+    m, runs = problem.simulator.mj_model, problem.fit
+    moving = np.sqrt(np.mean(np.concatenate([r.qvel for r in runs]) ** 2, 0))
+    ranges = np.ptp(m.jnt_range, axis=1) * m.jnt_limited
+    reach = np.where(ranges > 0, 0.5 * ranges, 1.0)[m.dof_jntid]  # m, rad
+    known = np.isfinite(np.asarray(noise))
+    position, velocity = np.split(np.where(known, noise, 0.0), 2)
+    guesses = [activation_guess(m, run) for run in runs]
+    return jnp.concatenate(
+        [
+            jnp.where(known[: m.nv], position, reach),
+            jnp.where(problem.measured, velocity, np.hypot(velocity, moving)),
+            activation_spread(m, runs, guesses),
+        ],
+        dtype=jnp.result_type(float),
+    )
+
+
 def ready_finish(
     problem: Problem,
     search: Search,
@@ -90,6 +116,7 @@ def ready_finish(
         np.concatenate([np.ones(simulator.mj_model.nv), problem.measured])
     )
     hidden = jnp.where(seen > 0, 0.0, jnp.inf)
+    start = start_spread(problem, effective_noise(simulator, whole, noise))
 
     def finish(
         mean: Any, cov: Any, pieces: Any, misfit: Any, robust: Any, near: Any
@@ -108,12 +135,14 @@ def ready_finish(
             robust,
             near=near,
             restarts=restarts,
+            start=start,
         )
         return found, errors(found, pieces)
 
     def ending(center: Any, cov: Any, whole: Any, misfit: Any) -> Any:
         how = search.config.informed_spread, search.mesh, misfit
-        found = polished(simulator, space, center, cov, whole, noise, *how)
+        given = simulator, space, center, cov, whole, noise
+        found = polished(*given, *how, start=start)
         return found, errors(found, whole)
 
     def errors(found: Any, pieces: Any) -> Any:

@@ -66,7 +66,7 @@ class RefineResult:
         cost: half the weighted squared error, at ``unit`` as given, after each round of
             the last stage, and at the result, ``(I + 2,)``; the last value from where
             the fit had settled.
-        delta: corrections of the starts, ``(M, 2 nv)``.
+        delta: corrections of the starts, ``(M, S)``.
         raised: ``unit`` with logarithmic parameters raised to the low end of their
             initial range: below it they may be as good as zero, where the logarithm has
             no slope.
@@ -100,12 +100,14 @@ def refine(
     free_starts: bool = True,
     near: bool | jax.Array = False,
     others: jax.Array | None = None,
+    start: jax.Array | None = None,
 ) -> RefineResult:
     """Levenberg-Marquardt from ``unit (n,)``; pure, for use inside jit.
 
     Args:
         iterations: rounds of a stage at most; fewer where the cost has settled.
-        noise: standard deviations of the measurement, ``(2 nv,)``, above zero.
+        noise: standard deviations of the measurement, ``(2 nv,)``, above zero;
+            infinite for what is not measured.
         prior_std: weak pull towards the start, in initial ranges, so that
             directions without any information stay where they are.
         misfit: what the model itself errs by in every step, standard deviations
@@ -119,15 +121,16 @@ def refine(
             fits better.
         others: ``(K, n)`` more places to start from; what fits best is the result. One
             that comes to within a standard deviation of it is followed no further.
+        start: what is known of starts, as in `PairedFit`.
     """
-    whole = PairedFit(simulator, space, segments, noise, mesh, free_starts)
+    whole = PairedFit(simulator, space, segments, noise, mesh, free_starts, None, start)
     low, high = space.unit_bounds
     anchor = unit
     pull = jnp.full(space.size, 1.0 / prior_std**2)
     weight = step_weights(segments, noise, misfit)
     short = min(segments.horizon, max(1, round(_SHORT / simulator.dt)))
     begin = jnp.arange(segments.horizon) < short
-    unmoved = jnp.zeros((segments.count, 2 * simulator.mj_model.nv))
+    unmoved = whole.unmoved
 
     away = functools.partial(_distance, space, anchor)
 
@@ -593,9 +596,10 @@ def moved(space: ParameterSpace, unit: jax.Array, du: jax.Array) -> jax.Array:
 def step_weights(
     segments: Segments, noise: jax.Array, misfit: jax.Array | None = None
 ) -> jax.Array:
-    """Weight of each measured number, ``(M, H, 2 nv)``: 1 where the model is exact."""
-    share = jnp.ones_like(noise)
+    """Weight of each measured number, ``(M, H, 2 nv)``: 1 where the model is exact, 0
+    of what is not measured."""
+    share = jnp.where(jnp.isfinite(noise), 1.0, 0.0)
     if misfit is not None:
-        share = 1.0 / (1.0 + (misfit / noise) ** 2)
+        share = share / (1.0 + (misfit / noise) ** 2)
     shape = (segments.count, segments.horizon, noise.shape[0])
     return jnp.broadcast_to(segments.weight[:, None, None] * share, shape)

@@ -4,8 +4,8 @@ Derivatives are those of `easi_jax.simulation.slopes` or, on MJX beyond three de
 freedom, central differences in single precision: derivatives of an arm of six compile
 for minutes, and batches of larger robots simulate many times faster than derivatives go
 through them (`easi_jax.simulation.cpu.batch_last`). The start state of each segment is
-unknown within its noise and eliminated (Schur complement). The inverse is the Cramer-
-Rao bound.
+unknown within what was measured of it, or less, and eliminated (Schur complement). The
+inverse is the Cramer-Rao bound.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ _LANES = 64  # simulations at once of a smaller robot, whose loop is one piece t
 # Of an initial range, for differences along a parameter: of 0.01 a bend of a drive's
 # limit looks like knowledge where there is none, of 0.001 rounding does.
 _STEP = 0.004
-_MOVE = 1e-4  # at least, along a start [m, rad, m/s, rad/s]
+_MOVE = 1e-4, 0.1  # at least and at most, along a start [m, rad, m/s, rad/s]
 _NUMERIC = 1e-4  # relative singular value that single precision cannot resolve
 
 
@@ -41,8 +41,8 @@ class Normal:
         gradient: ``(n,)``.
         costs: half the weighted squared error of each piece, ``(M,)``; inf where the
             simulation is not finite, which leaves no other trace here.
-        start_step: ``(M, 2 nv)`` correction of each start at zero parameter step.
-        start_gain: ``(M, 2 nv, n)``: correction per unit of parameter step.
+        start_step: ``(M, S)`` correction of each start at zero parameter step.
+        start_gain: ``(M, S, n)``: correction per unit of parameter step.
     """
 
     hessian: jax.Array
@@ -54,16 +54,20 @@ class Normal:
 
 @dataclass(frozen=True)
 class PairedFit:
-    """Predicted against measured segments, each start free within its noise.
+    """Predicted against measured segments, each start free within what is known of it.
 
     Attributes:
         simulator, space: what is simulated, and its parameters.
         segments: M of H control steps.
-        noise: standard deviations of measured positions and velocities, ``(2 nv,)``.
+        noise: standard deviations of measured positions and velocities, ``(2 nv,)``;
+            infinite for what is not measured.
         mesh: devices that share the segments; all of them by default.
-        free_starts: whether starts are free within the noise, or known exactly.
+        free_starts: whether starts are free, or known exactly.
         steps: control steps of each piece that are simulated, all by default; the
             others are to weigh nothing.
+        start: standard deviations of the true starts about those of the segments,
+            ``(S,)``: positions, velocities, and activations where these are free; by
+            default the noise, and activations that are known.
     """
 
     simulator: Simulator
@@ -73,12 +77,23 @@ class PairedFit:
     mesh: Mesh | None = None
     free_starts: bool = True
     steps: int | jax.Array | None = None
+    start: jax.Array | None = None
+
+    @property
+    def spread(self) -> jax.Array:
+        """Standard deviations of a start, ``(S,)``."""
+        return self.noise if self.start is None else self.start
+
+    @property
+    def unmoved(self) -> jax.Array:
+        """No shift of any start, ``(M, S)``."""
+        return jnp.zeros((self.segments.count, len(self.spread)))
 
     def normal(self, unit: jax.Array, delta: jax.Array, weight: jax.Array) -> Normal:
         """Gauss-Newton system at parameters ``unit (n,)`` and start shifts ``delta``.
 
         Args:
-            delta: ``(M, 2 nv)``.
+            delta: ``(M, S)``.
             weight: of each measured number, ``(M, H, 2 nv)``.
         """
         if self.simulator.by_differences:
@@ -96,12 +111,12 @@ class PairedFit:
 
     def around(self, unit: jax.Array, delta: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Points whose `sweep` holds the derivatives at ``unit (n,)`` and ``delta
-        (M, 2 nv)``: themselves, then steps up, then steps down; ``(K, n)``,
-        ``(K, M, 2 nv)``."""
-        n, m, nv2 = self.space.size, self._directions, delta.shape[1]
+        (M, S)``: themselves, then steps up, then steps down; ``(K, n)``,
+        ``(K, M, S)``."""
+        n, m, size = self.space.size, self._directions, delta.shape[1]
         low, high = self.space.unit_bounds
-        ways = jnp.eye(m, n + nv2) * self._steps()
-        ways = jnp.concatenate([jnp.zeros((1, n + nv2)), ways, -ways])
+        ways = jnp.eye(m, n + size) * self._steps()
+        ways = jnp.concatenate([jnp.zeros((1, n + size)), ways, -ways])
         # Between bounds a parameter may have less than its step to go.
         units = jnp.clip(unit + ways[:, :n], low, high)
         return units, delta + ways[:, None, n:]
@@ -109,7 +124,7 @@ class PairedFit:
     def sweep(
         self, units: jax.Array, deltas: jax.Array, weight: jax.Array
     ) -> tuple[Normal, jax.Array]:
-        """Simulates every piece from several points ``(K, n)``, ``(K, M, 2 nv)``.
+        """Simulates every piece from several points ``(K, n)``, ``(K, M, S)``.
 
         One simulation for derivatives and for trials, so that it is compiled once.
 
@@ -140,29 +155,35 @@ class PairedFit:
 
     def _steps(self) -> jax.Array:
         along = jnp.full(self.space.size, _STEP)
-        return jnp.concatenate([along, jnp.maximum(self.noise, _MOVE)])
+        return jnp.concatenate([along, jnp.clip(self.spread, *_MOVE)])
 
     def _equations(self, r: jax.Array, jac: jax.Array, d: jax.Array, w: Any) -> Any:
         """One piece's part of `Normal`, from its residual and slopes."""
-        n, nv2, noise = self.space.size, len(d), self.noise
-        root = jnp.sqrt(w) / noise
+        n, size = self.space.size, self.spread
+        root = jnp.sqrt(w) / self.noise
         # A piece of weight zero may hold anything; one that the simulation does not
         # get through has no slopes.
         on = (w > 0) & jnp.isfinite(r).all() & jnp.isfinite(jac).all()
         rw = jnp.where(on, r * root, 0.0).reshape(-1)
         jw = jnp.where(on[..., None], jac * root[..., None], 0.0)
         jw = jw.reshape(rw.shape[0], -1)
-        a, b = jw[:, :n], jw[:, n:]
-        hess, grad = a.T @ a, a.T @ rw
+        given = jnp.concatenate([jw[:, :n], rw[:, None]], 1)
         cost = self._cost(r, d, w)
         if not self.free_starts:
-            return hess, grad, cost, jnp.zeros(nv2), jnp.zeros((nv2, n))
-        # The start was measured too: its own shift costs d / noise.
-        fxx = b.T @ b + jnp.diag(1 / noise**2)
-        fxu, gx = b.T @ a, b.T @ rw + d / noise**2
-        sol = jnp.linalg.solve(fxx, jnp.concatenate([fxu, gx[:, None]], 1))
-        hess, grad = hess - fxu.T @ sol[:, :n], grad - fxu.T @ sol[:, n]
-        return hess, grad, cost, -sol[:, n], -sol[:, :n]
+            both = given.T @ given
+            still = jnp.zeros(len(d)), jnp.zeros((len(d), n))
+            return both[:n, :n], both[:n, n], cost, *still
+        # Of a start something is known, too: a shift of one deviation costs 1/2. What
+        # starts explain is taken off before squares are summed, for a broad one
+        # explains nearly all of it.
+        b = jw[:, n:] * size
+        known = jnp.zeros((len(d), n + 1)).at[:, n].set(d / size)
+        held = b.T @ b + jnp.eye(len(d))
+        follow = jnp.linalg.solve(held, b.T @ given + known)
+        left = jnp.concatenate([given - b @ follow, known - follow])
+        both = left.T @ left
+        step = -size[:, None] * follow
+        return both[:n, :n], both[:n, n], cost, step[:, n], step[:, :n]
 
     def _summed(self, parts: Any) -> Normal:
         hess, grad, cost, step, gain = parts
@@ -170,7 +191,7 @@ class PairedFit:
 
     def _cost(self, r: jax.Array, d: jax.Array, w: jax.Array) -> jax.Array:
         square = jnp.where(w > 0, w * (r / self.noise) ** 2, 0.0).sum()
-        total = 0.5 * (square + jnp.sum((d / self.noise) ** 2))
+        total = 0.5 * (square + jnp.sum((d / self.spread) ** 2))
         return jnp.where(jnp.isfinite(total), total, jnp.inf)
 
     def costs(self, unit: jax.Array, delta: jax.Array, weight: jax.Array) -> jax.Array:
@@ -178,7 +199,7 @@ class PairedFit:
 
         Args:
             unit: ``(K, n)``.
-            delta: ``(K, M, 2 nv)``.
+            delta: ``(K, M, S)``.
             weight: of each measured number, ``(M, H, 2 nv)``.
 
         Returns:
@@ -204,8 +225,7 @@ class PairedFit:
 
     @property
     def _directions(self) -> int:
-        starts = 2 * self.simulator.mj_model.nv if self.free_starts else 0
-        return self.space.size + starts
+        return self.space.size + (len(self.spread) if self.free_starts else 0)
 
     def _each(self, one: Any, points: int, *items: jax.Array) -> Any:
         """``one`` of every segment with its ``items``, shared among the devices.

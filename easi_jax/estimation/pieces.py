@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from easi_jax.data.activations import activation_guess
 from easi_jax.data.cleaning import _STEPS_AGREE, trusted_velocity
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import Segments, cut, join, windows
@@ -73,9 +74,9 @@ def segments_from_runs(
             if fitted
             else trusted_velocity(run)
         )
-        parts.append(
-            cut(run.qpos, qvel, run.ctrl, horizon, every, simulator.past_steps)
-        )
+        act = activation_guess(simulator.mj_model, run)
+        given = run.qpos, qvel, run.ctrl, horizon, every, simulator.past_steps, act
+        parts.append(cut(*given))
     whole = [p for p in parts if p is not None]
     if not whole:
         longest = max(runs, key=len)

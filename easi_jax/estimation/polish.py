@@ -57,13 +57,15 @@ def polish(
     mesh: Mesh | None = None,
     misfit: jax.Array | None = None,
     free_starts: bool = True,
+    start: jax.Array | None = None,
 ) -> RefineResult:
     """A fit ``unit (n,)`` after steps on ``segments``; pure, for use inside jit.
 
     Args:
         segments: those that count now, all M of them; the fit may come from others.
         noise: standard deviations of the measurement, ``(2 nv,)``, above zero.
-        misfit, free_starts: as in `easi_jax.estimation.levenberg_marquardt.refine`.
+        misfit, free_starts, start: as in
+            `easi_jax.estimation.levenberg_marquardt.refine`.
 
     Returns:
         The place of least cost among the fit's own, its starts as they were measured,
@@ -72,11 +74,11 @@ def polish(
         does not get through at ``unit`` counts nothing; at a place where one of the
         others explodes the cost is infinite.
     """
-    paired = PairedFit(simulator, space, segments, noise, mesh, free_starts)
+    given = simulator, space, segments, noise, mesh, free_starts
+    paired = PairedFit(*given, start=start)
     weight = step_weights(segments, noise, misfit)
     low, high = space.unit_bounds
-    given = unit
-    unmoved = jnp.zeros((segments.count, noise.shape[0]))
+    unmoved = paired.unmoved
 
     def going(c: _Look) -> jax.Array:
         return c.phase < _FINISHED
@@ -118,15 +120,15 @@ def polish(
             cost=jnp.where(here & stepping, cost, c.cost),
         )
 
-    like = jax.eval_shape(paired.normal, given, unmoved, weight)
+    like = jax.eval_shape(paired.normal, unit, unmoved, weight)
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
     begin = _Look(
         k=jnp.asarray(0),
         phase=jnp.asarray(_STEPPING),
-        unit=given,
+        unit=unit,
         starts=unmoved,
         damping=jnp.asarray(_DAMPING),
-        best=(given, unmoved, nothing),
+        best=(unit, unmoved, nothing),
         used=jnp.ones(segments.count, bool),
         least=jnp.asarray(jnp.inf),
         seen=nothing.hessian,

@@ -41,7 +41,8 @@ class Estimate:
         hessian: Fisher information of the data at the final mean, ``(n, n)``.
         noise: standard deviations that the information was computed with.
         cost: weighted error after each step of refinement (empty without).
-        delta: corrections of the pieces' starts within their noise, ``(M, 2 nv)``.
+        delta: corrections of the pieces' starts, ``(M, S)``: positions, velocities,
+            and activations where these are unknown.
         fit: where the data alone lead, unit coordinates, ``(n,)``; the search's mean
             where nothing was refined.
         excess: weighted squared error there beyond what the noise makes, ``()``
@@ -50,6 +51,7 @@ class Estimate:
             counts as one more.
         pieces: M segments that all this is about, with their weights.
         misfit: what the model errs by in every step, ``(2 nv,)``, beyond the noise.
+        start: what was known of starts, standard deviations ``(S,)``.
     """
 
     distribution: Distribution
@@ -64,6 +66,7 @@ class Estimate:
     simulated: jax.Array
     pieces: Segments
     misfit: jax.Array
+    start: jax.Array
 
 
 def estimate(
@@ -83,6 +86,7 @@ def estimate(
     restarts: int = 0,
     adjusted: bool = False,
     rest: Segments | None = None,
+    start: jax.Array | None = None,
 ) -> Estimate:
     """The result of a search at ``mean``, ``cov`` (unit coordinates); pure.
 
@@ -100,9 +104,12 @@ def estimate(
     where starts are exact, nor where slopes are differences
     (`Simulator.by_differences`). ``rest`` is more of the
     recording, ``pieces`` among it: the fit ends on that (`easi_jax.estimation.polish`).
+    ``start (S,)`` is what is known of starts, as in
+    `easi_jax.estimation.normal_equations.PairedFit`.
     What may be as good as zero is stated as `_near_zero` says.
     """
     assumed = effective_noise(simulator, pieces, noise)
+    start = assumed if start is None else start
     off = jnp.zeros_like(assumed) if misfit is None else misfit
     if refined:
         fit = refine(
@@ -117,20 +124,21 @@ def estimate(
             free_starts=free_starts,
             near=near,
             others=_draws(mean, cov, restarts) if restarts else None,
+            start=start,
         )
         if adjusted and free_starts and simulator.mj_model.nv <= FORWARD_MODE:
             given = simulator, space, fit.unit, pieces, assumed, mesh, misfit
             fit = _adjusted(fit, adjust(*given))
         if rest is not None:
             given = simulator, space, fit.unit, cov, rest, noise, informed, mesh, misfit
-            more = polished(*given)
+            more = polished(*given, start=start)
             simulated = fit.simulated + more.simulated
             return replace(more, search_mean=mean, simulated=simulated)
-        return _of_fit(space, fit, mean, cov, assumed, informed, pieces, off)
+        return _of_fit(space, fit, mean, cov, assumed, informed, pieces, off, start)
     weight = step_weights(pieces, assumed, misfit)
-    zero = jnp.zeros((pieces.count, len(noise)))
-    paired = PairedFit(simulator, space, pieces, assumed, mesh, free_starts)
-    eq = paired.normal(mean, zero, weight)
+    given = simulator, space, pieces, assumed, mesh, free_starts
+    paired = PairedFit(*given, start=start)
+    eq = paired.normal(mean, paired.unmoved, weight)
     left = excess(eq.costs, weight)
     open_cov, seen, _ = _posterior(eq.hessian * _trusted(left))
     spread = open_cov + seen @ cov @ seen.T
@@ -148,6 +156,7 @@ def estimate(
         simulated=simulated,
         pieces=pieces,
         misfit=off,
+        start=start,
     )
 
 
@@ -163,6 +172,7 @@ def polished(
     misfit: jax.Array | None = None,
     free_starts: bool = True,
     adjusted: bool = False,
+    start: jax.Array | None = None,
 ) -> Estimate:
     """The `estimate` of a fit at ``center (n,)`` after `easi_jax.estimation.polish`;
     pure.
@@ -170,16 +180,17 @@ def polished(
     Args:
         cov: of the search, ``(n, n)``.
         rest: pieces of the whole recording, R of them: cost, corrections of starts
-            ``(R, 2 nv)`` and information are theirs.
-        noise, informed, misfit, free_starts, adjusted: as in `estimate`.
+            ``(R, S)`` and information are theirs.
+        noise, informed, misfit, free_starts, adjusted, start: as in `estimate`.
     """
     assumed = effective_noise(simulator, rest, noise)
+    start = assumed if start is None else start
     off = jnp.zeros_like(assumed) if misfit is None else misfit
-    fit = polish(simulator, space, center, rest, assumed, mesh, off, free_starts)
+    fit = polish(simulator, space, center, rest, assumed, mesh, off, free_starts, start)
     if adjusted and free_starts and simulator.mj_model.nv <= FORWARD_MODE:
         given = simulator, space, fit.unit, rest, assumed, mesh, off
         fit = _adjusted(fit, adjust(*given))
-    return _of_fit(space, fit, center, cov, assumed, informed, rest, off)
+    return _of_fit(space, fit, center, cov, assumed, informed, rest, off, start)
 
 
 def _of_fit(
@@ -191,6 +202,7 @@ def _of_fit(
     informed: bool,
     pieces: Segments,
     misfit: jax.Array,
+    start: jax.Array,
 ) -> Estimate:
     """What is stated of a fit, after a search that ended at ``mean``, ``cov``."""
 
@@ -213,6 +225,7 @@ def _of_fit(
         simulated=fit.simulated,
         pieces=pieces,
         misfit=misfit,
+        start=start,
     )
 
 

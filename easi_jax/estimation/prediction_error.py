@@ -1,7 +1,6 @@
 """Errors of open-loop predictions of measured pieces, and what noise explains of
 them."""
 
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 from easi_jax.data.segments import Segments
 from easi_jax.simulation import open_loop
 from easi_jax.simulation.simulator import Simulator
+from easi_jax.simulation.slopes import shift_start
 
 
 def errors_and_floor(
@@ -30,11 +30,7 @@ def errors_and_floor(
     nv = simulator.mj_model.nv
     k_start, k_end = jax.random.split(key)
     z = noise * jax.random.normal(k_start, (held.count, 2 * nv))
-    moved = replace(
-        held,
-        qpos=simulator.move(held.qpos, z[:, :nv]),
-        qvel=held.qvel + z[:, nv:],
-    )
+    moved = shift_start(simulator, held, z)
     # One simulation, since compiling it takes longer than running it.
     every = jax.tree.map(lambda *x: jnp.concatenate(x), held, fit, moved)
     states = open_loop.predict(simulator, model, every)

@@ -55,10 +55,10 @@ def seed_results(
         fixed = {a: p.nominal for p in given for a in p.addresses}
         machine = simulator.rebuilt(space=rest, fixed={**simulator.fixed, **fixed})
 
-        def fit(start: Any, pieces: Any, noise: Any, misfit: Any) -> Estimate:
+        def fit(unit: Any, pieces: Any, noise: Any, misfit: Any, start: Any) -> Any:
             nothing = jnp.eye(rest.size)
-            how = True, None, misfit, free_starts, adjusted
-            return polished(machine, rest, start, nothing, pieces, noise, *how)
+            how = True, None, misfit, free_starts, adjusted, start
+            return polished(machine, rest, unit, nothing, pieces, noise, *how)
 
         compiled: list[Any] = []
 
@@ -84,7 +84,7 @@ def seed_results(
         at = np.delete(np.arange(space.size), taken)
         new = fit(
             jnp.asarray(start[at], found.fit.dtype),
-            *(found.pieces, found.noise, found.misfit),
+            *(found.pieces, found.noise, found.misfit, found.start),
         )
         result = _result(rest, new)
         # Known closely, and not only to be known so by data of this kind.

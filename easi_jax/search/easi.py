@@ -5,7 +5,6 @@ discriminator on measured against simulated transitions, let its mean score be t
 fitness, update the distribution.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -24,6 +23,7 @@ from easi_jax.search.evolution import make_strategy
 from easi_jax.simulation import open_loop
 from easi_jax.simulation.rollout import policy_rollout
 from easi_jax.simulation.simulator import Simulator
+from easi_jax.simulation.slopes import shift_start
 
 _USUAL_UPDATES = 20  # of the discriminator in a generation
 _CLIP = 4.0  # innovations beyond this many spreads are outliers
@@ -330,7 +330,7 @@ class Search:
         # (the log's start is off by it) and in its end, the same for everybody.
         z = data.noise * jax.random.normal(k_start, (m, 2 * nv))
         noise = data.noise * jax.random.normal(k_end, (m, c.horizon, 2 * nv))
-        starts = (self._noisy(seg, z), seg)
+        starts = (shift_start(self.simulator, seg, z), seg)
 
         def states(chunk: Any, starts: Any) -> Any:
             def one(item: Any) -> Any:
@@ -360,6 +360,7 @@ class Search:
             next_qvel=qvel + noise[..., nv:],
             weight=tile(seg.weight),
             past=jax.tree.map(tile, seg.past),
+            act=jax.tree.map(tile, seg.act),
         )
         return seg, reference, fake, jax.tree.map(tile, reference)
 
@@ -396,15 +397,6 @@ class Search:
         count = min(c.real_batch, data.segments.count)
         real = data.segments.take(_pick(k_pick, data.segments.weight, count))
         return real, self._reference(model, real), fake, reference
-
-    def _noisy(self, seg: Segments, z: jax.Array) -> Segments:
-        """Starts moved by tangent vectors ``z (M, 2 nv)``."""
-        nv = self.simulator.mj_model.nv
-        return dataclasses.replace(
-            seg,
-            qpos=self.simulator.move(seg.qpos, z[:, :nv]),
-            qvel=seg.qvel + z[:, nv:],
-        )
 
     # -- discriminator inputs ------------------------------------------------
 

@@ -19,17 +19,22 @@ def predict(
     """Open-loop prediction: ``qpos (M, H, nq)``, ``qvel (M, H, nv)``.
 
     Commands on their way at the start are those that the segments know of; before
-    them, the first one counts as sent for ever. ``steps``: how many control steps are
-    simulated, all H by default; the others hold the start.
+    them, the first one counts as sent for ever. Activations are the segments', or zero.
+    ``steps``: how many control steps are simulated, all H by default; the others hold
+    the start.
     """
     model = simulator.without_sense(model)  # only controllers read it
 
-    def one(qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array, past: Any) -> Any:
+    def one(
+        qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array, past: Any, act: Any
+    ) -> Any:
         def step(state: Any, u: jax.Array) -> Any:
             state = simulator.step(model, state, u)
             return state, (state.qpos, state.qvel)
 
-        first = dataclasses.replace(simulator.start(qpos, qvel), sensed=())
+        known = None if isinstance(act, tuple) else act
+        first = simulator.start(qpos, qvel, act=known)
+        first = dataclasses.replace(first, sensed=())
         if not isinstance(past, tuple):
             first = simulator.after(model, first, past)
         at_once = simulator.replay(model, first, ctrl, steps)
@@ -49,7 +54,8 @@ def predict(
 
         return jax.lax.fori_loop(0, steps, at, (first, begun))[1]
 
-    return jax.vmap(one)(segments.qpos, segments.qvel, segments.ctrl, segments.past)
+    s = segments
+    return jax.vmap(one)(s.qpos, s.qvel, s.ctrl, s.past, s.act)
 
 
 def prediction_residuals(

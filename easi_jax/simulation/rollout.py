@@ -56,6 +56,7 @@ def policy_rollout(
             next_qvel=after.physics.qvel[None],
             weight=alive,
             past=sent if past else (),
+            act=state.physics.act if state.physics.act.size else (),
         )
         sent = jnp.concatenate([sent, ctrl[None]])[1:]
         if auto_reset:
@@ -116,4 +117,5 @@ def measured(
         next_qvel=t.next_qvel + vel[:, end, None],
         weight=t.weight,
         past=t.past,
+        act=t.act,
     )

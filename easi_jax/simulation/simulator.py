@@ -182,13 +182,19 @@ class Simulator:
         return with_parameters(self.base, theta)
 
     def start(
-        self, qpos: jax.Array, qvel: jax.Array, model: Model | None = None
+        self,
+        qpos: jax.Array,
+        qvel: jax.Array,
+        model: Model | None = None,
+        act: jax.Array | None = None,
     ) -> Physics:
         """A measured state, nothing known of what came before it.
 
-        ``model`` is given where it has effects, which remember.
+        ``model`` is given where it has effects, which remember; activations ``act
+        (na,)`` are zero where they are not given.
         """
-        return at_rest(self.base if model is None else model, qpos, qvel)
+        state = at_rest(self.base if model is None else model, qpos, qvel)
+        return state if act is None else replace(state, act=act)
 
     def after(self, model: Model, state: Physics, past: jax.Array) -> Physics:
         """A state with commands ``past (D, nu)`` sent before it, oldest first."""

@@ -18,18 +18,23 @@ from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import open_loop
 from easi_jax.simulation.simulator import Simulator
 
-# Of an initial range, and along a start [m, rad, m/s, rad/s]: what a central difference
-# leaves out is of its square, and the constraint solver's rest, 1e-9, over it.
+# Of an initial range, and along a start [m, rad, m/s, rad/s, activations]: what a
+# central difference leaves out is of its square, and the constraint solver's rest,
+# 1e-9, over it.
 _STEP = 1e-4
 _MOVE = 1e-5
 
 
 def shift_start(simulator: Simulator, seg: Segments, delta: jax.Array) -> Segments:
-    """Segments with starts moved by tangent vectors ``(M, 2 nv)``."""
+    """Segments with starts moved by tangent vectors ``(M, 2 nv)``, or by these and
+    changes of their activations, ``(M, 2 nv + na)``."""
     nv = simulator.mj_model.nv
-    move = simulator.move
+    along, speed, act = jnp.split(delta, (nv, 2 * nv), axis=1)
     return replace(
-        seg, qpos=move(seg.qpos, delta[:, :nv]), qvel=seg.qvel + delta[:, nv:]
+        seg,
+        qpos=simulator.move(seg.qpos, along),
+        qvel=seg.qvel + speed,
+        act=seg.act + act if act.size else seg.act,
     )
 
 
@@ -45,7 +50,7 @@ def residuals(
 
     Args:
         unit: parameters, unit coordinates, ``(n,)``.
-        shift: of the measured start, ``(2 nv,)``.
+        shift: of the measured start, ``(S,)``, as in `shift_start`.
         piece: one segment, without an axis for it.
         steps: control steps that are simulated; all H where None.
     """
@@ -63,7 +68,7 @@ def linearized(
     free_start: bool = True,
 ) -> tuple[jax.Array, jax.Array]:
     """`residuals`, and their slopes along the parameters and, where it is free, the
-    start, ``(H, 2 nv, n + 2 nv or n)``; pure."""
+    start, ``(H, 2 nv, n + S or n)``; pure."""
     run = partial(_linearized, simulator, space, free_start)
     return _precisely(simulator, run, unit, shift, piece, steps)
 

@@ -85,6 +85,7 @@ class Bench:
             simulated=jnp.zeros(()),
             pieces=pieces,
             misfit=jnp.zeros(4),
+            start=noise,
         )
 
     def stated(self, estimates: Sequence[Estimate]) -> list[SeedResult]:
