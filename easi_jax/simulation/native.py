@@ -164,8 +164,10 @@ class _Host:
         qfrc: np.ndarray | None,
         xfrc: np.ndarray | None,
         every: int,
+        edge: np.ndarray | None = None,
     ) -> tuple["_State", np.ndarray, np.ndarray]:
-        """Physics steps with commands ``ctrl (N, T, nu)``, other forces held.
+        """Physics steps with commands ``ctrl (N, T, nu)``, other forces held; no joint
+        is faster than ``edge (N, nv)``.
 
         Returns:
             The state after the last, and positions and velocities after each
@@ -180,7 +182,9 @@ class _Host:
         qvel = np.empty((n, seen, self.mj.nv))
         wrong = b.failed.copy()
         try:
-            if seen == 1 and (steps == 1 or not np.ptp(ctrl, axis=1).any()):
+            if edge is not None:
+                self._clipped(b, ctrl, every, edge, wrong, qpos, qvel)
+            elif seen == 1 and (steps == 1 or not np.ptp(ctrl, axis=1).any()):
                 batch.bind("ctrl")[:] = ctrl[:, 0]
                 batch.step(nstep=steps)
                 qpos[:, 0], qvel[:, 0] = batch.bind("qpos"), batch.bind("qvel")
@@ -209,6 +213,7 @@ class _Host:
         qfrc: np.ndarray | None,
         xfrc: np.ndarray | None,
         pairs: np.ndarray,
+        edge: np.ndarray | None = None,
     ) -> tuple["_State", np.ndarray, np.ndarray]:
         """One physics step whose contacts are changed where they are made."""
         self._load(b, state, qfrc, xfrc)
@@ -227,6 +232,9 @@ class _Host:
             mujoco.mj_getState(m, d, row, _ALL)
             b.batch.state[i] = row
             wrong[i] = not np.isfinite(d.qacc).all()
+        if edge is not None:
+            speeds = b.batch.bind("qvel")
+            np.clip(speeds, -edge, edge, out=speeds)
         after = self._read(b, state)
         _lost(wrong, *after[:4])
         return after, after.qpos[:, None], after.qvel[:, None]
@@ -248,6 +256,28 @@ class _Host:
             rows = slice(at // every, at // every + some.shape[1] // every)
             qpos[:, rows] = got["qpos"][:, every - 1 :: every]
             qvel[:, rows] = got["qvel"][:, every - 1 :: every]
+
+    def _clipped(
+        self,
+        b: _Batch,
+        ctrl: np.ndarray,
+        every: int,
+        edge: np.ndarray,
+        wrong: np.ndarray,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+    ) -> None:
+        """Step by step: MuJoCo has no limit of a joint's speed."""
+        speeds, step = b.batch.bind("qvel"), b.batch.bind("ctrl")
+        for t in range(ctrl.shape[1]):
+            step[:] = ctrl[:, t]
+            try:
+                b.batch.step(nstep=1)
+            except mujoco_batch.SimulationError as error:
+                wrong[error.ids] = True
+            np.clip(speeds, -edge, edge, out=speeds)
+            if (t + 1) % every == 0:
+                qpos[:, t // every], qvel[:, t // every] = b.batch.bind("qpos"), speeds
 
     def _load(
         self,
@@ -383,7 +413,7 @@ def _host(template: Template) -> _Host:
 
 # Axes of its own that each argument of a call has, behind those of a batch.
 _OWN = {
-    **dict.fromkeys(("qpos", "qvel", "act", "warmstart", "rest", "qfrc"), 1),
+    **dict.fromkeys(("qpos", "qvel", "act", "warmstart", "rest", "qfrc", "edge"), 1),
     **dict.fromkeys(("ctrl", "xfrc", "pairs"), 2),
     "count": 0,
 }
@@ -488,13 +518,15 @@ class _Call:
         ctrl = rows["ctrl"].astype(np.float64)
         forces = rows.get("qfrc"), rows.get("xfrc")
         if "pairs" in rows:
-            return host.one_by_one(b, state, ctrl[:, 0], *forces, rows["pairs"])
+            given = (*forces, rows["pairs"], rows.get("edge"))
+            return host.one_by_one(b, state, ctrl[:, 0], *given)
+        more = (*forces, self.every, rows.get("edge"))
         if "count" not in rows:
-            return host.steps(b, state, ctrl, *forces, self.every)
+            return host.steps(b, state, ctrl, *more)
         count = int(rows["count"][0])
         if (rows["count"] != count).any():
             raise ValueError("simulations of one call end after as many steps")
-        after, *seen = host.steps(b, state, ctrl[:, :count], *forces, self.every)
+        after, *seen = host.steps(b, state, ctrl[:, :count], *more)
         steps = ctrl.shape[1] // self.every
         qpos, qvel = (
             np.repeat(start[:, None].astype(np.float64), steps, 1)
@@ -523,6 +555,7 @@ def run(
     pairs: jax.Array | None = None,
     stage: str = "step",
     count: jax.Array | None = None,
+    edge: jax.Array | None = None,
 ) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, jax.Array], jax.Array]:
     """Physics steps of MuJoCo C; may be traced, and mapped over any argument.
 
@@ -540,6 +573,7 @@ def run(
         stage: "step"; "velocity": nothing moves, and ``read`` sees the state itself.
         count: physics steps that are taken, ``()``, the same for all that are mapped
             over; T where None. Of later ones the motion is that of the start.
+        edge: speeds that joints are clipped to after each physics step, ``(nv,)``.
 
     Returns:
         qpos, qvel, act, warm start and rest after the last step; qpos and qvel after
@@ -549,7 +583,7 @@ def run(
     m = model.template.mj
     every = every or ctrl.shape[0]
     given = {name: getattr(state, name) for name in _State._fields} | {"ctrl": ctrl}
-    more = {"qfrc": qfrc, "xfrc": xfrc, "pairs": pairs, "count": count}
+    more = {"qfrc": qfrc, "xfrc": xfrc, "pairs": pairs, "count": count, "edge": edge}
     given |= {name: x for name, x in more.items() if x is not None}
     seen, size = ctrl.shape[0] // every, read.size if read is not None else 0
     shapes = (seen, m.nq), (seen, m.nv), (size,)

@@ -59,11 +59,13 @@ def _varies(model: Any) -> bool:
     m = model.mjx.template
     sprung = not m.mj.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SPRING
     steady = [f for f in _STEADY if f != "stiffness" or sprung]
-    return (
-        model.torque_speed is not None
-        or m.limits_speed
-        or any(f not in steady for f in _acting(model))
-    )
+    unsteady = any(f not in steady for f in _acting(model))
+    return model.torque_speed is not None or unsteady
+
+
+def _edge(model: Any) -> Any:
+    """Speed limits of joints, where there may be any."""
+    return model.speed_limit if model.mjx.template.limits_speed else None
 
 
 def _reading(model: Any) -> Any:
@@ -85,7 +87,9 @@ def steps(model: Any, state: Any, arrived: jax.Array) -> Any:
         return jax.lax.scan(lambda s, u: (_one(model, s, u), None), state, arrived)[0]
     changed, qfrc, xfrc = _steady(model)
     out, _, sensed = native.run(
-        changed, state, arrived, qfrc, xfrc, read=_reading(model)
+        *(changed, state, arrived, qfrc, xfrc),
+        read=_reading(model),
+        edge=_edge(model),
     )
     return _after(model, state, out, sensed)
 
@@ -103,7 +107,7 @@ def replay(
     ctrl = arrived.reshape(h * substeps, nu)
     count = None if steps is None else jnp.asarray(steps * substeps)
     given = changed, state, ctrl, qfrc, xfrc
-    return native.run(*given, every=substeps, count=count)[1]
+    return native.run(*given, every=substeps, count=count, edge=_edge(model))[1]
 
 
 def _after(model: Any, state: Any, out: tuple[jax.Array, ...], sensed: Any) -> Any:
@@ -143,7 +147,7 @@ def _steady(model: Any) -> tuple[Any, Any, Any]:
 
 
 def _one(model: Any, state: Any, ctrl: jax.Array) -> Any:
-    """One physics step; a joint's speed limit clips after it."""
+    """One physics step."""
     m, e, rotor = model.mjx, model.effects, state.rotor
     acting = _acting(model)
     if model.torque_speed is not None:
@@ -165,9 +169,6 @@ def _one(model: Any, state: Any, ctrl: jax.Array) -> Any:
         *(m, state, ctrl[None], d.qfrc_applied, d.xfrc_applied),
         read=_reading(model),
         pairs=pairs,
+        edge=_edge(model),
     )
-    new = _after(model, state, out, sensed).replace(rotor=rotor)
-    if model.mjx.template.limits_speed:
-        edge = model.speed_limit
-        new = new.replace(qvel=jnp.clip(new.qvel, -edge, edge))
-    return new
+    return _after(model, state, out, sensed).replace(rotor=rotor)

@@ -171,6 +171,43 @@ def test_steps_agree_with_the_replay_and_any_number_of_threads(
     np.testing.assert_allclose(qvel, found[0][1], atol=1e-4)
 
 
+@pytest.mark.parametrize("slip", [(), ("effect.slip.floor/tip",)])
+def test_speed_limits_clip_each_physics_step(slip: tuple[str, ...]) -> None:
+    """By one call for a replay, unless an effect takes more."""
+    m = _model()
+    limit = declare(
+        m, "limit", "joint.elbow.speed_limit", nominal=2.0, initial=(0.5, 9.0)
+    )
+    space = ParameterSpace((limit, *(declare(m, "slip", a) for a in slip)))
+    simulator = Simulator(m, space, 0.02, engine="mujoco")
+    seg = _segments(m, 3, 5)
+    seg = dataclasses.replace(seg, qvel=seg.qvel.at[2].set(jnp.nan))
+    limits, still = np.array([0.5, 2.0, 99.0]), np.ones((3, len(slip)))
+    rows = np.concatenate([limits[:, None], still], 1)
+    qpos, qvel = _predicted(simulator, seg, rows)
+    fastest = np.zeros(3)
+    for p, edge in enumerate(limits):
+        for i in range(2):
+            d = mujoco.MjData(m)
+            d.qpos[:], d.qvel[:] = seg.qpos[i], seg.qvel[i]
+            for k in range(5):
+                d.ctrl[:] = seg.ctrl[i, k]
+                for _ in range(4):
+                    mujoco.mj_step(m, d)
+                    fastest[p] = max(fastest[p], abs(d.qvel[1]))
+                    d.qvel[1] = np.clip(d.qvel[1], -edge, edge)
+                np.testing.assert_allclose(qpos[p, i, k], d.qpos, rtol=1e-5, atol=1e-5)
+                np.testing.assert_allclose(qvel[p, i, k], d.qvel, rtol=1e-4, atol=1e-4)
+    assert (fastest > limits).tolist() == [True, True, False]
+    assert np.isnan(qvel[:, 2]).all()
+
+    def replay(t: jax.Array) -> Any:
+        return open_loop.predict(simulator, simulator.model(t), seg)
+
+    calls = str(jax.make_jaxpr(replay)(jnp.asarray(rows[0])))
+    assert ("scan" in calls) == bool(slip)
+
+
 def test_models_leave_nothing_to_the_next_ones() -> None:
     """Where a model is nominal, nothing that follows from it has a row of its own."""
     m = _model()
