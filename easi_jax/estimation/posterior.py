@@ -27,7 +27,8 @@ RESTARTS = 2  # of the finish on noisy data, where it has more than one minimum
 _SHARP = 1.0 / 3.0  # of a value: its standard deviation where logarithms will do
 _KNOWN = 0.5  # of the initial range's top: a standard deviation that says something
 _HIDDEN = 0.1  # of what a model errs by, that a parameter takes up unseen
-_INITIAL_VARIANCE = 1.0 / 12.0  # of a uniform initial range, unit coordinates
+# Of a uniform initial range, unit coordinates.
+_MIDDLE, _INITIAL_VARIANCE = 0.5, 1.0 / 12.0
 
 
 @flax.struct.dataclass
@@ -92,8 +93,9 @@ def estimate(
 
     The covariance joins two sources: the search's own spread, and what the data leave
     open, ``(F + prior)^-1`` with F the Fisher information of ``pieces`` and the initial
-    range as prior. A direction that the data do not show keeps the initial spread,
-    whatever the search has drifted to. Where the fit leaves more than the noise
+    range as prior. The mean is that of both, too: a direction that the data do not show
+    keeps the initial spread about the middle of the initial range, wherever the search
+    has drifted to. Where the fit leaves more than the noise
     explains, the model lacks something, and the information counts for less
     (`_trusted`). Without ``informed`` it is the search's own covariance alone. ``misfit
     (2 nv,)`` is what the model itself errs by in every step, on top of the noise; it,
@@ -142,9 +144,14 @@ def estimate(
     left = excess(eq.costs, weight)
     open_cov, seen, _ = _posterior(eq.hessian * _trusted(left))
     spread = open_cov + seen @ cov @ seen.T
+    center = _MIDDLE + seen @ (mean - _MIDDLE)
     simulated = jnp.asarray(1.0 * paired.points * pieces.count * pieces.horizon)
     return Estimate(
-        distribution=gaussian(space, mean, spread if informed else cov),
+        distribution=gaussian(
+            space,
+            center if informed else mean,
+            spread if informed else cov,
+        ),
         search_mean=mean,
         search_cov=cov,
         hessian=eq.hessian,
@@ -207,8 +214,8 @@ def _of_fit(
     """What is stated of a fit, after a search that ended at ``mean``, ``cov``."""
 
     def said(trusted: Any) -> tuple[jax.Array, jax.Array]:
-        open_cov, _, shown = _posterior(fit.raised_hessian * trusted)
-        return _near_zero(space, fit.unit, fit.raised, open_cov, shown)
+        known = _posterior(fit.raised_hessian * trusted)
+        return _near_zero(space, fit.unit, fit.raised, *known)
 
     center = said(1.0)[0]  # what predicts best, whatever it stands in for
     spread = said(_trusted(fit.excess))[1]
@@ -337,11 +344,14 @@ def _near_zero(
     unit: jax.Array,
     raised: jax.Array,
     cov: jax.Array,
+    seen: jax.Array,
     shown: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Mean and covariance where a logarithmic parameter may be as good as zero.
+    """Mean and covariance, also where a logarithmic parameter may be as good as zero.
 
-    The likelihood is a Gaussian in the SI value, not in its logarithm. Where its
+    The mean lies where the fit ``unit`` and the middle of the initial range meet, by
+    what is known of either (``cov``, ``seen`` and ``shown`` are of `_posterior`). But
+    the likelihood is a Gaussian in the SI value, not in its logarithm. Where its
     standard deviation is no small part of the value, mean and variance of the logarithm
     are those under that likelihood and the initial range as prior. The others follow
     the SI value along the covariance, ``cov`` at ``raised``: ``unit`` with what lies
@@ -351,17 +361,21 @@ def _near_zero(
     """
     width = jnp.asarray(space.log_width)
     std = jnp.sqrt(jnp.diag(cov))
-    # What the data and the priors of the other parameters say of each.
-    precision = 1.0 / jnp.maximum(shown, 1e-12) - 1.0 / _INITIAL_VARIANCE
-    alone = 1.0 / jnp.sqrt(jnp.maximum(precision, 1e-3))
     value = jnp.exp(width * (unit - raised))  # in the SI value at `raised`
-    error = width * alone
+    straight = raised + (value - 1.0) / width  # along it
+    shrunk = _MIDDLE + seen @ (straight - _MIDDLE)
+    # What the data and the priors of the other parameters say of each.
+    shown = jnp.maximum(shown, 1e-12)
+    precision = jnp.maximum(1.0 / shown - 1.0 / _INITIAL_VARIANCE, 1e-3)
+    pull = (shrunk - _MIDDLE) / shown / precision
+    error = width / jnp.sqrt(precision)
     top = jnp.exp(width * (1.0 - raised))  # of the initial range
     # What lies below its range has no slope there to be known by.
     known = (error < _KNOWN * top) | (unit < raised)
     weak = space.log & known & (error > _SHARP * value)
-    mean, x_std, log_mean, log_std = _of_logarithm(raised, width, value, error)
-    moved = jnp.where(weak, (mean - value) / width, 0.0)
+    told = 1.0 + width * (_MIDDLE + pull - raised)
+    mean, x_std, log_mean, log_std = _of_logarithm(raised, width, told, error)
+    moved = jnp.where(weak, raised + (mean - 1.0) / width - shrunk, 0.0)
     # The others follow the weak ones all together (these may be known by their sum
     # only): what moves with them, and what is left once they are known.
     among = jnp.where(weak[:, None] & weak, cov, 0.0)
@@ -371,7 +385,7 @@ def _near_zero(
     # value; among themselves they keep their correlations.
     wide = follow * (x_std / width / std) + jnp.diag(jnp.where(weak, log_std / std, 0))
     return (
-        jnp.where(weak, log_mean, unit + follow @ moved),
+        jnp.where(weak, log_mean, unit + shrunk - straight + follow @ moved),
         rest + wide @ among @ wide.T,
     )
 
@@ -395,7 +409,7 @@ def _of_logarithm(
     u = jnp.linspace(-8.0, 4.0, 2401)
     x = jnp.exp(width[:, None] * (u - at[:, None]))
     score = -0.5 * ((x - value[:, None]) / error[:, None]) ** 2
-    p = jax.nn.softmax(score - 0.5 * (u - 0.5) ** 2 / _INITIAL_VARIANCE, axis=1)
+    p = jax.nn.softmax(score - 0.5 * (u - _MIDDLE) ** 2 / _INITIAL_VARIANCE, axis=1)
 
     def moments(v: jax.Array) -> tuple[jax.Array, jax.Array]:
         mean = (p * v).sum(1)
