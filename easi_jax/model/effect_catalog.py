@@ -315,6 +315,23 @@ def _vector(
     return Site(parts, ((0.0,) * len(parts),))
 
 
+# A motor is rarely 2.5 times weaker than its data sheet, but may well carry a load that
+# nobody told of.
+_USUAL = (0.4, 2.5)
+
+
+def _factor(
+    column: str, low: float, able: Callable[[Spot], bool] = lambda o: True
+) -> Site:
+    part = Part(column, "factor", "1", low, 10.0, 0.02)
+    return Site((part,), ((1.0,),), able=able)
+
+
+def _holds_both(o: Spot) -> bool:
+    """Whether a drive has feedback of its position and of its speed."""
+    return all(NUMBERS[c].refuse(o.m, o.i) is None for c in ("kp", "kv"))
+
+
 def _contact_friction(column: str) -> Site:
     slides = Part(column, "friction", "1", 0.05, 10.0, 0.05, of="friction")
     return Site((slides,), ((0.6,), (1.6,)), able=lambda o: bool(o.pairs))
@@ -501,11 +518,37 @@ _ROWS = (
         "actuator_gain",
         'actuator "{at}" gives {gain} times what it is told',
         {"actuator": Site((Part("gain", "gain", "1", 0.02, 10.0, 0.02),), ((1.0,),))},
-        # A motor is rarely 2.5 times weaker than its data sheet, but may well carry a
-        # load that nobody told of.
-        usual=(0.4, 2.5),
+        usual=_USUAL,
         refits=("actuator", "gain"),
-        mjcf=effect_mjcf.GAIN,
+        mjcf=effect_mjcf.DRIVE,
+    ),
+    Effect(
+        "drive_stiffness",
+        'drive "{at}" holds its position with {factor} times its kp',
+        {"actuator": _factor("kp", 0.02)},
+        usual=_USUAL,
+        refits=("actuator", "kp"),
+        mjcf=effect_mjcf.DRIVE,
+    ),
+    Effect(
+        "drive_damping",
+        'drive "{at}" damps its motion with {factor} times its kv',
+        {"actuator": _factor("kv", 0.0)},
+        # Where it is more than the model has, a joint with more damping is the same,
+        # and more common.
+        is_rare=True,
+        usual=_USUAL,
+        refits=("actuator", "kv"),
+        mjcf=effect_mjcf.DRIVE,
+    ),
+    Effect(
+        "actuator_strength",
+        'actuator "{at}" gives {factor} times its force',
+        # A motor's is its gain. Without kp it is the drive's damping, without kv its
+        # stiffness. A limit of the force is another effect, and stays.
+        {"actuator": _factor("strength", 0.02, able=_holds_both)},
+        usual=_USUAL,
+        mjcf=effect_mjcf.DRIVE,
     ),
     Effect(
         "actuator_delay",

@@ -15,7 +15,7 @@ import numpy as np
 
 from easi_jax.model.contact_pairs import contact_pairs, geom_name, pair_names
 from easi_jax.model.effect_numbers import EffectEntry
-from easi_jax.model.effects import tilted
+from easi_jax.model.effects import drive_factors, tilted
 from easi_jax.model.joint_space import joint_name
 from easi_jax.model.quantities import actuator_name, body_name, direct_solref
 
@@ -66,8 +66,14 @@ def _spring(m: mujoco.MjModel, e: EffectEntry) -> None:
     m.qpos_spring[q] = torque / m.jnt_stiffness[j]
 
 
-def _gain(m: mujoco.MjModel, e: EffectEntry) -> None:
-    m.actuator_gainprm[_index(m, e), :3] *= e.columns["gain"]
+def _drive(m: mujoco.MjModel, e: EffectEntry) -> None:
+    at = [_index(m, e)]
+    names = "gain", "kp", "kv", "strength"
+    gain, kp, kv, strength = (np.array([e.columns.get(n, 1.0)]) for n in names)
+    factors = gain, kp, kv, strength
+    gains, biases = drive_factors(m.actuator_biasprm[at], *factors, np)
+    m.actuator_gainprm[at, :3] *= gains
+    m.actuator_biasprm[at, :3] *= biases
 
 
 def _saturation(m: mujoco.MjModel, e: EffectEntry) -> None:
@@ -177,7 +183,7 @@ COULOMB = InMjcf(_of_joint("dof_frictionloss", "coulomb"))
 DAMPING = InMjcf(_of_joint("dof_damping", "damping"))
 ARMATURE = InMjcf(_of_joint("dof_armature", "armature"))
 SPRING = InMjcf(_spring, _springy)
-GAIN = InMjcf(_gain)
+DRIVE = InMjcf(_drive)
 LIMIT = InMjcf(_saturation)
 LAG = InMjcf(_lag, _filtered)
 DELAY = InMjcf(lambda m, e: None, _delayed)

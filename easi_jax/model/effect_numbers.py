@@ -21,7 +21,9 @@ from easi_jax.model.quantities import (
     Inert,
     Quantity,
     actuation,
+    affine_bias,
     direct_solref,
+    fixed_gain,
     joint_unit,
     linear_drive,
     open_force_limit,
@@ -132,15 +134,48 @@ def _geared(m: Any, j: int) -> str | None:
     return "only joints that an actuator turns directly have play"
 
 
+def _feedback(term: int, name: str) -> Callable[[Any, int], str | None]:
+    """Refuses what has no feedback of the position (1) or of the speed (2)."""
+
+    def refuse(m: Any, a: int) -> str | None:
+        if not fixed_gain(m, a) or not affine_bias(m, a):
+            return "it is no drive: its force is not a fixed gain with an affine bias"
+        if m.actuator_gainprm[a, 0] == 0:
+            return "it is no drive: no command moves it"
+        if m.actuator_biasprm[a, term] >= 0:
+            return Inert(f"its {name} is 0, and so is a multiple of it")
+        return actuation(m, a)
+
+    return refuse
+
+
+def _linear(m: Any, a: int) -> str | None:
+    affine_gain = m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_AFFINE
+    no_bias = m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
+    if (fixed_gain(m, a) or affine_gain) and (no_bias or affine_bias(m, a)):
+        return actuation(m, a)
+    return "its gain and bias are not constant or affine"
+
+
 def _actuator(
     field: str,
     word: str,
     unit: Callable[[Any, int], str],
     low: float = 0.0,
+    refuse: Callable[[Any, int], str | None] = actuation,
     **more: Any,
 ) -> EffectNumber:
     return EffectNumber(
-        _at(field), unit, low, refuse=actuation, on="actuator", word=word, **more
+        _at(field), unit, low, refuse=refuse, on="actuator", word=word, **more
+    )
+
+
+def _factor(
+    field: str, refuse: Callable[[Any, int], str | None], low: float = 1e-3
+) -> EffectNumber:
+    """A factor on numbers of an actuator."""
+    return _actuator(
+        *(field, "factor", _unit("1"), low), refuse, neutral=1.0, acts="model"
     )
 
 
@@ -229,6 +264,9 @@ EFFECT_TABLE: dict[str, EffectNumber] = {
         "rotor", "rotor_inertia", _INERTIA, 1e-9, refuse=_geared, acts="drive"
     ),
     "gain": _actuator("gain", "gain", _unit("1"), 1e-3, neutral=1.0, acts="model"),
+    "kp": _factor("kp", _feedback(1, "kp")),
+    "kv": _factor("kv", _feedback(2, "kv"), 0.0),
+    "strength": _factor("strength", _linear),
     "delay": _actuator(
         "delay", "delay", _unit("s"), high=_LONG, acts="command", is_shift=True
     ),

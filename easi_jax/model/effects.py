@@ -55,6 +55,9 @@ class Effects:
         phase: of the ripple at position zero, ``(nv,)`` [rad].
         armature: inertia beyond the model's, ``(nv,)``.
         gain: factor on a command within its range, ``(nu,)``.
+        kp: factor on how strongly a drive holds its position, ``(nu,)``.
+        kv: factor on how strongly a drive resists or holds its speed, ``(nu,)``.
+        strength: factor on an actuator's force within its limit, ``(nu,)``.
         delay: of a command, ``(nu,)`` [s].
         lag: time constant of a first-order response to a command, ``(nu,)`` [s].
         limit: largest force, ``(nu,)``.
@@ -94,6 +97,9 @@ class Effects:
     phase: jax.Array
     armature: jax.Array
     gain: jax.Array
+    kp: jax.Array
+    kv: jax.Array
+    strength: jax.Array
     delay: jax.Array
     lag: jax.Array
     limit: jax.Array
@@ -215,10 +221,13 @@ def with_effects(
         low, high = m.actuator_forcerange[:, 0], m.actuator_forcerange[:, 1]
         edge = jnp.maximum(low, -e.limit), jnp.minimum(high, e.limit)
         new["actuator_forcerange"] = jnp.stack(edge, 1)
-    if on("gain"):
+    if on("gain", "kp", "kv", "strength"):
+        gain, bias = m.actuator_gainprm, m.actuator_biasprm
         # Not on the command itself, which MuJoCo clips to its range.
-        scaled = m.actuator_gainprm.at[:, :3].multiply(e.gain[:, None])
-        new["actuator_gainprm"] = scaled
+        gains, biases = drive_factors(bias, e.gain, e.kp, e.kv, e.strength, jnp)
+        new["actuator_gainprm"] = gain.at[:, :3].multiply(gains)
+        if np.any(np.asarray(m.actuator_biastype) == mujoco.mjtBias.mjBIAS_AFFINE):
+            new["actuator_biasprm"] = bias.at[:, :3].multiply(biases)
     if on("tilt"):
         new["opt.gravity"] = tilted(m.opt.gravity, e.tilt)
     if on("friction"):
@@ -231,6 +240,25 @@ def with_effects(
             new["pair_solref"] = _softened(m.pair_solref, e.softness)
     m = m.tree_replace(new)
     return set_const(m) if on("mass", "com", "armature", "width") else m
+
+
+def drive_factors(
+    bias: Any, gain: Any, kp: Any, kv: Any, strength: Any, xp: Any
+) -> tuple[Any, Any]:
+    """Factors on the gains and biases of actuators, ``(n, 1)`` and ``(n, 3)``.
+
+    What says how strongly a drive goes for its target multiplies all that makes up the
+    target: the gain on the command and the constant bias, beside the feedback. That is
+    ``kp``; of a drive without feedback of its position, ``kv``.
+
+    Args:
+        bias: ``actuator_biasprm (n, 10)``.
+        gain, kp, kv, strength: as in `Effects`, ``(n,)``.
+        xp: numpy or jax.numpy.
+    """
+    target = xp.where(bias[:, 1] == 0, kv, kp)
+    gains = (gain * target * strength)[:, None]
+    return gains, strength[:, None] * xp.stack([target, kp, kv], 1)
 
 
 def _apart(e: Effects) -> jax.Array:

@@ -154,18 +154,20 @@ def _seed_dofs(m: Any, j: int) -> None:
 # Actuators -------------------------------------------------------------------
 
 
-def _fixed_gain(m: Any, a: int) -> bool:
+def fixed_gain(m: Any, a: int) -> bool:
+    """Whether a command is multiplied by a constant."""
     return m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED
 
 
-def _affine_bias(m: Any, a: int) -> bool:
+def affine_bias(m: Any, a: int) -> bool:
+    """Whether the force has a part linear in position and speed."""
     return m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE
 
 
 def is_position_servo(m: Any, a: int) -> bool:
     """Force is ``kp (ctrl - length) - kv velocity`` with kp not zero."""
     kp = m.actuator_gainprm[a, 0]
-    servo = _fixed_gain(m, a) and _affine_bias(m, a)
+    servo = fixed_gain(m, a) and affine_bias(m, a)
     return bool(servo and kp != 0 and m.actuator_biasprm[a, 1] == -kp)
 
 
@@ -173,7 +175,7 @@ def is_velocity_servo(m: Any, a: int) -> bool:
     """Force is ``kv (ctrl - velocity)`` with kv not zero."""
     kv = m.actuator_gainprm[a, 0]
     bias = m.actuator_biasprm[a]
-    servo = _fixed_gain(m, a) and _affine_bias(m, a) and kv != 0
+    servo = fixed_gain(m, a) and affine_bias(m, a) and kv != 0
     return bool(servo and bias[1] == 0 and bias[2] == -kv)
 
 
@@ -190,13 +192,13 @@ def _refuse_kp(m: Any, a: int) -> str | None:
 
 def _refuse_kv(m: Any, a: int) -> str | None:
     none = m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
-    if not _fixed_gain(m, a) or not (none or _affine_bias(m, a)):
+    if not fixed_gain(m, a) or not (none or affine_bias(m, a)):
         return "its force is not a fixed gain with an affine bias"
     return actuation(m, a)
 
 
 def _refuse_gain(m: Any, a: int) -> str | None:
-    if not _fixed_gain(m, a):
+    if not fixed_gain(m, a):
         return "its gain is not fixed"
     if is_position_servo(m, a):
         return "it is a position servo: vary its kp"
@@ -234,7 +236,7 @@ def _kv_entries(m: Any, a: int) -> tuple[Entry, ...]:
 
 
 def _open_kv(m: Any, a: int) -> None:
-    if not _affine_bias(m, a):
+    if not affine_bias(m, a):
         m.actuator_biastype[a] = mujoco.mjtBias.mjBIAS_AFFINE
         m.actuator_biasprm[a] = 0.0
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.gap_cases.cases import Case, build_machine, make_case
-from tests.gap_cases.effects import KINDS, OUTSIDE, CaseError, Effect
+from tests.gap_cases.effects import KINDS, ON_REQUEST, OUTSIDE, CaseError, Effect
 from tests.gap_cases.mechanisms import ON_GROUND, Mechanism, Stated
 from tests.gap_cases.places import places, twins
 from tests.gap_cases.robots import MECHANISMS
@@ -59,10 +59,11 @@ def _recipe(
 ) -> tuple[str, list[str]]:
     """Mechanism and names of effects; `effect` fixes the first."""
     names: list[str] = []
+    known = [name for name in KINDS if name not in ON_REQUEST]
     if kind in ("single", "pair"):
-        names.append(effect or str(rng.choice(list(KINDS))))
+        names.append(effect or str(rng.choice(known)))
     if kind == "pair":
-        names.append(str(rng.choice([name for name in KINDS if name != names[0]])))
+        names.append(str(rng.choice([name for name in known if name != names[0]])))
     if kind == "outside":
         names.append(effect or str(rng.choice(OUTSIDE)))
     return str(rng.choice(list(mechanisms))), names

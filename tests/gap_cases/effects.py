@@ -46,6 +46,9 @@ KINDS = {
     "armature": "joint",
     "backlash": "joint",
     "actuator_gain": "actuator",
+    "drive_stiffness": "actuator",
+    "drive_damping": "actuator",
+    "actuator_strength": "actuator",
     "actuator_delay": "actuator",
     "actuator_lag": "actuator",
     "actuator_saturation": "actuator",
@@ -58,6 +61,8 @@ KINDS = {
     "contact_friction": "model",
     "contact_softness": "model",
 }
+ON_REQUEST = {"drive_stiffness", "drive_damping", "actuator_strength"}
+"""Effects that a draw does not take by itself: seeds of older cases stay theirs."""
 OUTSIDE = ("hysteresis", "gain_drift", "coupling_spring", "dropped_commands")
 
 

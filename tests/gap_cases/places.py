@@ -1,6 +1,6 @@
 """Where an effect can be seen, and what physics cannot tell apart from it."""
 
-from tests.gap_cases.effects import KINDS, Effect
+from tests.gap_cases.effects import KINDS, ON_REQUEST, Effect
 from tests.gap_cases.mechanisms import Joint, Mechanism
 
 BODY_TURNED = ("turret", "base")
@@ -45,9 +45,20 @@ def _joints(mechanism: Mechanism, effect: str) -> list[Joint]:
     return joints
 
 
+def _holds(joint: Joint, effect: str) -> bool:
+    """Whether an effect of drives is at this one, and no twin of another effect."""
+    if joint.drive == "velocity":  # its strength is its damping
+        return effect == "drive_damping"
+    # A joint's own damping is refitted, and would do what the drive's does.
+    refitted = effect == "drive_damping" and joint.damping
+    return joint.drive == "position" and not refitted
+
+
 def places(mechanism: Mechanism, effect: str) -> list[str]:
     """Names of the places where the effect changes what is measured."""
     driven = [mechanism.joints[i] for i in mechanism.driven]
+    if effect in ON_REQUEST:
+        return [joint.actuator for joint in driven if _holds(joint, effect)]
     if effect in ("contact_friction", "contact_softness"):
         return [""] if mechanism.on_ground else []
     if effect == "gravity_tilt":
@@ -101,6 +112,13 @@ def twins(mechanism: Mechanism, effect: Effect) -> list[str]:
     if mechanism.name == "leg" and at in ("height", "trunk"):
         group = ["constant_force@height", "constant_force@trunk"]
         found += group if f"{name}@{at}" in group else []
+    for joint in joints:
+        # More of either is a torque against the speed.
+        damping = f"viscous_damping@{joint.name}", f"drive_damping@{joint.actuator}"
+        change = float(effect.parameters.get("factor", 2.0)) - 1.0
+        more = change * float(effect.parameters.get("sign", 1.0)) > 0
+        if joint.drive == "position" and f"{name}@{at}" in damping and more:
+            found += damping
     if single and name in ("actuator_delay", "sensor_delay"):
         found += [f"actuator_delay@{first.actuator}", f"sensor_delay@{first.name}"]
     return sorted({twin for twin in found if twin != f"{name}@{at}"})

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tests.gap_cases.effects import Context, Effect, Parameters
+from tests.gap_cases.effects import ON_REQUEST, Context, Effect, Parameters
 from tests.gap_cases.mechanisms import GRAVITY
 
 Sizer = Callable[[Effect, float, Context], Parameters]
@@ -37,10 +37,13 @@ def _constant_force(effect: Effect, strength: float, context: Context) -> Parame
     return {"torque": effect.number("sign") * torque}
 
 
-def _gain(effect: Effect, strength: float, context: Context) -> Parameters:
-    del context
-    up = effect.number("sign") > 0
-    return {"gain": 1.0 + 0.6 * strength if up else 1.0 - 0.55 * strength}
+def _factor(name: str) -> Sizer:
+    def size(effect: Effect, strength: float, context: Context) -> Parameters:
+        del context
+        up = effect.number("sign") > 0
+        return {name: 1.0 + 0.6 * strength if up else 1.0 - 0.55 * strength}
+
+    return size
 
 
 def _steps(longest: float, name: str) -> Sizer:
@@ -131,7 +134,8 @@ SIZERS: dict[str, Sizer] = {
     "torque_ripple": _scaled("amplitude", lambda e, c, j: 0.8 * c.torque[j]),
     "armature": _scaled("armature", lambda e, c, j: 2.0 * c.inertia[j]),
     "backlash": _scaled("width", _play),
-    "actuator_gain": _gain,
+    "actuator_gain": _factor("gain"),
+    **{name: _factor("factor") for name in ON_REQUEST},
     "actuator_delay": _steps(0.06, "delay"),
     "actuator_lag": _lag,
     "actuator_saturation": _saturation,
@@ -224,6 +228,7 @@ FILLERS: dict[str, Filler] = {
     "torque_ripple": _ripple,
     "backlash": lambda e, r, c: {"rotor_share": float(r.uniform(0.4, 0.8))},
     "actuator_gain": _sign,
+    **dict.fromkeys(ON_REQUEST, _sign),
     "actuator_deadband": lambda e, r, c: {
         "shape": str(r.choice(("zeroed", "subtractive")))
     },

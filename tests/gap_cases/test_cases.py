@@ -306,6 +306,33 @@ def test_the_drive_of_a_rotor_is_mujocos_actuator(drive: str) -> None:
     assert data.qfrc_actuator[0] == 0.0
 
 
+@pytest.mark.parametrize(
+    ("name", "drive", "expected"),
+    [
+        ("drive_stiffness", "position", 0.7 * 400.0 * 0.4 + 40.0 * 0.8),
+        ("drive_damping", "position", 400.0 * 0.4 + 0.7 * 40.0 * 0.8),
+        ("actuator_strength", "position", 0.7 * (400.0 * 0.4 + 40.0 * 0.8)),
+        ("drive_damping", "velocity", 0.7 * 40.0 * (0.7 + 0.8)),
+    ],
+)
+def test_a_drive_with_other_gains(name: str, drive: str, expected: float) -> None:
+    machine = carriage(drive)
+    effect = Effect(name, "drive", {"factor": 0.7})
+    assert places(machine, name) == ["drive"] and twins(machine, effect) == []
+    data = mujoco.MjData(model := assemble(machine, [effect], FINE).model)
+    data.qpos[0], data.qvel[0], data.ctrl[0] = 0.3, -0.8, 0.7
+    mujoco.mj_forward(model, data)
+    assert data.qfrc_actuator[0] == pytest.approx(expected)
+
+
+def test_more_damping_of_a_drive_is_the_joints() -> None:
+    machine = carriage("position")
+    more = Effect("drive_damping", "drive", {"factor": 1.4})
+    assert twins(machine, more) == ["viscous_damping@slider"]
+    dragging = Effect("viscous_damping", "slider")
+    assert twins(machine, dragging) == ["drive_damping@drive"]
+
+
 # Readings.
 
 

@@ -103,6 +103,16 @@ def _change_model(truth: Truth, effect: Effect) -> None:
         at = model.actuator(effect.at).id
         model.actuator_forcelimited[at] = 1
         model.actuator_forcerange[at] = [-number("limit"), number("limit")]
+    elif name in ("drive_stiffness", "drive_damping", "actuator_strength"):
+        # Of a velocity drive the rate gain is also what multiplies the command.
+        at = model.actuator(effect.at).id
+        position = model.actuator_biasprm[at, 1] != 0
+        if name != "drive_damping" or not position:
+            model.actuator_gainprm[at, 0] *= number("factor")
+        if name != "drive_damping":
+            model.actuator_biasprm[at, 1] *= number("factor")
+        if name != "drive_stiffness":
+            model.actuator_biasprm[at, 2] *= number("factor")
     elif name == "contact_friction":
         model.geom_friction[:, 0] = number("friction")
     elif name == "contact_softness":

@@ -206,6 +206,20 @@ def test_gain_also_beyond_the_command_range(
     np.testing.assert_allclose(simulate(e), native(want, ctrl), atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("field", "kp", "kv"), [("kp", 7, 0.3), ("kv", 10, 0.21), ("strength", 7, 0.21)]
+)
+def test_a_drive_with_other_gains(
+    field: str, kp: float, kv: float, simulate: Any, model: Any, ctrl: np.ndarray
+) -> None:
+    """As MuJoCo compiles them; both times the target is the command."""
+    e = effects.none(model).replace(**{field: jnp.array([1.0, 0.7])})
+    other = ARM.replace('kp="10" kv="0.3"', f'kp="{kp}" kv="{kv}"')
+    want = native(mujoco.MjModel.from_xml_string(other), ctrl)
+    np.testing.assert_allclose(simulate(e), want, atol=1e-3)
+    assert np.abs(want - native(model, ctrl)).max() > 0.02, "the effect is visible"
+
+
 def test_tilt_turns_gravity() -> None:
     turned = effects.tilted(jnp.array([0.0, 0.0, -9.81]), jnp.array([0.0, 0.1]))
     np.testing.assert_allclose(

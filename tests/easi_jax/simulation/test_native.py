@@ -15,6 +15,7 @@ from easi_jax.data.segments import Segments
 from easi_jax.errors import UserError
 from easi_jax.io.runs.folder import RunFolder, engine_of
 from easi_jax.model.addresses import describe, split
+from easi_jax.model.effect_catalog import CATALOG
 from easi_jax.model.effect_numbers import EFFECT_TABLE
 from easi_jax.model.parameters import ParameterSpace, declare
 from easi_jax.simulation import engine, native, open_loop
@@ -55,6 +56,9 @@ _EFFECTS: dict[str, dict[str, float]] = {
     "ripple": {"effect.ripple.elbow": 0.2, "effect.cycles.elbow": 8.0},
     "armature": {"effect.armature.elbow": 0.02},
     "gain": {"effect.gain.shoulder": 0.6},
+    "kp": {"effect.kp.elbow": 0.3},
+    "kv": {"effect.kv.elbow": 3.0},
+    "strength": {"effect.strength.elbow": 0.3},
     "delay": {"effect.delay.shoulder": 0.03},
     "lag": {"effect.lag.elbow": 0.04},
     "limit": {"effect.limit.shoulder": 0.8},
@@ -257,6 +261,14 @@ def effects_on_both() -> dict[str, Any]:
         simulator = Simulator(m, space, 0.02, engine=name)  # type: ignore[arg-type]
         out[name] = _predicted(simulator, seg, rows)
     return out
+
+
+def test_every_effect_is_compared() -> None:
+    compared = {split(a)[2] for numbers in _EFFECTS.values() for a in numbers}
+    for row in CATALOG.values():
+        for site in row.sites.values():
+            columns = {p.column for p in site.parts} & {*EFFECT_TABLE}
+            assert not columns or columns & compared, row.name
 
 
 @pytest.mark.parametrize("effect", [e for e in _EFFECTS if e != "none"])
