@@ -7,6 +7,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from easi_jax.data.recording import Configuration, Run
+from easi_jax.data.windows import fitted_velocity
+from easi_jax.gap import analysis
+from easi_jax.gap.candidates import places
+from easi_jax.gap.result import Numbers
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation import engine
 from tests.commands import command
 from train import gap
 
@@ -24,26 +31,55 @@ TRUTHS = {
 }
 
 
-def write_log(path: Path, kp: float, kv: float) -> None:
+def recorded(kp: float, kv: float, seed: int = 0, rows: int = 800) -> np.ndarray:
+    """Time, position and command, ``(rows, 3)``."""
     m = mujoco.MjModel.from_xml_string(MODEL.format(kp=kp, kv=kv))
-    d, rng = mujoco.MjData(m), np.random.default_rng(0)
-    t = DT * np.arange(800)
+    d, rng = mujoco.MjData(m), np.random.default_rng(seed)
+    t = DT * np.arange(rows)
     rate, phase = rng.uniform(2.0, 14.0, 5), rng.uniform(0.0, 6.0, 5)
     ctrl = 0.4 + 0.25 * np.sin(np.outer(t, rate) + phase).sum(1)
-    rows = []
+    out = []
     for now, u in zip(t, ctrl, strict=True):
-        rows.append((now, d.qpos[0] + NOISE * rng.normal(), u))
+        out.append((now, d.qpos[0] + NOISE * rng.normal(), u))
         d.ctrl[:] = u
         mujoco.mj_step(m, d, 5)
-    head = "time,qpos.j,ctrl.servo"
-    np.savetxt(path, rows, "%.9g", ",", header=head, comments="")
+    return np.array(out)
+
+
+def run(name: str, m: mujoco.MjModel, rows: np.ndarray) -> Run:
+    t, q, u, c = rows[:, 0], rows[:, 1:2], rows[:, 2:], Configuration.of(m)
+    return Run(name, "made", DT, t, q, fitted_velocity(q, DT, c), False, u, c)
+
+
+def test_a_fit_of_each_candidate_tells_them_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    few = {*TRUTHS, "actuator_gain", "armature", "viscous_damping", "payload_mass"}
+    monkeypatch.setattr(
+        *(analysis, "places"), lambda *a: [p for p in places(*a) if p.effect in few]
+    )
+    monkeypatch.setattr(analysis, "ripples", lambda *a: [])
+    m = mujoco.MjModel.from_xml_string(MODEL.format(kp=KP, kv=KV))
+    truth = TRUTHS["drive_stiffness"]
+    fit, held = (run(str(k), m, recorded(*truth, k, 400)) for k in (0, 1))
+    noise = np.array([NOISE])
+    with engine.using("mujoco"):
+        a = analysis.Analysis(m, ParameterSpace(()), [fit], [held], noise, 0.2)
+        a.whiten(a.predictor.neutral)
+        found, _ = a.selector.expanded(a.refit([]), a.candidates([]))
+    (place,) = found[0].places
+    assert place.key == "drive_stiffness@servo"
+    value, _, unit = Numbers(a.selector, found[0]).values(place)["factor"]
+    assert value == pytest.approx(FACTOR, rel=0.01) and unit == "1"
+    assert found[1].loss.mean() > 10 * found[0].loss.mean()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("effect", TRUTHS)
 def test_what_the_drive_lacks_is_named(effect: str, tmp_path: Path) -> None:
     (tmp_path / "arm.xml").write_text(MODEL.format(kp=KP, kv=KV))
-    write_log(tmp_path / "log.csv", *TRUTHS[effect])
+    head, rows = "time,qpos.j,ctrl.servo", recorded(*TRUTHS[effect])
+    np.savetxt(tmp_path / "log.csv", rows, "%.9g", ",", header=head, comments="")
     out = tmp_path / "out"
     command(
         *(gap, "--model", tmp_path / "arm.xml", "--data", tmp_path / "log.csv"),
