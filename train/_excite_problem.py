@@ -30,7 +30,7 @@ class ExciteProblem:
         space: its own parameters that a refit may move.
         bench: model, wrong models, start, hold, limits.
         most: largest change of each command, ``(nu,)``.
-        noise: of positions, ``(nv,)``.
+        noise: of positions, ``(nv,)``; infinite where nobody measures them.
         scales: of --data; None without.
         pairs: effects that are to be told apart; empty: all.
         strengths: of those, by key, then by column of an effects file.
@@ -61,6 +61,7 @@ def read_excite_problem(config: "Config") -> ExciteProblem:
     from easi_jax.excite.candidates import LEAD, make_bench
     from easi_jax.excite.choose import check_names
     from easi_jax.excite.drives import limits_of
+    from easi_jax.io.logs.columns import named_joints
     from easi_jax.io.models.parameter_file import read_parameter_file
     from easi_jax.model.joint_space import joint_name, scalar_dofs
     from easi_jax.model.parameter_proposal import own_space
@@ -90,7 +91,12 @@ def read_excite_problem(config: "Config") -> ExciteProblem:
         dt = 1.0 / config.rate
     if dt is None:
         dt = 1.0 / _RATE if model.env is None else float(model.env.dt)
+    hidden = ~np.isfinite(noise)
+    hidden[[of_joint[n] for n in named_joints(m, config.unmeasured) & {*of_joint}]] = (
+        True
+    )
     noise = _numbers("--noise", config.noise, of_joint, noise)
+    noise = np.where(hidden, np.inf, noise)
     speed = _numbers("--max-speed", config.max_speed, of_joint, np.full(m.nv, np.inf))
     default = np.full(m.nv, _TRAVEL[3])
     for j, (_, d) in scalar_dofs(m).items():

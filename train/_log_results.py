@@ -32,6 +32,8 @@ def write(
 
     ``errors_of`` is of `easi_jax.estimation.from_runs.ready_errors`.
     """
+    import numpy as np
+
     from easi_jax.estimation.from_runs import held_out_errors
     from easi_jax.estimation.relative import seed_results
     from easi_jax.io.report.logs_report import logs_report
@@ -41,6 +43,7 @@ def write(
     means = [found.distribution.mean for found in estimates]
     errors = held_out_errors(problem, space, means, errors_of)
     best = errors.best
+    seen = np.flatnonzero(np.isfinite(problem.noise))
     folder.write_json(
         "distribution.json",
         distribution_json(
@@ -69,8 +72,8 @@ def write(
         errors,
         partial(history_figure, folder, space, seeds[best], None, generations),
         lost_simulations(folder),
-        problem.noise.tolist(),
-        problem.simulator.state_names,
+        problem.noise[seen].tolist(),
+        [problem.simulator.state_names[i] for i in seen],
         command="python -m train.easi --data ...",
         notes=problem.notes,
         config=folder.config,

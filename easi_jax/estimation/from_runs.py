@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from easi_jax.data import unmeasured
 from easi_jax.data.activations import activation_guess, activation_spread
 from easi_jax.data.segments import to_device
 from easi_jax.devices import distributed
@@ -52,8 +53,20 @@ def search_data(problem: Problem) -> SearchData:
     pieces = segments_from_runs(
         problem.simulator, problem.fit, problem.piece, max(1, problem.piece // 2)
     )
-    noise = jnp.asarray(problem.noise, jnp.result_type(float))
-    return SearchData(segments=to_device(pieces), noise=noise)
+    hidden = np.isinf(problem.noise)
+    noise = _with_start_spread(problem)
+    return SearchData(
+        segments=to_device(pieces),
+        noise=noise,
+        hidden=jnp.asarray(hidden) if hidden.any() else (),
+    )
+
+
+def _with_start_spread(problem: Problem) -> jax.Array:
+    """Noise ``(2 nv,)``, and where a start is hidden how far it may be off."""
+    spread = unmeasured.start_spread(problem.simulator.mj_model, problem.fit)
+    noise = np.where(np.isfinite(problem.noise), problem.noise, spread)
+    return jnp.asarray(noise, jnp.result_type(float))
 
 
 def start_spread(problem: Problem, noise: jax.Array) -> jax.Array:
@@ -61,20 +74,20 @@ def start_spread(problem: Problem, noise: jax.Array) -> jax.Array:
 
     A reading is as good as its ``noise (2 nv,)``. Velocities that come from positions
     say nothing that the rows of a piece do not say again, so they may be anything that
-    occurs; so may what is not measured, and activations
-    (`easi_jax.data.activations.activation_spread`).
+    occurs; so may what is hidden (`easi_jax.data.unmeasured.start_spread`), and
+    activations (`easi_jax.data.activations.activation_spread`).
     """
     m, runs = problem.simulator.mj_model, problem.fit
     moving = np.sqrt(np.mean(np.concatenate([r.qvel for r in runs]) ** 2, 0))
-    ranges = np.ptp(m.jnt_range, axis=1) * m.jnt_limited
-    reach = np.where(ranges > 0, 0.5 * ranges, 1.0)[m.dof_jntid]  # m, rad
-    known = np.isfinite(np.asarray(noise))
-    position, velocity = np.split(np.where(known, noise, 0.0), 2)
+    hidden = np.tile(unmeasured.hidden_in_any(runs), 2)
+    spread = np.where(hidden, unmeasured.start_spread(m, runs), np.asarray(noise))
+    position, velocity = np.split(spread, 2)
+    derived = ~problem.measured & ~hidden[m.nv :]
     guesses = [activation_guess(m, run) for run in runs]
     return jnp.concatenate(
         [
-            jnp.where(known[: m.nv], position, reach),
-            jnp.where(problem.measured, velocity, np.hypot(velocity, moving)),
+            position,
+            np.where(derived, np.hypot(velocity, moving), velocity),
             activation_spread(m, runs, guesses),
         ],
         dtype=jnp.result_type(float),
@@ -219,7 +232,7 @@ def ready_errors(
         )
         for runs in (problem.held, problem.fit)
     )
-    noise = jnp.asarray(problem.noise, jnp.result_type(float))
+    noise = _with_start_spread(problem)
 
     def errors(theta: Any) -> Any:
         model = simulator.model(theta)
@@ -237,19 +250,22 @@ def held_out_errors(
     errors_of: Callable[[jax.Array], tuple[Any, Any, Any]],
 ) -> HeldOutErrors:
     """Open-loop errors of the model as given and at each of ``means (n,)``, unit
-    coordinates; ``errors_of`` is of `ready_errors`."""
+    coordinates, of the joints that were measured; ``errors_of`` is of `ready_errors`.
+    """
     before, scale, _ = errors_of(jnp.asarray(space.nominal, jnp.result_type(float)))
     scale = np.maximum(scale, 1e-12)
     each = [errors_of(space.to_si(unit)) for unit in means]
     simulator = problem.simulator
-    coordinates = simulator.state_names[: simulator.mj_model.nv]
+    nv = simulator.mj_model.nv
+    seen = np.flatnonzero(np.isfinite(problem.noise[:nv]))
+    names, units = simulator.state_names[:nv], tangent_units(simulator.mj_model)
     return HeldOutErrors(
         what=problem.held_name,
         horizon=problem.horizon,
-        channels=[n.removeprefix("qpos.") for n in coordinates],
-        units=list(tangent_units(simulator.mj_model)),
-        before=before.tolist(),
-        after=[after.tolist() for after, _, _ in each],
-        floor=[floor.tolist() for _, _, floor in each],
-        fit=[float(np.mean((own / scale) ** 2)) for _, own, _ in each],
+        channels=[names[i].removeprefix("qpos.") for i in seen],
+        units=[units[i] for i in seen],
+        before=before[seen].tolist(),
+        after=[after[seen].tolist() for after, _, _ in each],
+        floor=[floor[seen].tolist() for _, _, floor in each],
+        fit=[float(np.mean((own / scale)[seen] ** 2)) for _, own, _ in each],
     )

@@ -27,10 +27,11 @@ def visible_steps(
 ) -> int:
     """Fewest steps over which motion stands out of the noise, at most ``most``.
 
-    RMS change of every position and velocity, at least ``ratio``
+    RMS change of every measured position and velocity, at least ``ratio``
     times its noise ``(2 nv,)``: in shorter pieces a search would see mostly noise.
     """
     states = [(run, trusted_velocity(run)) for run in runs]
+    known = np.isfinite(noise)
     for steps in range(1, most):
         square, rows = np.zeros(len(noise)), 0
         for run, qvel in states:
@@ -41,7 +42,7 @@ def visible_steps(
             square += (change**2).sum(0)
             rows += len(change)
         rms = np.sqrt(square / max(rows, 1))
-        if np.all(rms >= ratio * noise):
+        if np.all(rms[known] >= ratio * noise[known]):
             return steps
     return most
 

@@ -10,6 +10,7 @@ import numpy as np
 from easi_jax.data.cleaning import true_readings, trusted_velocity
 from easi_jax.data.measured import MeasuredRuns
 from easi_jax.data.recording import Run
+from easi_jax.data.unmeasured import hidden_in_any
 from easi_jax.errors import UserError
 from easi_jax.estimation.pieces import visible_steps
 from easi_jax.model.found_effects import FoundEffects, joined
@@ -30,7 +31,8 @@ class Problem:
         simulator: with the parameters, at the logs' control step.
         fit, held: runs.
         held_name: which data are held out.
-        noise: standard deviations of positions and velocities, ``(2 nv,)``.
+        noise: standard deviations of positions and velocities, ``(2 nv,)``; infinite
+            where hidden.
         measured: velocities that were measured and can be trusted, ``(nv,)`` bool.
         piece: control steps of a piece in the search.
         steps: control steps of the open-loop error that is reported.
@@ -84,7 +86,7 @@ def problem_of(
         found: effects that the model gets; their parameters join ``space``.
         start: where the search starts, as factors on the nominal values.
         noise: standard deviations of positions, then velocities, ``(2 nv,)``; empty:
-            those of ``runs``.
+            those of ``runs``. Numbers of joints that nobody measured are not used.
         horizon: of predictions [s]; None: `HORIZON`, and pieces of the search as short
             as the noise lets them be.
 
@@ -107,20 +109,26 @@ def problem_of(
     ]
     nv = mj_model.nv
     scatter = np.asarray(noise, float) if len(noise) else runs.noise
-    if scatter.shape != (2 * nv,) or not np.all(np.isfinite(scatter) & (scatter >= 0)):
+    given = np.where(np.isfinite(runs.noise) | (len(noise) > 0), scatter, 0.0)
+    if scatter.shape != (2 * nv,) or not np.all(np.isfinite(given) & (given >= 0)):
         raise UserError(
             f"--noise is {list(noise)}: {name} needs {2 * nv} numbers, 0 or "
             "more: positions, then velocities"
         )
+    hidden = hidden_in_any([*fit, *held])
+    scatter = np.where(np.tile(hidden, 2), np.inf, scatter)
     logged = Logged.of([*fit, *held])
     simulator = Simulator(mj_model, space, fit[0].dt, fixed=fixed, logged=logged)
     notes += simulator.notes
-    measured = np.array([run.qvel_measured for run in fit]).all() & np.all(
-        [(trusted_velocity(run) == run.qvel).all(0) for run in fit], axis=0
+    measured = (
+        ~hidden
+        & np.array([run.qvel_measured for run in fit]).all()
+        & np.all([(trusted_velocity(run) == run.qvel).all(0) for run in fit], axis=0)
     )
-    if any(run.qvel_measured for run in fit) and not measured.all():
+    if any(run.qvel_measured for run in fit) and not (measured | hidden).all():
         joints = [n for n, m in zip(simulator.state_names[nv:], measured, strict=True)]
-        doubted = [n for n, m in zip(joints, measured, strict=True) if not m]
+        fine = measured | hidden
+        doubted = [n for n, m in zip(joints, fine, strict=True) if not m]
         notes.append(
             f"{', '.join(doubted)}: not the derivative of the positions (filtered or "
             "late?), so velocities are taken from the positions"

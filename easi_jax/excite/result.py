@@ -44,7 +44,7 @@ def excite_result(
 
     Args:
         model: name.
-        noise: of positions, ``(nv,)``.
+        noise: of positions, ``(nv,)``; infinite where nobody measures them.
         horizon: of the predictions that the gap workflow will make [s].
         margin: share of a joint's range that is left free at both ends.
         duration: of each test [s].
@@ -76,7 +76,9 @@ def excite_result(
         actuators=_actuators(m, bench, best),
         score=float(choice.scores[choice.best]),
         noise={
-            joint_name(m, j): float(noise[d]) for j, (_, d) in scalar_dofs(m).items()
+            joint_name(m, j): float(noise[d])
+            for j, (_, d) in scalar_dofs(m).items()
+            if np.isfinite(noise[d])
         },
         horizon=horizon,
         effects=_effects(choice),

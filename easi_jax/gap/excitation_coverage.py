@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.data.recording import Run
+from easi_jax.data.unmeasured import hidden_in_any
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.model.joint_space import joint_name, scalar_dofs
 from easi_jax.model.quantities import actuator_name, joint_unit
@@ -29,7 +30,7 @@ def coverage_notes(
     fitted range test what was extrapolated.
 
     Args:
-        m: the model; hinges and slides are looked at.
+        m: the model; hinges and slides that were measured are looked at.
         fit: runs that fits see.
         held: runs that are held out.
     """
@@ -38,7 +39,10 @@ def coverage_notes(
         [fitted_velocity(r.qpos, r.dt, r.configuration) for r in part]
         for part in (fit, held)
     ]
+    hidden = hidden_in_any([*fit, *held])
     for j, (_, dof) in scalar_dofs(m).items():
+        if hidden[dof]:
+            continue
         name = joint_name(m, j)
         unit = joint_unit("m/s", "rad/s")(m, j)
         mine, theirs = (np.concatenate([v[:, dof] for v in part]) for part in speeds)
@@ -95,7 +99,9 @@ def _fed_back(runs: Sequence[Run]) -> list[int]:
 def _new(qpos: np.ndarray, run: Run) -> tuple[np.ndarray, np.ndarray]:
     """What positions ``(T, n)`` and commands ``(T, nu)`` of a run do not owe to the
     rows before, by least squares."""
-    scalar = list(run.configuration.scalar_qpos)
+    c = run.configuration
+    places = zip(c.scalar_qpos, c.scalar_qvel, strict=True)
+    scalar = [q for q, v in places if not run.hidden[v]]
     both = np.concatenate([qpos[:, scalar], run.ctrl], 1)
     if len(both) <= _PAST + 1:
         return np.zeros((0, len(scalar))), np.zeros((0, run.ctrl.shape[1]))

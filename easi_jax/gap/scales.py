@@ -7,6 +7,7 @@ import numpy as np
 
 from easi_jax.data.drive_forces import drive_forces
 from easi_jax.data.recording import Run
+from easi_jax.data.unmeasured import hidden_in_any, start_spread
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.model.contact_pairs import pair_ids, touching
 from easi_jax.model.effect_catalog import Scales
@@ -17,7 +18,8 @@ _PEAK = 99.8  # percentile
 
 
 def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
-    """Scales of the motion in ``runs`` under the model as given."""
+    """Scales of the motion in ``runs`` under the model as given; of what is hidden, how
+    far and how fast it may be (`easi_jax.data.unmeasured.start_spread`)."""
     d = mujoco.MjData(m)
     total = sum(len(r) for r in runs)
     stride = max(1, total // _ROWS)
@@ -59,7 +61,12 @@ def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
     speed = rms(got["v"])
     torque = np.median(np.abs(got["torque"]), 0)
     torque = np.maximum(torque, inertia * np.median(np.abs(got["a"]), 0))
-    position = got["q"].std(0)
+    position, span = got["q"].std(0), np.ptp(got["q"], 0)
+    hidden = hidden_in_any(runs)
+    if hidden.any():
+        far, fast = np.split(start_spread(m, runs), 2)
+        position, speed = np.where(hidden, [far, fast], [position, speed])
+        span = np.where(hidden, 2 * far, span)
     return Scales(
         position=np.maximum(position, 1e-9),
         speed=np.maximum(speed, 1e-9),
@@ -69,8 +76,9 @@ def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
         command=np.maximum(rms(got["ctrl"]), 1e-9) if m.nu else np.zeros(0),
         force=np.maximum(rms(got["force"]), 1e-9) if m.nu else np.zeros(0),
         peak=np.percentile(np.abs(forces), _PEAK, axis=0) if m.nu else np.zeros(0),
-        span=np.maximum(np.ptp(got["q"], 0), 1e-9),
+        span=np.maximum(span, 1e-9),
         touching=got["touching"].mean(0),
         dt=runs[0].dt,
         longest=max(_LONGEST, 3 * runs[0].dt),
+        hidden=tuple(hidden.tolist()),
     )

@@ -7,12 +7,13 @@ sites ...).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 
 import mujoco
 import numpy as np
 
+from easi_jax.data.cleaning import rows_of
 from easi_jax.data.recording import Run
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.model.joint_space import joint_name
@@ -27,6 +28,9 @@ _OFF = 3.0  # standard errors
 _SMALL = 0.01  # of what moves: a constant below it is no news
 _OWN_STEPS = 1.5  # physics steps: readings taken before a step are that late
 _SAME_STEP = 1e-6
+# Rows, and steps [rad, m, rad/s, m/s], in which a sensor's share of what is hidden
+# shows beyond rounding.
+_TRIED, _TRY, _ROUNDING = 5, 0.1, 1e-9
 _GEOMETRY = 0.5  # of the confidence, where the model's lengths may be wrong instead
 _NO_NUMBER = {"CLOCK", "USER", "PLUGIN"}
 _KINDS = {mujoco.mjtDataType.mjDATATYPE_REAL, mujoco.mjtDataType.mjDATATYPE_POSITIVE}
@@ -71,6 +75,8 @@ def reading_faults(m: mujoco.MjModel, runs: Sequence[Run]) -> list[ReadingFault]
         if dof in joints
     ]
     asked = [i for i in range(m.nsensor) if m.sensor(i).name and _follows(m, i)]
+    unknown = _of_hidden(m, runs[0])
+    asked = [i for i in asked if not unknown[_columns(m, i)].any()]
     named = {m.sensor(i).name for i in asked}
     used = [r for r in runs if abs(r.dt / runs[0].dt - 1) < _SAME_STEP]
     right = [_expected(m, r) if named & set(r.sensors) else np.empty(0) for r in used]
@@ -172,9 +178,25 @@ def _pieces(
     return np.concatenate(expected).std(0), every
 
 
-def _expected(m: mujoco.MjModel, run: Run) -> np.ndarray:
-    """What positions and speeds make of all sensors, ``(T, nsensordata)``."""
-    speed = fitted_velocity(run.qpos, run.dt, run.configuration)
+def _of_hidden(m: mujoco.MjModel, run: Run) -> np.ndarray:
+    """Numbers of sensors that what is hidden has a part in, ``(nsensordata,)`` bool."""
+    if not run.hidden.any():
+        return np.zeros(m.nsensordata, bool)
+    part = rows_of(run, 0, min(len(run), _TRIED))
+    step = np.random.default_rng(0).normal(size=(2, *part.qvel.shape)) * run.hidden
+    c = run.configuration
+    moved = replace(part, qpos=c.integrate(part.qpos, _TRY * step[0]))
+    others = _expected(m, moved), _expected(m, part, _TRY * step[1])
+    off = np.abs(np.array(others) - _expected(m, part))
+    return np.any(off > _ROUNDING, axis=(0, 1))
+
+
+def _expected(
+    m: mujoco.MjModel, run: Run, faster: np.ndarray | float = 0.0
+) -> np.ndarray:
+    """What positions and speeds, ``faster`` than fitted, make of all sensors, ``(T,
+    nsensordata)``."""
+    speed = fitted_velocity(run.qpos, run.dt, run.configuration) + faster
     data = mujoco.MjData(m)
     out = np.zeros((len(run), m.nsensordata))
     for row in range(len(run)):
@@ -236,7 +258,7 @@ def velocity_lags(runs: Sequence[Run]) -> dict[int, Lag]:
     dt = measured[0].dt
     shifts = round(_LONGEST / dt) + 1
     found = {}
-    for dof in range(measured[0].qvel.shape[1]):
+    for dof in np.flatnonzero(~measured[0].hidden).tolist():
         costs = _costs(measured, dof, shifts)
         lag = shift_of(costs.sum(0), dt)
         if lag is not None:

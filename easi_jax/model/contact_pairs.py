@@ -108,28 +108,51 @@ def _share(mix: np.ndarray) -> np.ndarray:
     return np.array([0.5, 0.5]) if not enough.any() else enough.astype(float)
 
 
+def _between(m: mujoco.MjModel, a: int, b: int) -> set[int]:
+    """Degrees of freedom that move geoms ``a`` and ``b`` against each other."""
+    return _moving(m, a) ^ _moving(m, b)
+
+
+def _moving(m: mujoco.MjModel, g: int) -> set[int]:
+    """Degrees of freedom that move geom ``g`` in the world."""
+    out, b = set[int](), int(m.geom_bodyid[g])
+    while b:
+        first = int(m.body_dofadr[b])
+        out.update(range(first, first + int(m.body_dofnum[b])))
+        b = int(m.body_parentid[b])
+    return out
+
+
 def never_near(
-    m: mujoco.MjModel, qpos: np.ndarray, lengthened: Mapping[int, float] | None = None
+    m: mujoco.MjModel,
+    qpos: np.ndarray,
+    lengthened: Mapping[int, float] | None = None,
+    hidden: np.ndarray | None = None,
 ) -> frozenset[Pair]:
     """Pairs of `pair_ids` that stay apart in all of some poses.
 
     Near are geoms within their margin and 5 % of the model's extent. Pairs that the
-    model names (``<pair>``), with height fields or signed distance fields, and those of
-    a free body with what cannot move are never apart.
+    model names (``<pair>``), with height fields or signed distance fields, those of
+    a free body with what cannot move, and those between which nobody measured a joint
+    are never apart.
 
     Args:
         m: the model.
         qpos: poses, ``(K, nq)`` [m, rad].
         lengthened: geoms whose surface may move by so much [m], in their body.
+        hidden: degrees of freedom that nobody measured, ``(nv,)`` bool.
     """
     more = dict(lengthened or {})
+    unknown = set() if hidden is None else set(np.flatnonzero(hidden).tolist())
     left = {
         (int(a), int(b)): _NEAR * m.stat.extent
         + float(m.geom_margin[[a, b]].sum())
         + more.get(int(a), 0.0)
         + more.get(int(b), 0.0)
         for a, b, named in geom_pairs(m)
-        if named < 0 and not _always(m, int(a), int(b))
+        if named < 0
+        and not _always(m, int(a), int(b))
+        and not (_between(m, int(a), int(b)) & unknown)
     }
     d = mujoco.MjData(m)
     looked_at = np.linspace(0, len(qpos) - 1, min(len(qpos), _POSES)).astype(int)

@@ -37,6 +37,8 @@ class Scales:
             (`easi_jax.model.contact_pairs`).
         dt: control step [s].
         longest: longest delay that is looked for [s].
+        hidden: degrees of freedom that nobody measured; none where it is empty. How far
+            they move is what they may at most.
     """
 
     position: np.ndarray
@@ -51,6 +53,7 @@ class Scales:
     touching: np.ndarray
     dt: float
     longest: float
+    hidden: tuple[bool, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,12 @@ class Spot:
         of_kind = {"joint": _of_joint, "actuator": _of_actuator, "body": _of_body}
         found = of_kind.get(self.kind, _of_contacts)(self)
         return {"1": 1.0, "dt": self.s.dt, "longest": self.s.longest, **found}
+
+    @property
+    def is_read(self) -> bool:
+        """Whether the joint's position is measured."""
+        hidden = self.s.hidden
+        return not (hidden and hidden[int(self.m.jnt_dofadr[self.i])])
 
 
 def _of_joint(o: Spot) -> dict[str, float]:
@@ -468,7 +477,12 @@ _ROWS = (
     Effect(
         "sensor_bias",
         'the reading of joint "{at}" is off by {bias}',
-        {"joint": _alone("bias", "bias", "position", -1.5, 1.5, 0.01)},
+        {
+            "joint": Site(
+                (Part("bias", "bias", "position", -1.5, 1.5, 0.01),),
+                able=lambda o: o.is_read,
+            )
+        },
     ),
     Effect(
         "sensor_delay",
@@ -478,6 +492,7 @@ _ROWS = (
                 (Part("late", "delay", "dt", 0.0, _longest, 0.25),),
                 ((0.5,), (2.0,)),
                 _late,
+                able=lambda o: o.is_read,
             )
         },
     ),

@@ -11,12 +11,14 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import Mesh
 
 from easi_jax.data.segments import Segments
 from easi_jax.devices.mesh import make_mesh, sharded_map
 from easi_jax.errors import UserError
 from easi_jax.model.distribution import gaussian
+from easi_jax.model.joint_space import widths
 from easi_jax.search import discriminator as critic
 from easi_jax.search.config import SearchConfig
 from easi_jax.search.evolution import make_strategy
@@ -38,13 +40,17 @@ class SearchData:
     Attributes:
         segments: measured pieces of ``horizon`` steps (1 for policy rollouts).
         noise: measurement noise of positions and velocities, ``(2 nv,)`` standard
-            deviations, added to what is simulated. Zero where there is none.
+            deviations, added to what is simulated. Zero where there is none; where
+            hidden, how far a start may be off.
+        hidden: positions and velocities that nobody measured, ``(2 nv,)`` bool, which
+            the discriminator is not told; () where there are none.
         policy: parameters of the controller, for ``source="policy"``.
     """
 
     segments: Segments
     noise: jax.Array
     policy: Any = None
+    hidden: Any = ()
 
 
 @flax.struct.dataclass
@@ -309,6 +315,7 @@ class Search:
         fake_out = jnp.where(ok[..., None], fake_out, 0.0)
         weight = fake_seg.weight * ok
         real_out, fake_out = self._scaled(data, real_out, fake_out, weight)
+        real_out, fake_out = (self._told(data, x) for x in (real_out, fake_out))
         base = self._base_inputs(data)
         real = jnp.concatenate([base(real_seg), real_out], -1)
         fake = jnp.concatenate([jax.vmap(base)(fake_seg), fake_out], -1)
@@ -329,7 +336,12 @@ class Search:
         # What is simulated gets the noise that what is measured has: in its start
         # (the log's start is off by it) and in its end, the same for everybody.
         z = data.noise * jax.random.normal(k_start, (m, 2 * nv))
-        noise = data.noise * jax.random.normal(k_end, (m, c.horizon, 2 * nv))
+        spread = (
+            data.noise
+            if isinstance(data.hidden, tuple)
+            else jnp.where(data.hidden, 0.0, data.noise)
+        )
+        noise = spread * jax.random.normal(k_end, (m, c.horizon, 2 * nv))
         starts = (shift_start(self.simulator, seg, z), seg)
 
         def states(chunk: Any, starts: Any) -> Any:
@@ -440,6 +452,20 @@ class Search:
             mid, std = _moments(known, data.segments.weight)
             return (real - mid) / std, (fake - mid) / std
         return real, fake
+
+    def _told(self, data: SearchData, outcome: jax.Array) -> jax.Array:
+        """Outcomes ``(..., F)`` without what nobody measured."""
+        if isinstance(data.hidden, tuple):
+            return outcome
+        c, hidden = self.config, data.hidden
+        if not (c.innovation_inputs or c.delta_inputs):
+            m = self.simulator.mj_model
+            joints = np.repeat(
+                np.arange(m.njnt), [widths(m, j)[0] for j in range(m.njnt)]
+            )
+            hidden = jnp.concatenate([hidden[m.jnt_dofadr[joints]], hidden[m.nv :]])
+        steps = outcome.shape[-1] // len(hidden)
+        return jnp.where(jnp.tile(hidden, steps), 0.0, outcome)
 
     def _base_inputs(self, data: SearchData) -> Callable[[Segments], jax.Array]:
         if not self.config.standardize_inputs:

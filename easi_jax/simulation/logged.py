@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.data.recording import Run
+from easi_jax.data.unmeasured import hidden_in_any
 from easi_jax.model.addresses import resolve
 from easi_jax.model.contact_pairs import (
     Pair,
@@ -29,17 +30,20 @@ class Logged:
         qpos: positions, ``(K, nq)`` [m, rad].
         qvel: velocities, ``(K, nv)`` [m/s, rad/s].
         ctrl: commands, ``(K, nu)``.
+        hidden: degrees of freedom that nobody measured, ``(nv,)`` bool, whose positions
+            and velocities are a guess.
     """
 
     qpos: np.ndarray
     qvel: np.ndarray
     ctrl: np.ndarray
+    hidden: np.ndarray | None = None
 
     @staticmethod
     def of(runs: Sequence[Run]) -> "Logged":
         """All rows of some runs."""
         columns = zip(*((r.qpos, r.qvel, r.ctrl) for r in runs), strict=True)
-        return Logged(*map(np.concatenate, columns))
+        return Logged(*map(np.concatenate, columns), hidden=hidden_in_any(runs))
 
     def states(
         self, m: mujoco.MjModel
@@ -75,7 +79,7 @@ def apart_in(
             share = 0.5 + float(np.linalg.norm(m.geom_pos[g])) / old
             moved = share * max(abs(float(x) - old) for x in ends)
             more[g] = max(more.get(g, 0.0), moved)
-    return never_near(m, logged.qpos, more)
+    return never_near(m, logged.qpos, more, logged.hidden)
 
 
 def apart_note(m: mujoco.MjModel, apart: frozenset[Pair]) -> str:

@@ -121,6 +121,25 @@ def _held(model: mujoco.MjModel) -> tuple[str, ...]:
     return (*numbered(f"qpos.{name}", FREE_WIDTH), *numbered(f"qvel.{name}", 6))
 
 
+def named_joints(model: mujoco.MjModel, unmeasured: Sequence[str]) -> set[str]:
+    """Joints that names and patterns of --unmeasured stand for, ``all`` aside.
+
+    Raises:
+        UserError: a name or pattern without a joint.
+    """
+    joints = [given_name(model, j) for j in range(model.njnt)]
+    out = set[str]()
+    for pattern in unmeasured:
+        found = fnmatch.filter(joints, pattern)
+        if not found and pattern != _ALL:
+            raise UserError(
+                f'--unmeasured "{pattern}": the model has no such joint'
+                f"{nearest(pattern, joints)} (known: {', '.join(joints)})"
+            )
+        out.update(found)
+    return out
+
+
 def hidden_joints(
     path: Path | str,
     names: Mapping[str, object],
@@ -141,22 +160,14 @@ def hidden_joints(
     Raises:
         UserError: a name or pattern without a joint, or no joint is left.
     """
-    joints = [given_name(model, j) for j in range(model.njnt)]
-    said = set[str]()
-    for pattern in unmeasured:
-        found = fnmatch.filter(joints, pattern)
-        if not found and pattern != _ALL:
-            raise UserError(
-                f'--unmeasured "{pattern}": the model has no such joint'
-                f"{nearest(pattern, joints)} (known: {', '.join(joints)})"
-            )
-        said.update(found)
+    said = named_joints(model, unmeasured)
     lacking = [
         j
         for j, group in enumerate(columns.positions)
         if any(name not in names for name in group)
     ]
-    out = {j: "--unmeasured" for j, name in enumerate(joints) if name in said}
+    joints = range(model.njnt)
+    out = {j: "--unmeasured" for j in joints if given_name(model, j) in said}
     if _ALL in unmeasured:
         out |= dict.fromkeys(lacking, "--unmeasured")
     measured = set(range(model.njnt)).difference(out, lacking)
