@@ -137,6 +137,7 @@ def _information(config: Config, m: Any, proposals: list[Any]) -> Any:
     from easi_jax.data.cleaning import to_common_step
     from easi_jax.data.noise import pooled_noise
     from easi_jax.data.segments import to_device
+    from easi_jax.estimation.from_runs import spread_of_starts
     from easi_jax.estimation.levenberg_marquardt import step_weights
     from easi_jax.estimation.normal_equations import PairedFit
     from easi_jax.estimation.pieces import effective_noise, segments_from_runs
@@ -157,15 +158,16 @@ def _information(config: Config, m: Any, proposals: list[Any]) -> Any:
     steps = max(1, round(_HORIZON / simulator.dt))
     pieces = to_device(segments_from_runs(simulator, runs, steps, steps))
     noise = effective_noise(simulator, pieces, jnp.asarray(noise, jnp.float32))
+    start = spread_of_starts(m, runs, noise, np.ones(m.nv, bool))
     unit = space.to_unit(jnp.asarray(space.nominal))
     unit = jnp.where(jnp.isfinite(unit), unit, 0.5)
     say("Fisher information of the logs ...")
 
     @jax.jit
     def information(unit: Any) -> Any:
-        paired = PairedFit(simulator, space, pieces, noise)
-        zero = jnp.zeros((pieces.count, 2 * m.nv))
-        return paired.normal(unit, zero, step_weights(pieces, noise)).hessian
+        paired = PairedFit(simulator, space, pieces, noise, start=start)
+        weight = step_weights(pieces, noise)
+        return paired.normal(unit, paired.unmoved, weight).hessian
 
     return np.asarray(information(unit))
 

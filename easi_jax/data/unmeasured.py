@@ -273,7 +273,9 @@ def measured_alike(
     ]
 
 
-def start_spread(m: mujoco.MjModel, runs: Sequence[Run]) -> np.ndarray:
+def start_spread(
+    m: mujoco.MjModel, runs: Sequence[Run], hidden: np.ndarray | None = None
+) -> np.ndarray:
     """How far a hidden start may be from its guess, standard deviations ``(2 nv,)``
     [m, rad, m/s, rad/s]: wide, so that the rows of a log decide.
 
@@ -283,11 +285,15 @@ def start_spread(m: mujoco.MjModel, runs: Sequence[Run]) -> np.ndarray:
     measured joint of the same unit is in RMS, and no slower than the spread of the
     position in a second.
 
+    Args:
+        hidden: degrees of freedom that are asked for, ``(nv,)`` bool; not given: those
+            that one of ``runs`` lacks.
+
     Returns:
         Finite at hidden degrees of freedom, infinite at measured ones, of which the
         caller knows the noise.
     """
-    hidden, units = hidden_in_any(runs), tangent_units(m)
+    hidden, units = hidden_in_any(runs) if hidden is None else hidden, tangent_units(m)
     out = np.full(2 * m.nv, np.inf)
     square = np.mean(np.concatenate([run.qvel for run in runs]) ** 2, 0)
     scalar = {d: j for j, (_, d) in scalar_dofs(m).items()}

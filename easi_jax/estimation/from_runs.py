@@ -6,10 +6,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from easi_jax.data import unmeasured
 from easi_jax.data.activations import activation_guess, activation_spread
+from easi_jax.data.recording import Run
 from easi_jax.data.segments import to_device
 from easi_jax.devices import distributed
 from easi_jax.devices.mesh import make_mesh, placed, replicated
@@ -70,19 +72,28 @@ def _with_start_spread(problem: Problem) -> jax.Array:
 
 
 def start_spread(problem: Problem, noise: jax.Array) -> jax.Array:
+    """What the problem's logs know of starts, ``(2 nv + na,)``: `spread_of_starts`."""
+    m = problem.simulator.mj_model
+    return spread_of_starts(m, problem.fit, noise, problem.measured)
+
+
+def spread_of_starts(
+    m: mujoco.MjModel, runs: Sequence[Run], noise: jax.Array, measured: np.ndarray
+) -> jax.Array:
     """What logs know of where a piece starts, standard deviations ``(2 nv + na,)``.
 
     A reading is as good as its ``noise (2 nv,)``. Velocities that come from positions
     say nothing that the rows of a piece do not say again, so they may be anything that
-    occurs; so may what is hidden (`easi_jax.data.unmeasured.start_spread`), and
-    activations (`easi_jax.data.activations.activation_spread`).
+    occurs; so may what is hidden, whose noise is infinite
+    (`easi_jax.data.unmeasured.start_spread`), and activations
+    (`easi_jax.data.activations.activation_spread`). ``measured (nv,)`` says which
+    velocities were.
     """
-    m, runs = problem.simulator.mj_model, problem.fit
     moving = np.sqrt(np.mean(np.concatenate([r.qvel for r in runs]) ** 2, 0))
-    hidden = np.tile(unmeasured.hidden_in_any(runs), 2)
-    spread = np.where(hidden, unmeasured.start_spread(m, runs), np.asarray(noise))
-    position, velocity = np.split(spread, 2)
-    derived = ~problem.measured & ~hidden[m.nv :]
+    hidden = np.isinf(np.asarray(noise))
+    wide = unmeasured.start_spread(m, runs, hidden[: m.nv])
+    position, velocity = np.split(np.where(hidden, wide, np.asarray(noise)), 2)
+    derived = ~measured & ~hidden[m.nv :]
     guesses = [activation_guess(m, run) for run in runs]
     return jnp.concatenate(
         [
