@@ -600,6 +600,7 @@ def step_weights(
     of what is not measured."""
     share = jnp.where(jnp.isfinite(noise), 1.0, 0.0)
     if misfit is not None:
-        share = share / (1.0 + (misfit / noise) ** 2)
+        known = jnp.isfinite(noise)
+        share = share / (1.0 + jnp.where(known, misfit / noise, 0.0) ** 2)
     shape = (segments.count, segments.horizon, noise.shape[0])
     return jnp.broadcast_to(segments.weight[:, None, None] * share, shape)
