@@ -132,7 +132,9 @@ def _exact_step(
 
     The derivative ``slope0 + t curve0 - sum jv clip(-D (x + t jv), low, high)``
     grows with t and is linear between the breakpoints, where a row's force reaches
-    one of its limits.
+    one of its limits. A row that the direction barely moves has its breakpoint very
+    far off, so the minimum is counted from the nearer end of its piece: counted from
+    the middle, it would be lost in rounding.
     """
 
     def slope(t: jax.Array) -> jax.Array:
@@ -155,5 +157,5 @@ def _exact_step(
     inside = (raw > low) & (raw < high)
     curve = curve0 + (jv * jv * dd * inside).sum()
     ok = curve > 0
-    step = mid - slope(mid) / jnp.where(ok, curve, 1.0)
-    return jnp.where(ok, jnp.maximum(step, 0.0), 0.0)
+    step = lo - slope(lo) / jnp.where(ok, curve, 1.0)
+    return jnp.where(ok, jnp.clip(step, lo, hi), 0.0)

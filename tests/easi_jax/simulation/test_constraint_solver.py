@@ -186,3 +186,16 @@ def test_lanes_add_up_over_nested_batches() -> None:
     alone = solve_spd(a[1, 2], b[2])
     np.testing.assert_allclose(got[1, 2], alone, rtol=1e-4)
     assert np.isnan(solve_spd(a[0, 0] * jnp.nan, b[0])).all()
+
+
+@pytest.mark.parametrize("barely", [1e-6, 1e-10, 1e-20, 1e-33])
+def test_a_row_that_a_direction_barely_moves_does_not_spoil_the_search(
+    barely: float,
+) -> None:
+    """A contact opens at 0.5 m/s^2, the minimum is at 0.9 with only the mass left; the
+    other contact, which rounding moves, would open far behind."""
+    rows = np.float32([[-0.5, -1e-3], [1.0, barely], [1e3, 1e3], [0, 0], [np.inf] * 2])
+    x, jv, stiff, low, high = map(jnp.asarray, rows)
+    curve = jnp.float32(0.73)
+    step = constraint_solver._exact_step(x, jv, stiff, low, high, -0.9 * curve, curve)
+    assert float(step) == pytest.approx(0.9, rel=1e-5)
