@@ -67,26 +67,6 @@ def run(config: Config) -> None:
     say(f"written: {path}")
 
 
-def _speed(r: Any) -> list[str]:
-    search = r["search"]
-    best, outside = min(search["search_s"]), search["outside_physics_per_generation_s"]
-    done = [s["finished"] for s in r["stress"]]
-    outside_goal, all_done = met(outside <= 0.25), f"{sum(done)} of {len(done)}"
-    rows = [
-        ("search of 50 x 300 x 200 [s]", f"{best:.1f}", "60", met(best < 60)),
-        ("a generation outside physics [s]", f"{outside:.3f}", "0.25", outside_goal),
-        *(
-            (f"trace + compile, {k} [s]", "{trace_s:.0f} + {compile_s:.0f}".format(**v))
-            for k, v in sorted(r["compile"].items(), key=lambda c: c[0] != "cold")
-        ),
-        ("large batches finished", all_done, "all", met(all(done))),
-    ]
-    return [
-        f"`{r['command']}`: Cartpole alone, on 2 cores.",
-        markdown_table(("figure", "measured", "goal", ""), rows),
-    ]
-
-
 def _accuracy(found: dict[str, Any]) -> list[str]:
     """What solver and time step of each robot cost in accuracy."""
     rows, head = [], ()
@@ -376,7 +356,6 @@ def _real(r: Any) -> list[str]:
 
 SECTIONS = (
     Section("## Speed", "engines.jsonl", "engines", engines.paragraphs),
-    Section("", "speed.json", "speed", _speed),
     Section(
         "",
         {name: f"accuracy_{name}.json" for name in ACCURATE},

@@ -33,7 +33,7 @@ def test_committed_page_is_that_of_the_committed_files(tmp_path: Path) -> None:
 
 def test_nothing_run_is_said(tmp_path: Path) -> None:
     text = page(tmp_path)
-    for command in ("speed", "recovery --cases free_clean", "transfer --factors 0.25"):
+    for command in ("own_robot", "recovery --cases free_clean", "export"):
         assert f"Not run: `python -m benchmarks.{command}" in text
     assert re.search(r"\bmet\b|missed", text) is None
 

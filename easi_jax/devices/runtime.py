@@ -75,10 +75,9 @@ def prepare() -> dict[str, object]:
       or a batched Cholesky of a few hundred matrices can wait for itself for ever.
     - one CPU device per core, so that a mesh over them uses all of them;
     - XLA's older loop emitters, which compile faster; what simulates for long asks for
-      the newer ones by `fast_loops` (measured with jaxlib 0.10.2, benchmarks/speed.py);
+      the newer ones by `fast_loops` (measured with jaxlib 0.10.2);
     - loops that touch up to 2 MB become one function, in place of a call for each
-      operation of each round (a cart-pole is simulated five times as fast,
-      benchmarks/speed.py);
+      operation of each round (a cart-pole is simulated five times as fast);
     - CPU devices wait for each other as long as it takes: XLA ends the process after a
       minute, but a device without a seed of its own waits for a chunk of training;
     - persistent compilation cache;

@@ -32,7 +32,7 @@ from easi_jax.simulation.logged import Logged, apart_in, apart_note
 from easi_jax.simulation.step import WRITTEN_OUT, Physics, at_rest, control_step
 
 # Small enough for XLA to run a simulation as one piece (see `runtime`).
-_BATCH = 128  # benchmarks/speed.py
+_BATCH = 128  # of a Cartpole, tried by hand
 _WIDE_BATCH = 32  # benchmarks/engines.py
 _ACCELERATOR_BATCH = 16_384  # benchmarks/scaling.py
 _NATIVE_BATCH = 4_096  # few calls, and 100 MB at most of models' numbers
