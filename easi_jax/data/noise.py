@@ -282,6 +282,15 @@ def _kept_noise(run: Run) -> np.ndarray:
     return np.median(_by_order(rows, 0, np.median, _MAD), 1)
 
 
+def resolutions(run: Run) -> np.ndarray:
+    """Smallest step between two readings of each degree of freedom, ``(nv,)``; 0 for
+    orientations."""
+    c = run.configuration
+    out = np.zeros(c.nv)
+    out[list(c.scalar_qvel)] = _resolution(run.qpos[:, list(c.scalar_qpos)])
+    return out
+
+
 def _resolution(x: np.ndarray) -> np.ndarray:
     """Smallest step between two readings of each column of ``x (T, n)``."""
     out = np.zeros(x.shape[1])

@@ -1,8 +1,4 @@
-"""Cuts runs into open-loop windows; nothing crosses a run's end.
-
-The start of a window is that of the log format: the position as measured, and as
-velocity the derivative of a quadratic fitted to the positions around it.
-"""
+"""Cuts runs into open-loop windows; nothing crosses a run's end."""
 
 from typing import NamedTuple
 
@@ -14,6 +10,8 @@ from easi_jax.model.joint_space import Configuration
 FIT_SECONDS = 0.02
 FIT_ROWS = 5
 MIN_STEPS = 10
+_START_ROWS = 5  # and seconds, on either side of a window's start, that it is fitted to
+_START_SECONDS = 0.03
 
 
 class Windows(NamedTuple):
@@ -69,13 +67,24 @@ def fitted_velocity(
     return velocity
 
 
-def make_windows(run: Run, horizon_s: float, every_s: float | None = None) -> Windows:
+def lead_rows(dt: float) -> int:
+    """Rows on either side of a window's start that the start is fitted to.
+
+    Those within 30 ms, and at least 5 (``start_seconds`` of the log format).
+    """
+    return max(_START_ROWS, round(_START_SECONDS / dt))
+
+
+def make_windows(
+    run: Run, horizon_s: float, every_s: float | None = None, lead: int = 0
+) -> Windows:
     """Windows of ``run`` for open-loop prediction.
 
     Args:
         run: the recording.
         horizon_s: length of a window, s; rounded to control steps, at least 10.
         every_s: time from one start to the next, s; half a horizon by default.
+        lead: so many rows earlier a window begins, which is as much longer for it.
 
     Returns:
         Windows that lie wholly inside the run, the first at its first row; none
@@ -89,6 +98,7 @@ def make_windows(run: Run, horizon_s: float, every_s: float | None = None) -> Wi
     steps = max(MIN_STEPS, round(horizon_s / run.dt))
     spacing = steps / 2 if every_s is None else every_s / run.dt
     stride = max(1, round(spacing))
+    steps += lead
     start = np.arange(0, max(len(run) - steps, 0), stride)
     row = start[:, None] + np.arange(steps)
     velocity = fitted_velocity(run.qpos, run.dt, run.configuration)

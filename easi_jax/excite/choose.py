@@ -145,7 +145,7 @@ def choose(
     )
     work = _WORK_WIDE if m.nv > WRITTEN_OUT else _WORK
     most = int(np.clip(work / (physics * guess * len(tests)) // 16 * 16, 16, 48))
-    parts = ev.windows_of(runs, horizon, scales.longest, most)
+    parts = ev.windows_of(m, runs, horizon, scales.longest, most)
     predictor = ev.make_predictor(m, space, found, parts, dt)
     bounds = bounds_of(space, predictor.layout)
     truths = _truths(predictor, found, strengths or {})

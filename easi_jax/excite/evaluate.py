@@ -6,14 +6,17 @@ import mujoco
 import numpy as np
 
 from easi_jax.data.recording import Run
+from easi_jax.data.windows import lead_rows
+from easi_jax.estimation.starts import Starts
 from easi_jax.excite.separation import Design
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.batched_least_squares import Bounds
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.table import Place
-from easi_jax.gap.whitening import make_residuals, start_sensitivity, velocity_slack
+from easi_jax.gap.whitening import make_residuals
 from easi_jax.gap.window_set import WindowSet, join, window_set
+from easi_jax.gap.window_starts import known_noise, window_starts
 from easi_jax.model.effect_catalog import Scales
 from easi_jax.model.parameters import ParameterSpace
 
@@ -24,7 +27,7 @@ Tell = Callable[[str], None]
 
 
 def windows_of(
-    runs: Sequence[Run], horizon: float, longest: float, most: int
+    m: mujoco.MjModel, runs: Sequence[Run], horizon: float, longest: float, most: int
 ) -> list[WindowSet]:
     """At most ``most`` windows of each run, at even distances.
 
@@ -37,7 +40,7 @@ def windows_of(
     """
     out = []
     for i, run in enumerate(runs):
-        every = window_set([run], horizon, longest, i)
+        every = window_set(m, [run], horizon, longest, i)
         if every is None:
             raise ValueError(f"{run.name} is shorter than a window")
         count = len(every)
@@ -78,53 +81,39 @@ def products_of(
         scales: how large motion is.
     """
     p, nv = design.predictor, m.nv
-    step = runs[0].dt / p.simulator.substeps
-    slack = [velocity_slack([r], step) for r in runs]
-    moved = np.concatenate(
-        [
-            np.maximum(1e-3 * scales.position, noise),
-            np.maximum(0.01 * scales.speed, np.max(slack, 0)),
-        ]
-    )
-    slope = start_sensitivity(p, design.base, moved, None)
+    windows, lead = join(list(parts)), lead_rows(runs[0].dt)
+    starts = window_starts(m, p, runs, scales, known_noise(noise, scales))
+    still = np.zeros((len(windows), p.size))
+    moved, _ = starts.solve(design.base, still)
     groups: list[np.ndarray] = []
     for first in range(0, len(design.vectors), _TOGETHER):
         x = np.array(design.vectors[first : first + _TOGETHER])
-        groups.append(p.errors(x))
+        at = np.broadcast_to(moved, (len(x), *still.shape))
+        groups.append(p.errors(x, None, at))
         tell(f"simulated {first + len(x)} of {len(design.vectors)} changes")
     errors = np.concatenate(groups)
     names = [n.removeprefix("qpos.") for n in p.simulator.state_names[:nv]]
     out, at = [], 0
-    for part, run, loose in zip(parts, runs, slack, strict=True):
+    for part, run in zip(parts, runs, strict=True):
         here = slice(at, at + len(part))
         at += len(part)
-        scale = measure.channels(m, names, [run], noise, p.steps).scale
+        scale = measure.channels(m, names, [run], noise, p.steps - lead).scale
         found = np.zeros((len(design.pairs),) * 2)
         if np.isfinite(scale).any():
-            found = _products(
-                *(design, part, runs, slope[:, here], errors[:, here]),
-                *(noise, loose, scale),
-            )
+            found = _products(design, starts.part(here), lead, errors[:, here], scale)
             # Windows overlap by half, and not all were simulated.
-            found *= len(run) / p.steps / len(part)
+            found *= len(run) / (p.steps - lead) / len(part)
         out.append(found)
     return out
 
 
 def _products(
-    design: Design,
-    windows: WindowSet,
-    runs: Sequence[Run],
-    slope: np.ndarray,
-    errors: np.ndarray,
-    noise: np.ndarray,
-    slack: np.ndarray,
-    scale: np.ndarray,
+    design: Design, starts: Starts, lead: int, errors: np.ndarray, scale: np.ndarray
 ) -> np.ndarray:
     """Products of all signatures in some windows, in units of noise, ``(P, P)``."""
     first, _ = measure.finite(errors[0], design.predictor.largest)
     rms = np.sqrt(np.mean(first.astype(float) ** 2, (0, 1)))
-    residuals = make_residuals(windows, runs, slope, noise, slack, _FLOOR * rms, scale)
+    residuals = make_residuals(starts, lead, _FLOOR * rms, scale)
     # Differences first: they are small beside what single precision carries.
     a, b = (np.array(x) for x in zip(*design.pairs, strict=True))
     change = residuals.grouped(errors[a].astype(np.float64) - errors[b])

@@ -132,7 +132,7 @@ def propose(
     given_runs = [r for r in runs if len(r) > predictor.steps]
     every = [*given_runs, *(t.run for t in tests)]
     most = min(_WINDOWS, predictor.capacity)
-    parts = ev.windows_of(every, horizon, scales.longest, most)
+    parts = ev.windows_of(m, every, horizon, scales.longest, most)
     found = []
     for group in _groups(parts, predictor.capacity):
         chosen = [_of_run(parts[k], i) for i, k in enumerate(group)]

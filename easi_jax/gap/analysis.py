@@ -13,7 +13,9 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
+from easi_jax.data.noise import resolutions
 from easi_jax.data.recording import Run, physics_steps
+from easi_jax.data.windows import lead_rows
 from easi_jax.errors import UserError
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.batched_least_squares import Bounds, bounds_of, window_weights
@@ -21,10 +23,9 @@ from easi_jax.gap.candidates import places, ripples
 from easi_jax.gap.discretization_error import error_of_steps, within_a_step
 from easi_jax.gap.effect_set import Candidate, Model
 from easi_jax.gap.effect_vector import Layout
-from easi_jax.gap.error_localization import Conditions
 from easi_jax.gap.forward_selection import Selector, shortlist
+from easi_jax.gap.held_out import HeldOut
 from easi_jax.gap.model_comparison import (
-    GOAL,
     HELPS,
     better,
     explained,
@@ -36,12 +37,10 @@ from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.result import Figures, Found, Numbers, Outcome, Part
 from easi_jax.gap.scales import scales_of
 from easi_jax.gap.table import Place, covered, does
-from easi_jax.gap.whitening import (
-    make_residuals,
-    start_sensitivity,
-    velocity_slack,
-)
+from easi_jax.gap.verdict import openness, surely_better, verdict_of
+from easi_jax.gap.whitening import make_residuals
 from easi_jax.gap.window_set import join, reach, spread, window_set
+from easi_jax.gap.window_starts import known_noise, window_starts
 from easi_jax.io.runs.step_cache import key_of
 from easi_jax.model.joint_space import is_hinge, scalar_dofs
 from easi_jax.model.parameters import ParameterSpace
@@ -58,14 +57,14 @@ _CLOSED = 1.1  # times the floor: nothing left to explain
 _RIVALS = 8
 _UNLIKELY = 0.3  # probability of an effect beside which a rival replaces it
 _ROUNDING = 0.005  # of the gap
-_CLEAR = 1.5  # times the floor: a gap that fits see without doubt
 _BEAM = 3  # sets of effects that are followed
 _LIKELY = 60  # of a larger robot's names, that are tried beside all but the first
 _NOTHING = 1e-3  # of the largest error: a change that shows nowhere
 _STEPS_SEEN = 0.75  # of the floor: less is lost in noise
 _WHOLE = 1.15  # of the error of steps; a finer simulation leaves some of it
 _TOLD = 0.8  # of the gap without the own steps' error: worth a note
-_DRAWS = 8  # of the noise of each held-out window
+_SAME_NOISE = 1.05  # times the noise that rows tell: the errors of starts tell better
+_LET_PASS = 0.05  # of what the model errs by, that no fit hangs on
 
 Tell = Callable[[str], None]
 
@@ -93,9 +92,10 @@ class Analysis:
         self.m, self.space, self.tell = mj_model, space, tell
         self.fixed = dict(fixed or {})
         self.runs = [*fit, *held]
-        self.noise = np.asarray(noise)[: mj_model.nv]
         dt = fit[0].dt
+        self.lead = lead_rows(dt)
         self.scales = scales_of(mj_model, fit)
+        self.noise = known_noise(np.asarray(noise), self.scales)
         self.everywhere = places(mj_model, self.scales)
         self.places = [p for p in self.everywhere if not covered(p, space, mj_model)]
         self.ripples = [
@@ -104,8 +104,8 @@ class Analysis:
             for p in ripples(mj_model, j, self.scales, self._cycles(j))
         ]
         layout = Layout(mj_model, [*self.everywhere, *self.ripples])
-        fitted = window_set(fit, horizon, self.scales.longest)
-        kept = window_set(held, horizon, self.scales.longest, len(fit))
+        fitted = window_set(mj_model, fit, horizon, self.scales.longest)
+        kept = window_set(mj_model, held, horizon, self.scales.longest, len(fit))
         if fitted is None or kept is None:
             what = "to fit" if fitted is None else "held out"
             raise UserError(
@@ -115,7 +115,7 @@ class Analysis:
         physics = fitted.ctrl.shape[1] * physics_steps(dt, mj_model.opt.timestep)
         most = min(max(_STEPS // physics, _FITTED[0]), _FITTED[1])
         chosen = spread(fitted, most, reach(mj_model, fit, fitted))
-        self.fit_windows, self.held = fitted.take(chosen), kept
+        self.fit_windows = fitted.take(chosen)
         pad = -len(self.fit_windows) % BLOCK
         repeated = np.r_[np.arange(len(chosen)), np.full(pad, len(chosen) - 1)]
         self.predictor = Predictor(
@@ -136,7 +136,7 @@ class Analysis:
             [n.removeprefix("qpos.") for n in simulator.state_names[: mj_model.nv]],
             self.runs,
             self.noise,
-            self.predictor.steps,
+            self.predictor.steps - self.lead,
         )
         if not np.isfinite(self.channels.scale).any():
             raise UserError(
@@ -144,7 +144,6 @@ class Analysis:
                 f"{horizon:g} s: record larger or faster motion, or lengthen --horizon"
             )
         self.step = dt / simulator.substeps
-        self.slack = velocity_slack(fit, self.step)
         self.dropped: set[str] = set()  # found, and then found to say nothing
         self.bounds = bounds_of(space, layout)
         count = len(self.fit_windows)
@@ -158,6 +157,23 @@ class Analysis:
             range(space.size),
             progress,
         )
+        self.resolution = np.max([resolutions(run) for run in self.runs], axis=0)
+        given = mj_model, self.predictor, fit, self.scales, self.noise
+        self.fit_starts = window_starts(*given, self.fit_blocks, count)
+        self.held_out = HeldOut(
+            mj_model,
+            self.runs,
+            self.predictor,
+            kept,
+            self.channels,
+            window_starts(*given, self.held_blocks, len(kept)),
+            self.lead,
+            self.resolution,
+        )
+
+    def _plain(self, x: np.ndarray) -> np.ndarray:
+        """Vectors without the share of the own steps' error."""
+        return x[..., : len(self.predictor.neutral)]
 
     def _cycles(self, j: int) -> list[float]:
         """Cycles per revolution that a ripple is looked for at."""
@@ -168,7 +184,7 @@ class Analysis:
     @property
     def key(self) -> str:
         """A digest of all that the results depend on, for a `Journal`."""
-        windows, held = vars(self.fit_windows), vars(self.held)
+        windows, held = vars(self.fit_windows), vars(self.held_out.windows)
         model = np.zeros(mujoco.mj_sizeModel(self.m), np.uint8)
         mujoco.mj_saveModel(self.m, None, model)
         return key_of(
@@ -178,7 +194,6 @@ class Analysis:
             *windows.values(),
             *held.values(),
             self.noise,
-            self.slack,
             self.predictor.simulator.dt,
             self.predictor.steps,
             self.predictor.devices,
@@ -188,11 +203,8 @@ class Analysis:
 
     def whiten(self, x: np.ndarray) -> None:
         """Renews the noise model of the fit at a vector."""
-        chosen = self.selector
-        slope = start_sensitivity(
-            self.predictor, chosen.plain(x), self.start_noise, self.fit_blocks
-        )
-        slope = slope[:, : chosen.count]
+        chosen, starts = self.selector, self.fit_starts
+        chosen.moved, _ = starts.solve(x, chosen.moved)
         errors = chosen.errors(x[None])[0]
         if not np.isfinite(errors).all():
             raise UserError(
@@ -200,29 +212,18 @@ class Analysis:
                 "up from the measured states; check its timestep, masses and contacts, "
                 "or shorten --horizon"
             )
+        # Rows alone may have taken motion for noise, a model its own errors.
+        least = known_noise(self.resolution / math.sqrt(12), self.scales)
+        told = np.maximum(starts.measured_noise(errors), least)
+        starts.noise = np.where(told < _SAME_NOISE * self.noise, told, self.noise)
+        self.held_out.starts.noise = starts.noise
         rms = np.sqrt(np.mean(errors.astype(float) ** 2, (0, 1)))
         chosen.residuals = make_residuals(
-            self.fit_windows,
-            self.runs,
-            slope,
-            self.noise,
-            self.slack,
-            0.05 * rms,
-            self.channels.scale,
+            starts, self.lead, _LET_PASS * rms, self.channels.scale
         )
-        floor = measure.floor_squares(self.fit_windows, self.runs, slope, self.noise)
-        self.fit_floor = float(measure.gap(floor.mean(0), self.channels.scale))
-        chosen.floor = self.fit_floor
-        self.fit_gap = float(
-            measure.gap(measure.squares(errors).mean(0), self.channels.scale)
-        )
-
-    @property
-    def start_noise(self) -> np.ndarray:
-        """Sizes of differences in start states, ``(2 nv,)``."""
-        speed = np.maximum(0.01 * self.scales.speed, self.slack)
-        position = np.maximum(1e-3 * self.scales.position, self.noise)
-        return np.concatenate([position, speed])
+        r = chosen.residuals
+        self.fit_gap = r.gap(r.whitened(r.grouped(errors[None]))[0])
+        self.fit_floor = chosen.floor = float(np.sqrt(r.floor.mean()))
 
     def watch_steps(self) -> None:
         """Lets fits see what the model's own steps do, where that can be seen.
@@ -232,12 +233,13 @@ class Analysis:
         """
         windows, count = self.predictor.windows, len(self.fit_windows)
         error = error_of_steps(self.m, windows, self.predictor.simulator.dt)
-        mine = measure.squares(error[:count]).mean(0)
+        mine = self.fit_starts.left(error[:count])[:, self.lead + 1 :]
+        mine = measure.squares(mine).mean(0)
         size = float(measure.gap(mine, self.channels.scale))
         if size < _STEPS_SEEN * self.fit_floor:
             return
         first = len(self.fit_blocks) * BLOCK
-        self.selector.steps, self.held_steps = error[:count], error[first:]
+        self.selector.steps, self.held_out.steps = error[:count], error[first:]
         b = self.bounds
         self.selector.bounds = Bounds(
             np.r_[b.low, 0.0], np.r_[b.high, _WHOLE], np.r_[b.size, 0.1]
@@ -268,51 +270,6 @@ class Analysis:
             for s in p.starts[: 1 if p.row.is_sine else None]
         ]
 
-    def figures(self, x: np.ndarray, judged: bool = False) -> Figures:
-        """Held-out gap at a vector; ``judged``: without the own steps' share."""
-        chosen = self.selector
-        share, x = x[len(self.predictor.neutral) :], chosen.plain(x)
-        (errors,), (lost,) = self._held_errors(x[None])
-        if judged and len(share):
-            errors -= share[0] * self.held_steps
-        square = measure.squares(errors)
-        scale = self.channels.scale
-        rows = self.predictor.rows(x, self.held)
-        return Figures(
-            float(measure.gap(square.mean(0), scale)),
-            measure.interval(square, scale),
-            np.sqrt(square.mean(0)),
-            square,
-            errors,
-            Conditions(self.m, self.held, self.runs, rows),
-            int(lost.sum()),
-        )
-
-    def _held_errors(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of vectors ``(B, n)`` on the held-out windows, as `gap_metric.finite`."""
-        errors = self.predictor.errors(x, self.held_blocks)[:, : len(self.held)]
-        return measure.finite(errors, self.predictor.largest)
-
-    def floor(self, x: np.ndarray) -> np.ndarray:
-        """Mean squares of a perfect model on the held-out windows, ``(nv,)``.
-
-        Noise is drawn for starts and targets and pushed through the model.
-        """
-        x, rng = self.selector.plain(x), np.random.default_rng(0)
-        offsets, targets = measure.drawn_noise(
-            self.held, self.runs, self.noise, self.predictor.steps, _DRAWS, rng
-        )
-        still = self.predictor.errors(x[None], self.held_blocks)
-        moved = self.predictor.errors(
-            np.repeat(x[None], _DRAWS, 0), self.held_blocks, offsets
-        )
-        count = len(self.held)
-        error = (moved[:, :count] - still[:, :count]).astype(float) - targets
-        known = np.isfinite(error).all((2, 3))
-        # Of a model that predicts nothing the noise of the targets alone is known.
-        kept = error[known] if known.any() else targets.reshape(-1, *targets.shape[2:])
-        return np.mean(kept**2, (0, 1))
-
     def disagreeing(
         self, x: np.ndarray, kept: Figures, floor: float
     ) -> dict[str, float]:
@@ -320,11 +277,11 @@ class Analysis:
 
         ``kept``: the held-out figures at ``x``; ``floor``: the gap of a perfect model.
         """
-        count, x = len(self.fit_windows), self.selector.plain(x)
-        fitted = self.predictor.errors(x[None], self.fit_blocks)[0][:count]
+        moved = self.selector.moved
+        fitted = self.fit_starts.fit(x[None], moved[None])[1][0, :, self.lead + 1 :]
         fitted, _ = measure.finite(fitted, self.predictor.largest)
         square = np.concatenate([measure.squares(fitted), kept.square])
-        run = np.concatenate([self.fit_windows.run, self.held.run])
+        run = np.concatenate([self.fit_windows.run, self.held_out.windows.run])
         scale = self.channels.scale
         if len(np.unique(run)) == 2:
             odd = measure.odd_of_two(square, scale, run, floor)
@@ -421,7 +378,7 @@ class Analysis:
         singles = self._singles(place)
         without = [[p for p in singles if p is not one] for one in singles]
         squares = self._squares([self._each(x, place, kept) for kept in without])
-        mine = self._squares([x])[0]
+        (mine,) = self._squares([x])
         scale = self.channels.scale
         order = np.argsort(-np.asarray(measure.gap(squares.mean(1), scale)))
         seen = [singles[i] for i in order if not self._as_good(mine, squares[i])]
@@ -432,10 +389,7 @@ class Analysis:
 
     def _squares(self, vectors: Sequence[np.ndarray]) -> np.ndarray:
         """Mean squares of each held-out window, ``(B, W, nv)``."""
-        if not vectors:
-            return np.zeros((0, len(self.held), self.m.nv))
-        x = self.selector.plain(np.stack(vectors))
-        return np.stack([measure.squares(e) for e in self._held_errors(x)[0]])
+        return self.held_out.squares(np.array([self._plain(x) for x in vectors]))
 
     def _needless(self, model: Model) -> list[tuple[Place, str]]:
         """Effects that were found and say nothing of the machine, with the reason."""
@@ -606,44 +560,102 @@ class Analysis:
         notes: Sequence[str] = (),
     ) -> Outcome:
         """Looks at the held-out data, once."""
-        scale = self.channels.scale
-        before = self.figures(self.predictor.neutral)
-        refit = self.figures(base.fit.x)
-        after = self.figures(model.fit.x) if model.places else refit
-        floor = self.floor(model.fit.x if model.places else base.fit.x)
+        notes, scale = list(notes), self.channels.scale
+        before = self.held_out.look(self.predictor.neutral)
+        refit = after = self.held_out.look(self._plain(base.fit.x))
+        floor = least = self.held_out.floor(self._plain(base.fit.x))
+        open_refit = open_after = openness(refit.square, floor, scale)
+        found: list[Found] = []
+        if model.places:
+            after = self.held_out.look(self._plain(model.fit.x))
+            floor = self.held_out.floor(self._plain(model.fit.x))
+            # With one noise that all tell: the refit beside the better floor.
+            open_refit = openness(refit.square, floor, scale)
+            open_after = openness(after.square, floor, scale)
+            if surely_better(after.square, refit.square, scale):
+                found = self._found(base, model, rivals, after, floor)
+            else:
+                names = ", ".join(p.key for p in model.places)
+                notes.append(
+                    f"{names}: seen in the fitting data, but the held-out data are "
+                    "predicted no better with it, so it is not named; the recordings "
+                    "differ, or are too few"
+                )
+                after, floor = refit, least
+                open_refit = open_after = openness(refit.square, floor, scale)
+                self.held_out.look(self._plain(base.fit.x))
+        last = model if found else base
+        share = self._share(last.fit.x)
+        fair = self.held_out.figures(self._plain(last.fit.x), share).gap
+        if fair < _TOLD * after.gap:
+            notes.append(
+                f"the model's physics step of {1000 * self.step:.3g} ms makes much of "
+                f"the gap itself: {after.gap:.3g} would be {fair:.3g} without "
+                "its error; a smaller timestep in the model takes it away"
+            )
+        x, floor_gap = self._plain(last.fit.x), float(measure.gap(floor, scale))
+        return Outcome(
+            verdict=verdict_of(bool(found), open_refit, open_after),
+            found=found,
+            refitted=Numbers(self.selector, last).refitted(self.space),
+            before=before,
+            refit=refit,
+            after=after,
+            floor=floor_gap,
+            floor_si=np.sqrt(floor),
+            open_refit=open_refit,
+            open_after=open_after,
+            channels=self.channels,
+            held=self.held_out.windows,
+            x=x,
+            active=[i for i in model.fit.active.tolist() if i < len(x)],
+            notes=notes,
+            disagreeing=self.disagreeing(x, after, floor_gap),
+            seconds=time.perf_counter() - began,
+            horizon=(self.predictor.steps - self.lead) * self.runs[0].dt,
+            start=self.lead * self.runs[0].dt,
+        )
+
+    def _share(self, x: np.ndarray) -> float:
+        """Of the own steps' error, as a fit has it."""
+        return float(sum(x[len(self.predictor.neutral) :]))
+
+    def _found(
+        self,
+        base: Model,
+        model: Model,
+        rivals: Mapping[str, Sequence[Model]],
+        after: Figures,
+        floor: np.ndarray,
+    ) -> list[Found]:
+        """What is told of each effect, judged without the error of own steps."""
+        scale, x = self.channels.scale, model.fit.x
         floor_gap = float(measure.gap(floor, scale))
-        found = []
         numbers = Numbers(self.selector, model)
-        # What follows is judged without the error of the model's own steps.
-        fair = [self.figures(m.fit.x, judged=True) for m in (base, model)]
-        gap = fair[0].gap  # that the effects before it leave
+        whole = self.held_out.figures(self._plain(x), self._share(x))
+        gap = self.held_out.figures(
+            self._plain(base.fit.x), self._share(base.fit.x)
+        ).gap  # that the effects before it leave
+        found = []
         for k, place in enumerate(model.places):
             part = model.places[: k + 1]
-            x = model.fit.x
             if k + 1 == len(model.places):
-                figures, left = after, fair[1]
+                x, figures, left = model.fit.x, after, whole
             else:
+                x = model.fit.x
                 for other in model.places[k + 1 :]:
                     x = self.selector.without(x, other, part)
                 x = self.selector.fit(part, x).fit.x
-                figures, left = self.figures(x), self.figures(x, judged=True)
-            alone = _last(model, place)
-            odds = 0.0
-            same: list[Place] = []
-            for rival in rivals[place.key][:_RIVALS]:
-                p = probability(alone, rival)
-                odds += (1 - p) / max(p, 1e-6)
-                theirs = self.figures(rival.fit.x, judged=True)
-                if self._as_good(fair[1].square, theirs.square):
-                    other = rival.places[-1]
-                    same += self._singles(other) if other.shared else [other]
+                figures = self.held_out.figures(self._plain(x))
+                left = self.held_out.figures(self._plain(x), self._share(x))
+            odds, same = self._odds(_last(model, place), rivals[place.key], whole)
             parts = self._parts(x, place, figures) if place.shared else ()
             mine = {place.key, *(p.place.key for p in parts)}
             found.append(
                 Found(
                     place,
                     numbers.values(place),
-                    explained(gap, fair[1].gap, floor_gap) / (1.0 + odds),
+                    explained(gap, whole.gap, floor_gap) / (1.0 + odds),
                     [k for k in dict.fromkeys(p.key for p in same) if k not in mine],
                     figures.gap,
                     numbers.fitted(place),
@@ -652,62 +664,22 @@ class Analysis:
                 )
             )
             gap = left.gap
-        goal = GOAL * floor_gap
-        fitted = float(base.gap.mean()) ** 0.5 / self.fit_floor
-        notes = list(notes)
-        if refit.gap <= goal and not (found and fitted > _CLEAR):
-            verdict = "no_gap"
-        elif found and after.interval[1] <= goal:
-            verdict = "explained"
-        else:
-            verdict = "unexplained"
-        if refit.gap <= goal and verdict != "no_gap":
-            notes.append(
-                "the held-out data show no gap: what was found acts in the fitting "
-                f"data alone, which the model misses by {fitted:.3g} times their "
-                "noise; hold out other runs to see it confirmed"
-            )
-        if found and fair[1].gap >= fair[0].gap:
-            names = ", ".join(f.place.key for f in found)
-            notes.append(
-                f"{names}: seen in the fitting data, but the held-out data are "
-                "predicted no better with it, so it is not named; the recordings "
-                "differ, or are too few"
-            )
-            verdict = "no_gap" if refit.gap <= goal else "unexplained"
-            found, after, fair[1] = [], refit, fair[0]
-        if verdict == "no_gap":
-            found = []
-            after = refit
-            fair[1] = fair[0]
-        x = model.fit.x if found else base.fit.x
-        if fair[1].gap < _TOLD * after.gap:
-            notes.append(
-                f"the model's physics step of {1000 * self.step:.3g} ms makes much of "
-                f"the gap itself: {after.gap:.3g} would be {fair[1].gap:.3g} without "
-                "its error; a smaller timestep in the model takes it away"
-            )
-        x = self.selector.plain(x)
-        return Outcome(
-            verdict=verdict,
-            found=found,
-            refitted=Numbers(self.selector, model if found else base).refitted(
-                self.space
-            ),
-            before=before,
-            refit=refit,
-            after=after,
-            floor=floor_gap,
-            floor_si=np.sqrt(floor),
-            channels=self.channels,
-            held=self.held,
-            x=x,
-            active=[i for i in model.fit.active.tolist() if i < len(x)],
-            notes=notes,
-            disagreeing=self.disagreeing(x, after, floor_gap),
-            seconds=time.perf_counter() - began,
-            horizon=self.predictor.steps * self.runs[0].dt,
-        )
+        return found
+
+    def _odds(
+        self, mine: Model, rivals: Sequence[Model], whole: Figures
+    ) -> tuple[float, list[Place]]:
+        """Odds of an effect's rivals, and those that predict held-out data as well."""
+        odds, same = 0.0, []
+        for rival in rivals[:_RIVALS]:
+            p = probability(mine, rival)
+            odds += (1 - p) / max(p, 1e-6)
+            x = rival.fit.x
+            theirs = self.held_out.figures(self._plain(x), self._share(x))
+            if self._as_good(whole.square, theirs.square):
+                other = rival.places[-1]
+                same += self._singles(other) if other.shared else [other]
+        return odds, same
 
     def _as_good(self, mine: np.ndarray, theirs: np.ndarray) -> bool:
         """Whether the difference of two held-out gaps may be none, or is in favor;

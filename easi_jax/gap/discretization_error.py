@@ -30,7 +30,7 @@ def error_of_steps(
         windows: W of them, each of H control steps of ``dt`` [s].
 
     Returns:
-        Tangents ``(W, H, nv)``; zero where either is not finite.
+        Tangents ``(W, H + 1, nv)``, from the start on; zero where either is not finite.
     """
     m = copy.deepcopy(mj_model)
     parts = physics_steps(dt, m.opt.timestep)
@@ -39,6 +39,7 @@ def error_of_steps(
     state = np.zeros((len(windows), size))
     state[:, 1 : 1 + m.nq] = windows.start_qpos
     state[:, 1 + m.nq : 1 + m.nq + m.nv] = windows.speed[:, start]
+    state[:, 1 + m.nq + m.nv : 1 + m.nq + m.nv + m.na] = windows.start_act
     configuration, paths = Configuration.of(m), []
     # What explodes is left out below; MuJoCo would write a file about it.
     mujoco.set_mju_user_warning(lambda _: None)
@@ -51,7 +52,7 @@ def error_of_steps(
             paths.append(configuration.difference(windows.start_qpos[:, None], qpos))
     finally:
         mujoco.set_mju_user_warning(None)
-    out = paths[1] - paths[0]
+    out = np.pad(paths[1] - paths[0], [(0, 0), (1, 0), (0, 0)])
     return np.where(np.isfinite(out).all((1, 2), keepdims=True), out, 0.0)
 
 

@@ -43,8 +43,9 @@ class Selector:
     Its ``residuals`` have to be set before it fits, and ``floor``, the gap of a perfect
     model, before it chooses. ``journal`` keeps what takes long.
 
-    ``steps``, where set, is an error of all predictions ``(count, H, nv)`` of which a
+    ``steps``, where set, is an error of all predictions ``(count, T, nv)`` of which a
     share is nobody's fault. That share is one number more at the end of the vectors.
+    ``moved (count, s)`` are offsets of the windows' starts.
 
     Args:
         predictor: predictions.
@@ -74,6 +75,7 @@ class Selector:
         self.group, self.own = group, tuple(own)
         self.weight = np.ones(count)
         self.steps: np.ndarray | None = None
+        self.moved = np.zeros((count, predictor.size))
 
     @property
     def neutral(self) -> np.ndarray:
@@ -86,14 +88,15 @@ class Selector:
         return x[..., : len(self.predictor.neutral)]
 
     def errors(self, x: np.ndarray, some: np.ndarray | None = None) -> np.ndarray:
-        """Errors of the fitted windows under vectors ``(B, n)``, ``(B, W, H, nv)``;
+        """Errors of the fitted windows under vectors ``(B, n)``, ``(B, W, T, nv)``;
         ``some``: of those in some of the blocks, by their place among them.
 
         Single windows whose prediction is not finite count as the largest motion; of a
         vector that loses most windows they stay as they are, and no fit takes it."""
         every = np.arange(len(self.blocks)) if some is None else some
-        found = self.predictor.errors(self.plain(x), self.blocks[every])
         at = self.windows_of(every)
+        moved = np.broadcast_to(self.moved[at], (len(x), len(at), self.moved.shape[1]))
+        found = self.predictor.errors(self.plain(x), self.blocks[every], moved)
         found = found[:, : len(at)]
         bounded, lost = finite(found, self.predictor.largest)
         few = lost.mean(1) <= _LOST

@@ -7,8 +7,6 @@ import mujoco
 import numpy as np
 
 from easi_jax.data.recording import Run
-from easi_jax.gap.whitening import noise_rows
-from easi_jax.gap.window_set import WindowSet
 from easi_jax.model.joint_space import (
     FREE_WIDTH,
     dofs,
@@ -178,53 +176,3 @@ def interval(
     drawn = gap(resampled(len(square), seed) @ square, scale)
     low, high = np.quantile(drawn, (0.025, 0.975))
     return float(low), float(high)
-
-
-def floor_squares(
-    windows: WindowSet, runs: Sequence[Run], slope: np.ndarray, noise: np.ndarray
-) -> np.ndarray:
-    """Expected mean squares of a perfect model, ``(W, nv)``.
-
-    The noise of the start state, through the fit of its velocity and the prediction,
-    and that of the target; the exact expectation of drawing both.
-
-    Args:
-        slope: of errors with the start state, ``(2 nv, W, H, nv)``.
-        noise: of measured positions, ``(nv,)``.
-    """
-    nv, steps = len(noise), slope.shape[2]
-    out = np.zeros((len(windows), nv))
-    for w in range(len(windows)):
-        run, row = runs[windows.run[w]], int(windows.row[w])
-        origin, weights = noise_rows(run, row, steps)
-        for c in range(nv):
-            a = slope[nv + c, w][:, :, None] * weights  # (H, nv, rows)
-            a[:, :, origin] += slope[c, w]
-            a[np.arange(steps), c, origin + np.arange(1, steps + 1)] -= 1.0
-            out[w] += noise[c] ** 2 * (a**2).sum(-1).mean(0)
-    return out
-
-
-def drawn_noise(
-    windows: WindowSet,
-    runs: Sequence[Run],
-    noise: np.ndarray,
-    steps: int,
-    draws: int,
-    rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Noise of start states ``(draws, W, 2 nv)`` and of targets ``(draws, W, H, nv)``.
-
-    Both come from the same noisy rows: the velocity is fitted to some of the targets.
-    """
-    nv = len(noise)
-    offsets = np.zeros((draws, len(windows), 2 * nv))
-    targets = np.zeros((draws, len(windows), steps, nv))
-    for w in range(len(windows)):
-        run, row = runs[windows.run[w]], int(windows.row[w])
-        origin, weights = noise_rows(run, row, steps)
-        rows = noise * rng.normal(size=(draws, len(weights), nv))
-        offsets[:, w, :nv] = rows[:, origin]
-        offsets[:, w, nv:] = np.einsum("k,dkc->dc", weights, rows)
-        targets[:, w] = rows[:, origin + 1 : origin + 1 + steps]
-    return offsets, targets

@@ -7,12 +7,12 @@ import numpy as np
 
 from easi_jax.gap.effect_set import Model
 from easi_jax.gap.table import Place
+from easi_jax.gap.verdict import GOAL
 
 _SURE = 1.7  # standard errors by which an effect has to help
 _LIKELY = 1.0  # by either measure
 HELPS = 0.05  # share of the squared gap by which each of its numbers has to help
 _LARGE = 0.3
-GOAL = 1.25  # times the floor: a gap that is as good as closed
 _PLAIN = 2.0  # times as far above the floor: a gap beyond doubt
 _CLOSER = 3.0  # times as much has to be gained where it is
 _TINY = 1e-300

@@ -99,6 +99,8 @@ class Predictor:
         wrapped: hinges in whose range a full turn fits, whose errors are wrapped,
             ``(nv,)`` bool.
         largest: motion that was measured in a window, ``(nv,)``.
+        steps: control steps of a window, those before its start counted.
+        size: of a start state: positions, velocities, activations, ``2 nv + na``.
     """
 
     def __init__(
@@ -126,6 +128,7 @@ class Predictor:
         self.neutral = np.concatenate([np.asarray(space.nominal), layout.neutral])
         m, nv = mj_model, mj_model.nv
         self.nv, self.steps = nv, windows.ctrl.shape[1]
+        self.size = 2 * nv + m.na
         self.wrapped = np.zeros(nv, bool)
         for j in range(m.njnt):
             self.wrapped[dofs(m, j)] = turns_fully(m, j)
@@ -175,6 +178,7 @@ class Predictor:
             blocks(x)
             for x in (
                 padded.start_qpos,
+                padded.start_act,
                 padded.ctrl,
                 padded.past,
                 padded.past_qpos,
@@ -257,7 +261,7 @@ class Predictor:
             like = (
                 np.zeros((batch, len(self.neutral)), np.float32),
                 np.zeros(batch, np.int32),
-                np.zeros((batch, BLOCK, 2 * self.nv), np.float32),
+                np.zeros((batch, BLOCK, self.size), np.float32),
             )
             for out in self._without if self.simulator.engine == "mjx" else [left_out]:
                 # Play is for few predictions.
@@ -295,14 +299,14 @@ class Predictor:
         )
 
     def _window(self, model: Model, window: tuple, moved: jax.Array) -> jax.Array:
-        """Readings less measurements after each step, ``(H, nv)``.
+        """Readings less measurements at each row, ``(H + 1, nv)``.
 
         Where readings are late, the simulation begins by the longest delay earlier, so
         that it starts from what was read until the window's start. Each joint is
         compared with the readings of the times that are simulated: as far from its
         start as without delays. Where a run only begins, all is later by that delay.
         """
-        start_q, ctrl, past, past_q, past_v, seen, speed, led = window
+        start_q, start_act, ctrl, past, past_q, past_v, seen, speed, led = window
         simulator, e, nv = self.simulator, model.effects, self.nv
         assert e is not None
         early = led * jnp.max(e.late)
@@ -311,7 +315,8 @@ class Predictor:
         read = _between(seen, now + jnp.arange(self.steps + 1)[:, None])
         v = _between(speed, now[None])[0]
         q = simulator.move(start_q, read[0] - e.bias + moved[:nv])
-        physics = simulator.start(q, v + moved[nv:], model).replace(memory=())
+        physics = simulator.start(q, v + moved[nv : 2 * nv], model)
+        physics = physics.replace(memory=(), act=start_act + moved[2 * nv :])
         arrived = effects.command_sequence(
             e.replace(delay=e.delay + early),
             jnp.concatenate([past, ctrl]),
@@ -334,8 +339,9 @@ class Predictor:
         # From the start, so that readings are plain numbers also where q is not.
         zero = jnp.zeros(nv)
         difference = jax.vmap(simulator.difference, (None, None, 0, None))
+        qs = jnp.concatenate([q[None], qs])
         path = difference(start_q, zero, qs, zero)[:, :nv]
-        error = path + e.bias - read[1:]
+        error = path + e.bias - read
         turn = 2 * jnp.pi
         near = error - turn * jnp.round(error / turn)
         return jnp.where(self.wrapped, near, error)
@@ -388,26 +394,28 @@ class Predictor:
         windows: np.ndarray | None = None,
         moved: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Predicted readings less measured ones, ``(B, W, H, nv)``.
+        """Predicted readings less measured ones, ``(B, W, H + 1, nv)``: at the start,
+        and after each step.
 
         Args:
             x: vectors, ``(B, n)``.
             windows: which blocks of `BLOCK` windows, sorted; all where None.
-            moved: offsets of start positions and velocities, ``(B, W, 2 nv)``.
+            moved: offsets of start positions, velocities and activations,
+                ``(B, W, 2 nv + na)``.
         """
         blocks = np.arange(self.blocks) if windows is None else np.asarray(windows)
         count, nb = len(x), len(blocks)
         items = count * nb
         vectors = np.repeat(x, nb, 0).astype(np.float32)
         which = np.tile(blocks, count).astype(np.int32)
-        shape = (items, BLOCK, 2 * self.nv)
+        shape = (items, BLOCK, self.size)
         if moved is None:
             offsets = np.zeros(shape, np.float32)
         else:
-            whole = np.zeros((count, nb * BLOCK, 2 * self.nv), np.float32)
+            whole = np.zeros((count, nb * BLOCK, self.size), np.float32)
             whole[:, : moved.shape[1]] = moved
             offsets = whole.reshape(shape)
-        out = np.empty((items, BLOCK, self.steps, self.nv), np.float32)
+        out = np.empty((items, BLOCK, self.steps + 1, self.nv), np.float32)
         neutral, left = self.neutral.astype(np.float32), np.ones(items, bool)
         for left_out, columns in self._without.items():
             fits = left & (vectors[:, columns] == neutral[columns]).all(1)
@@ -419,7 +427,7 @@ class Predictor:
                 args = vectors[part], which[part], offsets[part]
                 got = program(*args, *self._data)
                 out[part] = np.asarray(got)
-        out = out.reshape(count, nb * BLOCK, self.steps, self.nv)
+        out = out.reshape(count, nb * BLOCK, self.steps + 1, self.nv)
         return out[:, : self.count(windows)]
 
     def _batches(self, chosen: np.ndarray) -> list[np.ndarray]:

@@ -9,6 +9,7 @@ from easi_jax.gap.error_localization import Conditions
 from easi_jax.gap.forward_selection import Selector
 from easi_jax.gap.gap_metric import Channels
 from easi_jax.gap.table import Place
+from easi_jax.gap.verdict import Openness
 from easi_jax.gap.window_set import WindowSet
 from easi_jax.model.parameters import ParameterSpace
 
@@ -65,6 +66,7 @@ class Figures:
         conditions: what was going on in the rows that the errors belong to.
         not_finite: windows whose prediction is not, which count as errors of the
             largest motion.
+        first: errors at the start that the gap is measured from, ``(W, nv)``.
     """
 
     gap: float
@@ -74,6 +76,7 @@ class Figures:
     errors: np.ndarray
     conditions: Conditions
     not_finite: int = 0
+    first: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 @dataclass
@@ -85,7 +88,9 @@ class Outcome:
             moved.
         disagreeing: runs that the model predicts far worse than the others, with how
             many times.
+        open_refit, open_after: errors beside their floor.
         horizon: of the predictions [s].
+        start: time on either side of a start that it is fitted to [s].
     """
 
     verdict: str
@@ -96,6 +101,8 @@ class Outcome:
     after: Figures
     floor: float
     floor_si: np.ndarray
+    open_refit: Openness
+    open_after: Openness
     channels: Channels
     held: WindowSet
     x: np.ndarray
@@ -104,6 +111,7 @@ class Outcome:
     disagreeing: dict[str, float] = field(default_factory=dict)
     seconds: float = 0.0
     horizon: float = 0.0
+    start: float = 0.0
 
 
 class Numbers:

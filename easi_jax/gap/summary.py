@@ -9,6 +9,7 @@ from easi_jax.data.recording import Run
 from easi_jax.gap.error_localization import condition_errors, where
 from easi_jax.gap.result import Figures, Found, Outcome
 from easi_jax.gap.sensor_faults import ReadingFault
+from easi_jax.gap.verdict import Openness
 from easi_jax.model.joint_space import scalar_dofs
 from easi_jax.model.results import (
     ErrorMap,
@@ -53,8 +54,8 @@ def gap_result(
             Refitted(r["address"], r["from"], r["to"], r["std"]) for r in o.refitted
         ),
         before=_figures(o.before),
-        refit=_figures(o.refit),
-        after=_figures(o.after),
+        refit=_figures(o.refit, _intervals(o, o.open_refit)),
+        after=_figures(o.after, _intervals(o, o.open_after)),
         floor=o.floor,
         floor_si=tuple(o.floor_si.tolist()),
         channels=c.names,
@@ -65,6 +66,9 @@ def gap_result(
         horizon=o.horizon,
         disagreeing=o.disagreeing,
         seconds=o.seconds,
+        start=o.start,
+        open=_named(c.names, o.open_after.open),
+        undecided=_named(c.names, o.open_after.undecided),
         notes=(*notes, *o.notes, *_not_finite(lost, len(o.held))),
     )
 
@@ -83,8 +87,25 @@ def _not_finite(lost: int, of: int) -> list[str]:
     ]
 
 
-def _figures(f: Figures) -> GapFigures:
-    return GapFigures(f.gap, f.interval, tuple(f.si.tolist()), f.not_finite)
+_Intervals = tuple[tuple[float, float] | None, ...]
+
+
+def _figures(f: Figures, intervals: _Intervals = ()) -> GapFigures:
+    return GapFigures(f.gap, f.interval, tuple(f.si.tolist()), intervals, f.not_finite)
+
+
+def _intervals(o: Outcome, found: Openness) -> _Intervals:
+    """Of errors of channels, in their units."""
+    edges = np.stack([found.low, found.high], 1)[:-1] * o.floor_si[:, None]
+    return tuple(
+        (low, high) if low == low else None  # a channel that is left out has none
+        for low, high in edges.tolist()
+    )
+
+
+def _named(names: Sequence[str], which: np.ndarray) -> tuple[str, ...]:
+    """Channels of a mask ``(nv + 1,)``, the whole by an empty name."""
+    return tuple(n for n, yes in zip((*names, ""), which, strict=True) if yes)
 
 
 def _effects(o: Outcome) -> tuple[NamedEffect, ...]:
@@ -166,10 +187,11 @@ def telling_traces(o: Outcome, m: mujoco.MjModel, run: Run) -> Traces:
         positions = figures.conditions.positions[w]
         origin = np.broadcast_to(m.qpos0, positions.shape)
         seen = run.configuration.difference(origin, positions)
-        error = np.pad(figures.errors[w], [(0, 0), (1, 0), (0, 0)])
+        error = np.concatenate([figures.first[w, None], figures.errors[w]], 1)
         found.append((seen, seen + error))
     (measured, before), (_, after) = found
-    after = _on_rows(after, last.conditions.rows.readings[w], o.held.row[w])
+    begin = o.before.conditions.rows.readings[w, 0, 0]
+    after = _on_rows(after, last.conditions.rows.readings[w], begin)
     some = np.flatnonzero(used)[:_SHOWN]
     return Traces(
         np.arange(measured.shape[1]) * run.dt,

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from easi_jax.data.activations import activation_guess
 from easi_jax.data.drive_forces import exertion
 from easi_jax.data.recording import Run
-from easi_jax.data.windows import fitted_velocity, make_windows
+from easi_jax.data.windows import fitted_velocity, lead_rows, make_windows
 
 _BEFORE = 0.6  # s before a window in which a drive with play finds its side
 _EXTREME = 4  # for so many, one more that has large forces or speeds
@@ -19,10 +20,14 @@ _EXTREME = 4  # for so many, one more that has large forces or speeds
 class WindowSet:
     """Windows of several runs; all arrays have a leading axis W.
 
+    A window begins `easi_jax.data.windows.lead_rows` before the start that it is
+    measured from: its state there is fitted to the rows on either side of the start.
+
     Attributes:
         run: index of the run.
-        row: row of the run where the window starts.
-        start_qpos: measured positions at the start, ``(W, nq)``.
+        row: row of the run where the window begins.
+        start_qpos: measured positions there, ``(W, nq)``.
+        start_act: activations there as far as commands tell, ``(W, na)``.
         ctrl: ``(W, H, nu)``.
         past: commands before, oldest first, ``(W, D, nu)``; before a run's first row
             its first command.
@@ -39,6 +44,7 @@ class WindowSet:
     run: np.ndarray
     row: np.ndarray
     start_qpos: np.ndarray
+    start_act: np.ndarray
     ctrl: np.ndarray
     past: np.ndarray
     past_qpos: np.ndarray
@@ -76,26 +82,33 @@ def join(sets: Sequence[WindowSet]) -> WindowSet:
 
 
 def window_set(
-    runs: Sequence[Run], horizon_s: float, longest: float, first_run: int = 0
+    m: mujoco.MjModel,
+    runs: Sequence[Run],
+    horizon_s: float,
+    longest: float,
+    first_run: int = 0,
 ) -> WindowSet | None:
     """Windows every half horizon, each inside one run; None where there are none.
 
     Args:
+        m: the model that was recorded.
         longest: delay of commands and readings that predictions allow for [s].
         first_run: index of the first of ``runs``.
     """
     sets = [
-        _windows_of(run, first_run + i, horizon_s, longest)
+        _windows_of(m, run, first_run + i, horizon_s, longest)
         for i, run in enumerate(runs)
     ]
     sets = [s for s in sets if len(s)]
     return join(sets) if sets else None
 
 
-def _windows_of(run: Run, number: int, horizon_s: float, longest: float) -> WindowSet:
+def _windows_of(
+    m: mujoco.MjModel, run: Run, number: int, horizon_s: float, longest: float
+) -> WindowSet:
     late = math.ceil(longest / run.dt - 1e-9)
     past = math.ceil(max(2 * longest, _BEFORE) / run.dt) + 2
-    w = make_windows(run, horizon_s)
+    w = make_windows(run, horizon_s, lead=lead_rows(run.dt))
     velocity = fitted_velocity(run.qpos, run.dt, run.configuration)
     start, steps = w.start_row[:, None], w.ctrl.shape[1]
 
@@ -111,6 +124,7 @@ def _windows_of(run: Run, number: int, horizon_s: float, longest: float) -> Wind
         run=np.full(len(w.start_row), number),
         row=w.start_row,
         start_qpos=run.qpos[w.start_row],
+        start_act=activation_guess(m, run)[w.start_row],
         ctrl=w.ctrl,
         past=run.ctrl[inside(before)],
         past_qpos=run.qpos[inside(before)],

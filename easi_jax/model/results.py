@@ -81,12 +81,14 @@ class GapFigures:
         gap: in units of the motion.
         interval: its 95 % interval.
         si: RMS error of each channel, in its unit.
+        si_intervals: simultaneous 95 % intervals of those; None where left out.
         not_finite: windows whose prediction is not.
     """
 
     gap: float
     interval: tuple[float, float]
     si: tuple[float, ...]
+    si_intervals: tuple[tuple[float, float] | None, ...] = ()
     not_finite: int = 0
 
 
@@ -167,6 +169,10 @@ class GapResult:
         disagreeing: runs that the model predicts far worse than the others, with how
             many times.
         seconds: that it took.
+        start: time on either side of a start that it is fitted to [s].
+        open: channels whose error is surely beyond 1.25 times their floor; the empty
+            name stands for all together.
+        undecided: channels of which these data do not tell.
         notes: what the user should know.
         where: places of the remaining error, largest first; None where not known.
         record_next: what to record to tell names apart, a sentence for each pair.
@@ -192,6 +198,9 @@ class GapResult:
     horizon: float
     disagreeing: Mapping[str, float]
     seconds: float
+    start: float = 0.0
+    open: tuple[str, ...] = ()
+    undecided: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     where: tuple[ErrorPlace, ...] | None = None
     record_next: tuple[str, ...] = ()
@@ -201,6 +210,14 @@ class GapResult:
     def times_floor(self, gap: float) -> float:
         """A gap in units of that of a perfect model."""
         return gap / self.floor if self.floor > 0 else math.inf
+
+    def share(self, before: float, after: float) -> float | None:
+        """Part of the gap between refit and floor that a fall from ``before`` to
+        ``after`` is, squared; None where there is no gap."""
+        whole = self.refit.gap**2 - self.floor**2
+        if self.verdict == "no_gap" or whole <= 0:
+            return None
+        return (before**2 - after**2) / whole
 
     @property
     def found(self) -> FoundEffects:

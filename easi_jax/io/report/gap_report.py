@@ -42,11 +42,14 @@ def gap_json(result: GapResult) -> dict[str, Any]:
                     for k, (v, s, u) in e.values.items()
                 },
                 "confidence": e.confidence,
+                "explains": r.share(before, gap),
                 "indistinguishable": e.indistinguishable,
                 "gap_after": gap,
             }
             for e in (*r.effects, *r.readings)
-            for at, gap in zip(e.at, e.gaps, strict=True)
+            for at, before, gap in zip(
+                e.at, (e.gap_before, *e.gaps), e.gaps, strict=False
+            )
         ],
         "refitted": [
             {"address": p.address, "from": p.nominal, "to": p.value, "std": p.std}
@@ -55,16 +58,17 @@ def gap_json(result: GapResult) -> dict[str, Any]:
         "gap": {
             "before": r.before.gap,
             "refit": r.refit.gap,
+            "refit_95": r.refit.interval,
             "after": r.after.gap,
             "after_95": r.after.interval,
             "floor": r.floor,
+            "open": "" in r.open,
         },
-        "gap_si": {
-            name: dict(
-                zip(("unit", "before", "refit", "after", "floor"), row, strict=True)
-            )
-            for name, *row in _channels(r)
-        },
+        "unexplained_share": r.share(r.after.gap, r.floor),
+        "gap_si": {row[0]: _channel_json(r, *row) for row in _channels(r)},
+        "undecided": [name for name in r.undecided if name],
+        "horizon_seconds": r.horizon,
+        "start_seconds": r.start,
         "not_finite": last.not_finite,
         "ignored": [{"at": k, "reason": v} for k, v in r.ignored.items()],
         "held_out": r.held_out,
@@ -252,6 +256,31 @@ def _channels(r: GapResult) -> list[tuple[str, str, float, float, float, float]]
     return list(zip(r.channels, r.units, *sizes, strict=True))
 
 
+def _state(r: GapResult, name: str) -> str:
+    if name in r.open:
+        return "open"
+    return "undecided" if name in r.undecided else ""
+
+
+def _channel_json(
+    r: GapResult,
+    name: str,
+    unit: str,
+    before: float,
+    refit: float,
+    after: float,
+    floor: float,
+) -> dict[str, Any]:
+    """An entry of ``gap_si``; intervals where the channel is compared."""
+    at = r.channels.index(name)
+    out = {"unit": unit, "before": before, "refit": refit, "after": after}
+    for key, figures in (("refit_95", r.refit), ("after_95", r.after)):
+        interval = figures.si_intervals[at] if figures.si_intervals else None
+        if interval is not None:
+            out[key] = interval
+    return {**out, "floor": floor, "open": name in r.open}
+
+
 def _tables(r: GapResult) -> list[Table]:
     returns = r.retrained
     trained = (
@@ -271,10 +300,14 @@ def _tables(r: GapResult) -> list[Table]:
         ),
         Table(
             "Error by channel",
-            ["channel", "unit", "as given", "refitted", "after", "noise floor"],
-            [(name, shown_unit(u), *sizes) for name, u, *sizes in _channels(r)],
+            ["channel", "unit", "as given", "refitted", "after", "noise floor", ""],
+            [
+                (name, shown_unit(u), *sizes, _state(r, name))
+                for name, u, *sizes in _channels(r)
+            ],
             f"RMS over windows of {measured(r.horizon, 's', 3)}, held out: "
-            f"{r.held_name}.",
+            f"{r.held_name}. Open: surely beyond 1.25 times the floor; undecided: "
+            "perhaps, more data would tell.",
         ),
         Table(
             "Where the rest sits",

@@ -1,0 +1,247 @@
+"""Start states of windows, fitted with the dynamics of the model that predicts.
+
+Nobody measures a start: positions are read with noise, velocities and activations
+hardly ever. A window begins some rows before the start that it is measured from, and
+its first state is what brings the simulation nearest to the readings within as many
+rows on either side of that start, in units of their noise (the log format's "Start of a
+window"). So the same estimator serves every model that is compared, and noise pushed
+through it says what a perfect model would leave (`floor`).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+# Takes vectors (B, n) and offsets of starts (B, W, s); returns errors (B, W, T, c).
+Simulate = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+_ROUNDS = 6  # looks at each start
+_SHORTER = 0.3  # times the step of a start that was not improved
+_SETTLED = 0.02  # of half the weighted squared error: no step is worth less
+_LINEARIZED = 4  # times, at most, that slopes are taken
+_WORTH = 0.05  # of half the weighted squared error of a row: worth new slopes
+_FAR = 2.0  # times what noise makes of a row: far off
+_NEAREST, _NEAR = 4, 3  # rows at least, and what part of them, that are met first
+_TOGETHER = 4  # draws of the noise that are simulated at once
+
+
+@dataclass
+class Starts:
+    """Starts of W windows whose errors ``simulate`` returns.
+
+    Attributes:
+        simulate: errors of vectors and offsets of starts.
+        noise: of each channel of the errors, standard deviations ``(c,)``; infinite
+            where nothing was measured.
+        spread: how far starts may be from offsets of zero, ``(s,)``.
+        rows: so many first rows of a window decide on its start.
+        step: sizes of differences, ``(s,)``.
+        slope: of errors with the start, ``(s, W, T, c)``, of the last `linearize`.
+    """
+
+    simulate: Simulate
+    noise: np.ndarray
+    spread: np.ndarray
+    rows: int
+    step: np.ndarray
+    slope: np.ndarray = field(init=False)
+
+    def part(self, some: slice) -> "Starts":
+        """Of some of the windows, whose errors can no longer be asked for."""
+        out = replace(self)
+        out.slope = self.slope[:, some]
+        return out
+
+    def linearize(self, x: np.ndarray, begin: np.ndarray) -> None:
+        """Takes slopes at a vector ``(n,)`` and offsets ``(W, s)``."""
+        size, (count, _) = len(self.step), begin.shape
+        moved = np.broadcast_to(begin, (2 * size, count, size)).copy()
+        at = np.arange(size)
+        moved[at, :, at] += self.step[:, None]
+        moved[size + at, :, at] -= self.step[:, None]
+        got = self.simulate(np.repeat(x[None], 2 * size, 0), moved).astype(np.float64)
+        slope = (got[:size] - got[size:]) / (2 * self.step)[:, None, None, None]
+        # One prediction in thousands is not finite; it must not spoil all windows.
+        self.slope = np.where(np.isfinite(slope), slope, 0.0)
+
+    @property
+    def _weight(self) -> np.ndarray:
+        return 1.0 / self.noise**2
+
+    def gain(self) -> tuple[np.ndarray, np.ndarray]:
+        """What turns errors of the first rows, and offsets, into a Gauss-Newton step:
+        ``(W, s, rows, c)``, ``(W, s, s)``."""
+        near = self.slope[:, :, : self.rows]
+        weighed = near * self._weight
+        normal = np.einsum("swtc,uwtc->wsu", near, weighed, optimize=True)
+        prior = np.diag(1.0 / self.spread**2)
+        inverse = np.linalg.inv(_scaled(normal + prior, self.spread)) * np.outer(
+            self.spread, self.spread
+        )
+        return (
+            np.einsum("wsu,uwtc->wstc", inverse, weighed, optimize=True),
+            inverse @ prior,
+        )
+
+    def solve(self, x: np.ndarray, begin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Fitted starts of one vector ``(n,)``, slopes taken there; leaves them taken.
+
+        A start far off, as a fast joint's at a slow rate is, first meets the nearest
+        rows alone, over which errors are nearly linear.
+
+        Args:
+            begin: offsets to start from, ``(W, s)``.
+
+        Returns:
+            Offsets ``(W, s)`` and errors ``(W, T, c)``.
+        """
+        whole, moved, errors = self.rows, begin, np.zeros(0)
+        before = np.full(len(begin), np.inf)
+        known = np.isfinite(self.noise).sum()
+        for k in range(_LINEARIZED):
+            self.linearize(x, moved)
+            if k == 0:
+                start = self.simulate(x[None], moved[None])[0]
+                before = self._cost(start[None], moved[None])[0]
+                if np.median(before) > _FAR * whole * known:
+                    self.rows = max(_NEAREST, whole // _NEAR)
+                    moved = self.fit(x[None], moved[None])[0][0]
+                    self.rows = whole
+                    self.linearize(x, moved)
+            (moved,), (errors,) = self.fit(x[None], moved[None])
+            after = self._cost(errors[None], moved[None])[0]
+            fell = np.minimum(before, 1e300) - after
+            before = after
+            if np.nanmax(np.where(np.isfinite(after), fell, 0.0)) < _WORTH * whole:
+                break
+        return moved, errors
+
+    def _cost(self, errors: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        """Half the weighted squared error of each start, ``(B, W)``."""
+        square = (errors[:, :, : self.rows].astype(float) ** 2) @ self._weight
+        total = 0.5 * (square.sum(-1) + ((moved / self.spread) ** 2).sum(-1))
+        return np.where(np.isfinite(errors).all((2, 3)), total, np.inf)
+
+    def fit(
+        self, x: np.ndarray, begin: np.ndarray, readings: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Fitted starts of vectors ``(B, n)``, by the slopes of `linearize`.
+
+        Args:
+            begin: offsets to start from, ``(B, W, s)``.
+            readings: by how much readings differ from those that ``simulate`` compares
+                with, ``(B, W, T, c)``.
+
+        Returns:
+            Offsets ``(B, W, s)`` and errors ``(B, W, T, c)``.
+        """
+        more = 0.0 if readings is None else readings
+        gain, back = self.gain()
+        moved = np.array(begin, float)
+        errors = self.simulate(x, moved) - more
+        cost = self._cost(errors, moved)
+        length = np.ones(cost.shape)
+        for _ in range(_ROUNDS):
+            near = np.nan_to_num(errors[:, :, : self.rows].astype(float))
+            step = np.einsum("wstc,bwtc->bws", gain, near, optimize=True)
+            step += np.einsum("wsu,bwu->bws", back, moved, optimize=True)
+            ahead = moved - length[..., None] * step
+            got = self.simulate(x, ahead) - more
+            new = self._cost(got, ahead)
+            better = new < cost
+            gained = np.where(better, np.minimum(cost, 1e300) - new, 0.0)
+            moved = np.where(better[..., None], ahead, moved)
+            errors = np.where(better[..., None, None], got, errors)
+            cost = np.where(better, new, cost)
+            length = np.where(better, 1.0, _SHORTER * length)
+            if (gained <= _SETTLED).all():
+                break
+        return moved, errors
+
+    def left(self, errors: np.ndarray) -> np.ndarray:
+        """What small errors ``(..., W, T, c)`` become where starts are fitted anew."""
+        gain, _ = self.gain()
+        near = errors[..., : self.rows, :]
+        moved = np.einsum("wstc,...wtc->...ws", gain, near, optimize=True)
+        return errors - np.einsum("...ws,swtc->...wtc", moved, self.slope)
+
+    def expected(self) -> np.ndarray:
+        """Mean squares of the errors that noise alone leaves, ``(W, T, c)``."""
+        gain, _ = self.gain()
+        known = np.isfinite(self.noise)
+        noise = np.where(known, self.noise, 0.0)
+        # Of start offsets, and of their product with each reading's own noise.
+        cov = np.einsum("wstc,wutc,c->wsu", gain, gain, noise**2, optimize=True)
+        out = np.einsum("swtc,wsu,uwtc->wtc", self.slope, cov, self.slope)
+        out += noise**2
+        near = self.slope[:, :, : self.rows]
+        own = np.einsum("wstc,swtc->wtc", gain, near, optimize=True)
+        out[:, : self.rows] -= 2 * noise**2 * own
+        return out
+
+    def measured_noise(self, errors: np.ndarray) -> np.ndarray:
+        """Noise as the errors at fitted starts show it, ``(c,)``.
+
+        An upper bound where the model errs within the first rows; half of the windows
+        may do so without harm.
+
+        Args:
+            errors: of `fit`, ``(W, T, c)``.
+        """
+        got = np.nanmean(errors[:, : self.rows].astype(float) ** 2, 1)
+        due = self.expected()[:, : self.rows].mean(1)
+        # Of rows less what the starts take up; a chi-square's median (Wilson and
+        # Hilferty, PNAS 17, 1931).
+        with np.errstate(divide="ignore", invalid="ignore"):
+            free = np.maximum(self.rows * due / self.noise**2, 1.0)
+            ratio = got / due / (1 - 2 / (9 * free)) ** 3
+        middle = np.nanmedian(np.where(np.isfinite(ratio), ratio, np.nan), 0)
+        return np.where(np.isfinite(self.noise), self.noise * np.sqrt(middle), np.inf)
+
+
+def floor(
+    starts: Starts,
+    x: np.ndarray,
+    begin: np.ndarray,
+    draws: int,
+    step: np.ndarray,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Mean squares of each row that a perfect model would leave, ``(W, T, c)``.
+
+    Readings of the model's own motion, from fitted starts ``begin (W, s)`` on, are
+    drawn with noise and resolution, and go through the same fit of starts.
+
+    Args:
+        x: the model's vector, ``(n,)``.
+        draws: of each window.
+        step: between two readings of each channel; 0 where they are fine, ``(c,)``.
+    """
+    exact = starts.simulate(x[None], begin[None])[0].astype(float)
+    rounded = step / np.sqrt(12.0)
+    known = np.isfinite(starts.noise)
+    noise = np.where(known, starts.noise, 0.0)
+    coarse = np.logical_and(step > 0, rounded > 0.5 * noise)
+    white = np.sqrt(np.maximum(noise**2 - (coarse * rounded) ** 2, 0.0))
+    total, count = np.zeros(exact.shape), np.zeros(len(exact))
+    for first in range(0, draws, _TOGETHER):
+        many = min(_TOGETHER, draws - first)
+        read = exact + white * rng.normal(size=(many, *exact.shape))
+        size = np.where(coarse, step, 1.0)
+        read = np.where(coarse, np.round(read / size) * size, read)
+        vectors = np.repeat(x[None], many, 0)
+        at = np.broadcast_to(begin, (many, *begin.shape))
+        _, errors = starts.fit(vectors, at, read)
+        fine = np.asarray(np.isfinite(errors).all((2, 3)))
+        square = np.where(fine[..., None, None], errors.astype(float) ** 2, 0.0)
+        total += square.sum(0)
+        count += fine.sum(0)
+    # Of a model that predicts nothing the noise of the readings alone is known.
+    each = np.broadcast_to(count[:, None, None], total.shape)
+    return np.where(each > 0, total / np.maximum(each, 1.0), noise**2)
+
+
+def _scaled(normal: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Matrices ``(W, s, s)`` in units of ``size (s,)``."""
+    return normal * np.outer(size, size)

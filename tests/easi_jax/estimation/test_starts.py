@@ -1,0 +1,115 @@
+"""Starts that are fitted with a model's own dynamics: a linear one, known exactly."""
+
+import numpy as np
+import pytest
+
+from easi_jax.estimation.starts import Starts, floor
+
+W, T, ROWS, DT = 400, 31, 11, 0.01
+NOISE = np.array([2e-3])
+
+
+def path(start: np.ndarray) -> np.ndarray:
+    """A falling mass from ``start (..., 2)``, ``(..., T, 1)``."""
+    t = DT * np.arange(T)
+    return (start[..., :1] + start[..., 1:] * t - 0.5 * 9.81 * t**2)[..., None]
+
+
+def made(seed: int, pull: float = 0.0, step: float = 0.0) -> tuple[Starts, np.ndarray]:
+    """Starts of windows read with noise; ``pull`` is what the model lacks [m/s2]."""
+    rng = np.random.default_rng(seed)
+    true = rng.normal(size=(W, 2))
+    t = DT * np.arange(T)[:, None]
+    read = path(true) + 0.5 * pull * t**2 + NOISE * rng.normal(size=(W, T, 1))
+    if step:
+        read = np.round(read / step) * step
+    guess = np.stack([read[:, 0, 0], np.zeros(W)], 1)
+
+    def simulate(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        return path(guess + moved) - read
+
+    spread = np.array([0.1, 3.0])
+    return Starts(simulate, NOISE, spread, ROWS, 1e-3 * spread), true - guess
+
+
+def fitted(starts: Starts) -> tuple[np.ndarray, np.ndarray]:
+    x = np.zeros(1)
+    starts.linearize(x, np.zeros((W, 2)))
+    moved, errors = starts.fit(x[None], np.zeros((1, W, 2)))
+    return moved[0], errors[0]
+
+
+def test_starts_are_those_of_least_squares() -> None:
+    starts, off = made(0)
+    moved, _ = fitted(starts)
+    t = DT * np.arange(ROWS)
+    design = np.stack([np.ones(ROWS), t], 1)
+    std = NOISE * np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
+    np.testing.assert_allclose((moved - off).std(0), std, rtol=0.1)
+    assert np.abs((moved - off).mean(0) / std).max() < 3 / np.sqrt(W)
+
+
+@pytest.mark.parametrize("step", [0.0, 8e-3])
+def test_a_perfect_model_leaves_its_floor(step: float) -> None:
+    starts, _ = made(1, step=step)
+    starts.noise = np.hypot(NOISE, step / np.sqrt(12.0))
+    moved, errors = fitted(starts)
+    got = (errors[:, ROWS:] ** 2).mean()
+    rng = np.random.default_rng(0)
+    drawn = floor(starts, np.zeros(1), moved, 20, np.array([step]), rng)
+    assert np.sqrt(got / drawn[:, ROWS:].mean()) == pytest.approx(1.0, abs=0.06)
+    if not step:
+        due = starts.expected()
+        np.testing.assert_allclose(drawn.mean(0), due.mean(0), rtol=0.1)
+
+
+def test_what_a_model_lacks_is_not_hidden_and_enters_no_floor() -> None:
+    starts, _ = made(2, pull=2.0)
+    moved, errors = fitted(starts)
+    got = np.sqrt((errors[:, ROWS:] ** 2).mean())
+    drawn = floor(starts, np.zeros(1), moved, 20, np.zeros(1), np.random.default_rng(0))
+    assert got > 5 * np.sqrt(drawn[:, ROWS:].mean())
+
+
+def test_noise_is_read_off_the_first_rows() -> None:
+    starts, _ = made(3)
+    starts.noise = 3 * NOISE
+    _, errors = fitted(starts)
+    np.testing.assert_allclose(starts.measured_noise(errors), NOISE, rtol=0.05)
+
+
+def test_what_small_errors_become() -> None:
+    starts, _ = made(4)
+    _, errors = fitted(starts)
+    more = np.full((W, T, 1), 0.3)  # as if all were read 0.3 m too low
+    np.testing.assert_allclose(starts.left(more), 0.0, atol=2e-3)
+    np.testing.assert_allclose(starts.left(errors), errors, atol=0.03 * NOISE[0])
+
+
+def test_a_channel_without_readings_has_no_say() -> None:
+    starts, _ = made(5)
+    both = Starts(
+        lambda x, moved: np.concatenate([starts.simulate(x, moved)] * 2, -1),
+        np.array([NOISE[0], np.inf]),
+        starts.spread,
+        ROWS,
+        starts.step,
+    )
+    alone, _ = fitted(starts)
+    beside, errors = fitted(both)
+    np.testing.assert_allclose(beside, alone, atol=1e-9)
+    assert np.isinf(both.measured_noise(errors)[1])
+
+
+def test_what_is_not_finite_keeps_its_start() -> None:
+    starts, _ = made(6)
+    plain = starts.simulate
+
+    def blown(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        out = plain(x, moved)
+        out[:, 3, 20:] = np.nan
+        return out
+
+    starts.simulate = blown
+    moved, _ = fitted(starts)
+    assert np.isfinite(moved).all() and not moved[3].any()
