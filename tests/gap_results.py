@@ -44,7 +44,7 @@ def effect(
 
 def result(text: str = "hinge", unit: str = "rad", **changed: Any) -> GapResult:
     """One effect at a joint, a run that disagrees, a channel left out."""
-    figures = GapFigures(0.2, (0.1, 0.3), (1.0,))
+    figures = GapFigures(0.2, (0.1, 0.3), (1.0,), ((0.8, 1.3),))
     found = GapResult(
         model=text,
         verdict="unexplained",
@@ -64,6 +64,9 @@ def result(text: str = "hinge", unit: str = "rad", **changed: Any) -> GapResult:
         horizon=0.200009,
         disagreeing={text: 3.0},
         seconds=1.0,
+        start=0.05,
+        open=(text,),
+        undecided=("cart", ""),
         notes=(text, unit),
         where=(ErrorPlace(text, 0.5, unit),),
         record_next=(text,),

@@ -72,7 +72,9 @@ def test_numbers_are_those_that_people_write() -> None:
 
 def test_a_result_with_nothing_in_it_has_a_report() -> None:
     """No effect, no place of the error, no noise, figures that are not finite."""
-    none = GapFigures(float("nan"), (float("nan"), float("nan")), (float("inf"),), 7)
+    none = GapFigures(
+        float("nan"), (float("nan"), float("nan")), (float("inf"),), (None,), 7
+    )
     found = result(
         effects=(),
         refitted=(),
@@ -96,7 +98,8 @@ def test_gap_json_holds_every_key_of_the_format() -> None:
         result(retrained=Retrained("cartpole", 2400, {"0": 1.0}, {"0": 2.0}))
     )
     assert list(told) == [
-        *("schema", "verdict", "effects", "refitted", "gap", "gap_si", "not_finite"),
+        *("schema", "verdict", "effects", "refitted", "gap", "unexplained_share"),
+        *("gap_si", "undecided", "horizon_seconds", "start_seconds", "not_finite"),
         *("ignored", "held_out", "where", "disagreeing_runs", "record_next", "notes"),
         *("seconds", "not_in_model_xml", "retrained"),
     ]
@@ -107,8 +110,13 @@ def test_gap_json_holds_every_key_of_the_format() -> None:
         "kind": "joint",
         "parameters": {"torque": {"value": 0.1, "std": 0.01, "unit": "rad"}},
         "confidence": 0.9,
+        "explains": pytest.approx((0.2**2 - 0.1**2) / (0.2**2 - 0.1**2)),
         "indistinguishable": ("viscous_damping@rad",),
         "gap_after": 0.1,
     }
-    assert told["gap_si"]["hinge"]["unit"] == "rad"
+    channel = told["gap_si"]["hinge"]
+    assert channel["unit"] == "rad" and channel["open"] is True
+    assert channel["after_95"] == (0.8, 1.3) and told["gap"]["open"] is False
+    assert told["unexplained_share"] == pytest.approx(1.0)
+    assert told["undecided"] == ["cart"]
     assert told["retrained"]["with"] == {"0": 2.0}

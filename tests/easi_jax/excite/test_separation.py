@@ -8,12 +8,14 @@ import pytest
 
 from easi_jax.data.cleaning import rows_of
 from easi_jax.data.recording import Run
+from easi_jax.data.windows import lead_rows
 from easi_jax.excite import candidates, choose, drives, play, separation
 from easi_jax.excite import evaluate as ev
 from easi_jax.excite.propose import propose, quick_tests
 from easi_jax.gap.batched_least_squares import bounds_of, least_squares, lockstep
 from easi_jax.gap.scales import scales_of
-from easi_jax.gap.whitening import make_residuals, start_sensitivity, velocity_slack
+from easi_jax.gap.whitening import make_residuals
+from easi_jax.gap.window_starts import window_starts
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameter_proposal import own_space
 
@@ -82,7 +84,7 @@ class Case:
         self.scales = scales_of(m, self.runs)
         self.space = own_space(m)
         found = choose.effects_wanted(m, self.space, self.scales, EFFECTS)
-        self.parts = ev.windows_of(self.runs, HORIZON, self.scales.longest, 96)
+        self.parts = ev.windows_of(m, self.runs, HORIZON, self.scales.longest, 96)
         self.predictor = ev.make_predictor(m, self.space, found, self.parts, DT)
         self.bounds = bounds_of(self.space, self.predictor.layout)
         self.places = {p.key: p for p in found}
@@ -115,19 +117,23 @@ class Case:
         out = []
         for _ in range(draws):
             drawn = noisy(run, rng)
-            (windows,) = ev.windows_of([drawn], HORIZON, self.scales.longest, 999)
+            longest = self.scales.longest
+            (windows,) = ev.windows_of(self.m, [drawn], HORIZON, longest, 999)
             windows = windows.take(np.arange(0, len(windows), 2))
             p, x = self.predictor.on(windows), self.predictor.neutral
-            slack = velocity_slack([run], p.simulator.dt / 2)
-            slope = start_sensitivity(p, x, np.array([NOISE, 0.05]), None)
-            residuals = make_residuals(
-                windows, [drawn], slope, self.noise, slack, np.zeros(1), np.ones(1)
-            )
+            starts = window_starts(self.m, p, [drawn], self.scales, self.noise)
+            moved, _ = starts.solve(x, np.zeros((len(windows), p.size)))
+            residuals = make_residuals(starts, lead_rows(DT), np.zeros(1), np.ones(1))
 
             def simulate(
-                vectors: np.ndarray, p: Any = p, residuals: Any = residuals
+                vectors: np.ndarray,
+                p: Any = p,
+                residuals: Any = residuals,
+                moved: np.ndarray = moved,
             ) -> np.ndarray:
-                return residuals.whitened(residuals.grouped(p.errors(vectors)))
+                at = np.broadcast_to(moved, (len(vectors), *moved.shape))
+                errors = p.errors(vectors, None, at)
+                return residuals.whitened(residuals.grouped(errors))
 
             weight = np.ones(len(windows))
             problems = [

@@ -51,6 +51,7 @@ def simulator() -> tuple[WindowSet, list[Run]]:
         run=np.zeros(len(rows), int),
         row=rows,
         start_qpos=qpos[rows],
+        start_act=np.zeros((len(rows), 0)),
         ctrl=run.ctrl[at],
         past=run.ctrl[rows][:, None],
         past_qpos=qpos[rows][:, None],

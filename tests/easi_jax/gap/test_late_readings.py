@@ -65,7 +65,7 @@ def predictor(m: mujoco.MjModel, run: Run) -> tuple[Predictor, Vector]:
     """Predictions, and the vector of one effect of a size."""
     found = places(m, scales_of(m, [run]))
     layout = Layout(m, found)
-    windows = window_set([run], 0.2, 0.1)
+    windows = window_set(m, [run], 0.2, 0.1)
     assert windows is not None
     p = Predictor(m, ParameterSpace(()), layout, windows, DT)
 

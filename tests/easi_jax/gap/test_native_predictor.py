@@ -21,7 +21,7 @@ def test_a_window_is_one_call_unless_an_effect_depends_on_the_state(
     run = recorded(m, (0.0,))
     found = places(m, scales_of(m, [run]))
     layout = Layout(m, found)
-    windows = window_set([run], 0.05, 0.0)
+    windows = window_set(m, [run], 0.05, 0.0)
     assert windows is not None
     with engine.using("mujoco"):
         p = Predictor(m, ParameterSpace(()), layout, windows, DT)

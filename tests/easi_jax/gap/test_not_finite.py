@@ -10,11 +10,14 @@ import pytest
 
 from easi_jax.errors import UserError
 from easi_jax.estimation.prediction_error import rms_of_steps
+from easi_jax.estimation.starts import Starts
 from easi_jax.excite.propose import Proposal, quick_tests
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.analysis import Analysis
 from easi_jax.gap.forward_selection import Selector
 from easi_jax.gap.gap_metric import Channels
+from easi_jax.gap.held_out import HeldOut
+from easi_jax.gap.window_set import Rows
 
 W, H, NV = 12, 4, 2
 LARGEST = np.array([0.5, 2.0])
@@ -37,22 +40,24 @@ def predictor(errors: Any) -> Any:
         errors=errors,
         largest=LARGEST,
         neutral=np.zeros(1),
-        rows=lambda x, windows: None,
-        steps=H,
+        rows=lambda x, windows: Rows(np.zeros((W, H, NV)), np.zeros((W, H - 1))),
+        steps=H - 1,
+        size=2 * NV,
     )
 
 
-def analysis(errors: Any) -> Analysis:
-    """One without a compiled program."""
-    made = object.__new__(Analysis)
-    made.predictor = predictor(errors)
-    made.held = [None] * W  # type: ignore[assignment]
-    made.held_blocks = np.arange(1)
-    made.m, made.runs = None, []  # type: ignore[assignment]
-    made.noise = np.full(NV, 1e-3)
-    made.channels = Channels(NAMES, NAMES, ("rad", "m"), np.ones(NV), {})
-    made.selector = SimpleNamespace(plain=lambda x: x)  # type: ignore[assignment]
-    return made
+def held_out(errors: Any) -> HeldOut:
+    """Held-out windows without a compiled program; the first row is the start."""
+    spread = np.ones(2 * NV)
+    noise = np.full(NV, 1e-3)
+    starts = Starts(lambda x, moved: errors(x), noise, spread, 2, 1e-3 * spread)
+    channels = Channels(NAMES, NAMES, ("rad", "m"), np.ones(NV), {})
+    given = None, [], predictor(errors), [None] * W, channels, starts
+    return HeldOut(*given, lead=0, resolution=np.zeros(NV))  # type: ignore[arg-type]
+
+
+def repeated(*lost: int) -> Any:
+    return lambda x, *_: np.repeat(blown(*lost), len(x), 0)
 
 
 def test_a_lost_window_counts_as_the_largest_motion() -> None:
@@ -67,53 +72,42 @@ def test_a_lost_window_counts_as_the_largest_motion() -> None:
 def test_held_out_figures_stay_numbers_and_say_how_many_are_lost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("easi_jax.gap.analysis.Conditions", lambda *_: None)
-    figures = analysis(lambda *_: blown(3, 5)).figures(np.zeros(1))
+    monkeypatch.setattr("easi_jax.gap.held_out.Conditions", lambda *_: None)
+    figures = held_out(repeated(3, 5)).look(np.zeros(1))
     assert figures.not_finite == 2
     assert np.isfinite([figures.gap, *figures.interval, *figures.si]).all()
     expected = np.sqrt((2 * LARGEST**2).sum() / W / NV)
     assert figures.gap == pytest.approx(expected, rel=0.01)
-    assert analysis(lambda *_: some()).figures(np.zeros(1)).not_finite == 0
+    assert held_out(repeated()).look(np.zeros(1)).not_finite == 0
 
 
 @pytest.mark.parametrize("lost", [(3,), tuple(range(W))], ids=["one", "all"])
 def test_the_floor_is_of_what_is_known(
     lost: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def errors(x: np.ndarray, blocks: Any, moved: Any = None) -> np.ndarray:
-        return np.repeat(blown(*lost), len(x), 0)
-
-    def drawn(*_: Any) -> tuple[np.ndarray, np.ndarray]:
-        rng = np.random.default_rng(1)
-        return np.zeros((8, W, 2 * NV)), 1e-3 * rng.normal(size=(8, W, H, NV))
-
-    monkeypatch.setattr(measure, "drawn_noise", drawn)
-    floor = analysis(errors).floor(np.zeros(1))
-    np.testing.assert_allclose(np.sqrt(floor), 1e-3, rtol=0.2)
+    monkeypatch.setattr("easi_jax.gap.held_out.Conditions", lambda *_: None)
+    windows = held_out(repeated(*lost))
+    windows.look(np.zeros(1))
+    np.testing.assert_allclose(np.sqrt(windows.floor(np.zeros(1))), 1e-3, rtol=0.2)
 
 
 def test_fits_go_on_with_the_windows_that_are_left() -> None:
     chosen = object.__new__(Selector)
     chosen.blocks, chosen.count, chosen.steps = np.arange(1), W, None
+    chosen.moved = np.zeros((W, 2 * NV))
     chosen.predictor = predictor(lambda *_: blown(3))
     assert np.isfinite(chosen.errors(np.zeros((1, 1)))).all()
     chosen.predictor = predictor(lambda *_: blown(*range(8)))
     assert np.isnan(chosen.errors(np.zeros((1, 1)))).any()
 
 
-def test_a_model_that_blows_up_is_told_in_one_line(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    made = analysis(None)
+def test_a_model_that_blows_up_is_told_in_one_line() -> None:
+    made = object.__new__(Analysis)
+    lost = repeated(*range(8))
+    made.fit_starts = held_out(lost).starts
     made.selector = SimpleNamespace(  # type: ignore[assignment]
-        plain=lambda x: x, count=W, errors=lambda x: blown(*range(8))
+        moved=np.zeros((W, 2 * NV)), errors=lost
     )
-    made.fit_blocks = np.arange(1)
-    monkeypatch.setattr(
-        "easi_jax.gap.analysis.start_sensitivity",
-        lambda *_: np.zeros((2 * NV, W, H, NV)),
-    )
-    monkeypatch.setattr(Analysis, "start_noise", np.zeros(2 * NV))
     with pytest.raises(UserError, match="not finite: the model blows up"):
         made.whiten(np.zeros(1))
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from easi_jax.data.recording import Run, physics_steps
-from easi_jax.data.windows import fitted_velocity
+from easi_jax.data.windows import fitted_velocity, lead_rows
+from easi_jax.estimation.starts import Starts, floor
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.batched_least_squares import (
     Bounds,
@@ -35,13 +36,9 @@ from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.scales import scales_of
 from easi_jax.gap.sensor_faults import velocity_lags
 from easi_jax.gap.table import Place
-from easi_jax.gap.whitening import (
-    Residuals,
-    make_residuals,
-    start_sensitivity,
-    step_groups,
-)
+from easi_jax.gap.whitening import Residuals, make_residuals, row_groups
 from easi_jax.gap.window_set import window_set
+from easi_jax.gap.window_starts import window_starts
 from easi_jax.model.effect_catalog import EFFECTS
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace
@@ -99,65 +96,50 @@ def runs(model: mujoco.MjModel) -> list[Run]:
 
 @pytest.fixture(scope="module")
 def predictor(model: mujoco.MjModel, runs: list[Run]) -> Predictor:
-    windows = window_set(runs, 0.2, 0.1)
+    windows = window_set(model, runs, 0.2, 0.1)
     assert windows is not None
     layout = Layout(model, places(model, scales_of(model, runs)))
     return Predictor(model, ParameterSpace(()), layout, windows, DT)
 
 
-def drawn_floor(predictor: Predictor, runs: list[Run], noise: np.ndarray) -> np.ndarray:
-    """The floor by drawing noise and pushing it through the model."""
-    x, draws = predictor.neutral, 8
-    offsets, targets = measure.drawn_noise(
-        predictor.windows, runs, noise, predictor.steps, draws, np.random.default_rng(0)
-    )
-    still = predictor.errors(x[None])
-    error = predictor.errors(np.repeat(x[None], draws, 0), None, offsets) - still
-    return np.mean((error - targets) ** 2, (0, 1, 2))
+@pytest.fixture(scope="module")
+def starts(model: mujoco.MjModel, predictor: Predictor, runs: list[Run]) -> Starts:
+    """Of a perfect model's windows, solved for."""
+    scales = scales_of(model, runs)
+    return window_starts(model, predictor, runs, scales, np.array([NOISE]))
 
 
 def test_floor_and_whitening_of_a_perfect_model(
-    predictor: Predictor, runs: list[Run]
+    predictor: Predictor, starts: Starts
 ) -> None:
-    noise = np.array([NOISE, 0.0])
-    x = predictor.neutral
-    slope = start_sensitivity(predictor, x, np.array([NOISE, 0.05]), None)
-    slope = slope[:, : len(predictor.windows)]
-    floor = measure.floor_squares(predictor.windows, runs, slope, noise[:1]).mean(0)
-    errors = predictor.errors(x[None])[0]
-    got = measure.squares(errors).mean(0)
-    np.testing.assert_allclose(np.sqrt(got), np.sqrt(floor), rtol=0.08)
-    drawn = drawn_floor(predictor, runs, noise[:1])
-    np.testing.assert_allclose(np.sqrt(drawn), np.sqrt(floor), rtol=0.03)
-    residuals = make_residuals(
-        predictor.windows, runs, slope, noise[:1], np.zeros(1), np.zeros(1), np.ones(1)
-    )
-    white = residuals.whitened(residuals.grouped(errors[None]))[0]
-    assert np.mean(white**2) == pytest.approx(1.0, rel=0.15)
-    off = np.cov(white.T) - np.eye(white.shape[1])
-    assert np.abs(off).max() < 0.5
+    x, lead = predictor.neutral, lead_rows(DT)
+    still = np.zeros((len(predictor.windows), predictor.size))
+    moved, errors = starts.solve(x, still)
+    got = measure.squares(errors[:, lead + 1 :]).mean(0)
+    rng = np.random.default_rng(0)
+    drawn = floor(starts, x, moved, 20, np.zeros(1), rng)[:, lead + 1 :].mean((0, 1))
+    np.testing.assert_allclose(np.sqrt(got), np.sqrt(drawn), rtol=0.06)
+    due = starts.expected()[:, lead + 1 :].mean((0, 1))
+    np.testing.assert_allclose(np.sqrt(drawn), np.sqrt(due), rtol=0.03)
+    np.testing.assert_allclose(starts.measured_noise(errors), NOISE, rtol=0.06)
+    r = make_residuals(starts, lead, np.zeros(1), np.array([0.5]))
+    white = r.whitened(r.grouped(errors[None]))[0]
+    # Of the start's two numbers nothing is left in the errors.
+    free = 1 - 2 / white.shape[1]
+    assert np.mean(white**2) == pytest.approx(free, rel=0.1)
+    assert r.gap(white) == pytest.approx(np.sqrt(r.floor.mean()), rel=0.15)
 
 
-def test_plain_errors_come_back_from_whitened_ones(
-    predictor: Predictor, runs: list[Run]
-) -> None:
-    errors = predictor.errors(predictor.neutral[None])
-    slope = start_sensitivity(
-        predictor, predictor.neutral, np.array([NOISE, 0.05]), None
-    )
-    slope = slope[:, : len(predictor.windows)]
-    r = make_residuals(
-        predictor.windows,
-        runs,
-        slope,
-        np.array([NOISE]),
-        np.zeros(1),
-        np.zeros(1),
-        np.array([0.5]),
-    )
-    grouped = r.grouped(errors)[0]
-    back = np.einsum("wij,wj->wi", r.plain, r.whitened(grouped[None])[0])
-    np.testing.assert_allclose(back, grouped[..., 0] / 0.5, atol=1e-5)
+def test_a_start_that_is_off_is_no_error(predictor: Predictor, starts: Starts) -> None:
+    """Whitened errors and the gap are the same from any start near by."""
+    x, lead = predictor.neutral, lead_rows(DT)
+    moved, errors = starts.solve(x, np.zeros((len(predictor.windows), predictor.size)))
+    off = predictor.errors(x[None], None, (moved + np.array([3e-3, 0.05]))[None])
+    r = make_residuals(starts, lead, np.zeros(1), np.array([0.5]))
+    near, far = (r.whitened(r.grouped(e))[0] for e in (errors[None], off))
+    assert np.abs(off - errors).max() > 5 * NOISE
+    np.testing.assert_allclose((far**2).mean(), (near**2).mean(), rtol=0.03)
+    assert r.gap(far) == pytest.approx(r.gap(near), rel=0.03)
 
 
 def test_every_effect_of_the_table_moves_the_prediction(
@@ -239,9 +221,10 @@ def test_advantage_is_in_standard_errors() -> None:
 
 
 def test_groups_average_all_steps() -> None:
-    for steps in (10, 12, 37, 200):
-        g = step_groups(steps)
-        assert len(g) <= 12
+    for rows, start in ((22, 11), (16, 11), (49, 11), (261, 61)):
+        g = row_groups(rows, start)
+        assert len(g) <= 18
+        assert not ((g[:, :start] > 0).any(1) & (g[:, start:] > 0).any(1)).any()
         np.testing.assert_allclose(g.sum(1), 1.0)
         assert ((g > 0).sum(0) == 1).all()
 
@@ -320,7 +303,7 @@ def test_a_mass_at_its_joints_may_move_away() -> None:
     run = Run("r", "made", DT, t, qpos, fitted_velocity(qpos, DT, c), False, ctrl, c)
     found = places(m, scales_of(m, [run]))
     layout = Layout(m, found)
-    windows = window_set([run], 0.2, 0.03)
+    windows = window_set(m, [run], 0.2, 0.03)
     assert windows is not None
     predictor = Predictor(m, ParameterSpace(()), layout, windows, DT)
     x = predictor.neutral.copy()
@@ -361,7 +344,7 @@ def test_of_two_runs_that_contradict_the_one_that_is_not_followed_is_told(
 def test_what_is_not_finite_loses(model: mujoco.MjModel, runs: list[Run]) -> None:
     """Physics in single precision fails now and then; the command must not."""
     layout = Layout(model, places(model, scales_of(model, runs)))
-    windows = window_set(runs, 0.2, 0.03)
+    windows = window_set(model, runs, 0.2, 0.03)
     assert windows is not None
     predictor = Predictor(model, ParameterSpace(()), layout, windows, DT)
     bounds = bounds_of(ParameterSpace(()), layout)
@@ -382,10 +365,11 @@ def test_some_blocks_are_whitened_as_among_all(predictor: Predictor) -> None:
     bounds, group = bounds_of(ParameterSpace(()), layout), np.arange(count) % 5
     selector = Selector(predictor, blocks, count, bounds, group, ())
     rng = np.random.default_rng(0)
-    groups = step_groups(predictor.steps)
+    groups = row_groups(predictor.steps + 1, 11)
     root = rng.normal(size=(count, len(groups), len(groups)))
-    selector.residuals = Residuals(groups, np.ones(1), root, root)
-    selector.steps = rng.normal(size=(count, predictor.steps, 1))
+    selector.residuals = Residuals(groups, np.ones(1), root, root, np.zeros(count))
+    selector.steps = rng.normal(size=(count, predictor.steps + 1, 1))
+    selector.moved = 1e-3 * rng.normal(size=(count, predictor.size))
     assert count % BLOCK  # the last block is not full
     x = np.append(predictor.neutral, 0.3)[None]
     some = blocks[[0, -1]]
@@ -399,7 +383,7 @@ def test_some_blocks_are_whitened_as_among_all(predictor: Predictor) -> None:
 def test_the_error_of_steps_is_what_smaller_ones_take_away(
     model: mujoco.MjModel, runs: list[Run]
 ) -> None:
-    windows = window_set(runs, 0.2, 0.03)
+    windows = window_set(model, runs, 0.2, 0.03)
     assert windows is not None
     error = error_of_steps(model, windows, DT)
     own, fine = copy.deepcopy(model), copy.deepcopy(model)

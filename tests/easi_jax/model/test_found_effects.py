@@ -173,7 +173,7 @@ def test_replay_predicts_what_the_gap_analysis_does(
     """Late and lagging commands too: those before a piece are known."""
     run = log_of(arm, ctrl)
     horizon = 10
-    past = window_set([run], horizon * DT, simulator.past_steps * DT)
+    past = window_set(arm, [run], horizon * DT, simulator.past_steps * DT)
     assert past is not None
     layout = Layout(arm, places(arm, scales_of(arm, [run])))
     predictor = Predictor(arm, ParameterSpace(()), layout, past, DT)
@@ -182,9 +182,10 @@ def test_replay_predicts_what_the_gap_analysis_does(
     for i, c in enumerate(layout.columns):
         if c.index == (1,) and c.field in values:
             x[i] = values[c.field]
-    want = predictor.errors(x[None])[0]
+    want = predictor.errors(x[None])[0][:, 1:]
 
-    segments = segments_from_runs(simulator, [run], horizon, horizon // 2)
+    steps = predictor.steps
+    segments = segments_from_runs(simulator, [run], steps, horizon // 2)
     theta = at(simulator, none, **values)
     errors = jax.jit(lambda s: open_loop.errors(simulator, simulator.model(theta), s))
     segments = to_device(segments)
