@@ -17,6 +17,7 @@ from easi_jax.data.noise import resolutions
 from easi_jax.data.recording import Run, physics_steps
 from easi_jax.data.windows import lead_rows
 from easi_jax.errors import UserError
+from easi_jax.estimation.starts import floor
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.batched_least_squares import Bounds, bounds_of, window_weights
 from easi_jax.gap.candidates import places, ripples
@@ -24,7 +25,7 @@ from easi_jax.gap.discretization_error import error_of_steps, within_a_step
 from easi_jax.gap.effect_set import Candidate, Model
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.forward_selection import Selector, shortlist
-from easi_jax.gap.held_out import HeldOut
+from easi_jax.gap.held_out import DRAWS, HeldOut
 from easi_jax.gap.model_comparison import (
     HELPS,
     better,
@@ -53,7 +54,7 @@ _BLOCKS = 10
 _MOST = 5  # effects
 _STAGES = 8  # of adding one and taking out what has become needless
 _RIPPLES = [0.75 * k for k in range(3, 27)]  # cycles over the range of a joint
-_CLOSED = 1.1  # times the floor: nothing left to explain
+_CLOSED = 1.05  # times the floor: nothing left to explain, where not surely more
 _RIVALS = 8
 _UNLIKELY = 0.3  # probability of an effect beside which a rival replaces it
 _ROUNDING = 0.005  # of the gap
@@ -224,6 +225,16 @@ class Analysis:
         r = chosen.residuals
         self.fit_gap = r.gap(r.whitened(r.grouped(errors[None]))[0])
         self.fit_floor = chosen.floor = float(np.sqrt(r.floor.mean()))
+
+    def _closed(self, x: np.ndarray) -> bool:
+        """Whether nothing is left to explain in the fitting data, whitened at ``x``."""
+        starts, moved = self.fit_starts, self.selector.moved
+        errors = self.selector.errors(x[None])[0]
+        rng, after = np.random.default_rng(1), self.lead + 1
+        noise = floor(starts, x, moved, DRAWS, self.resolution, rng)
+        square, due = measure.squares(errors[:, after:]), noise[:, after:].mean((0, 1))
+        low = openness(square, due, self.channels.scale).low
+        return bool(np.nanmax(low) <= _CLOSED)
 
     def watch_steps(self) -> None:
         """Lets fits see what the model's own steps do, where that can be seen.
@@ -468,7 +479,7 @@ class Analysis:
                 chosen.fit(model.places, model.fit.x).fit.residual
             )
             model = chosen.fit(model.places, model.fit.x)
-            if self.fit_gap <= _CLOSED * self.fit_floor:
+            if self._closed(model.fit.x):
                 break
             found: dict[frozenset[str], Model] = {}
             # What was taken out of the best may still be in the others.
@@ -563,17 +574,17 @@ class Analysis:
         notes, scale = list(notes), self.channels.scale
         before = self.held_out.look(self.predictor.neutral)
         refit = after = self.held_out.look(self._plain(base.fit.x))
-        floor = least = self.held_out.floor(self._plain(base.fit.x))
-        open_refit = open_after = openness(refit.square, floor, scale)
+        noise = least = self.held_out.floor(self._plain(base.fit.x))
+        open_refit = open_after = openness(refit.square, noise, scale)
         found: list[Found] = []
         if model.places:
             after = self.held_out.look(self._plain(model.fit.x))
-            floor = self.held_out.floor(self._plain(model.fit.x))
+            noise = self.held_out.floor(self._plain(model.fit.x))
             # With one noise that all tell: the refit beside the better floor.
-            open_refit = openness(refit.square, floor, scale)
-            open_after = openness(after.square, floor, scale)
+            open_refit = openness(refit.square, noise, scale)
+            open_after = openness(after.square, noise, scale)
             if surely_better(after.square, refit.square, scale):
-                found = self._found(base, model, rivals, after, floor)
+                found = self._found(base, model, rivals, after, noise)
             else:
                 names = ", ".join(p.key for p in model.places)
                 notes.append(
@@ -581,8 +592,8 @@ class Analysis:
                     "predicted no better with it, so it is not named; the recordings "
                     "differ, or are too few"
                 )
-                after, floor = refit, least
-                open_refit = open_after = openness(refit.square, floor, scale)
+                after, noise = refit, least
+                open_refit = open_after = openness(refit.square, noise, scale)
                 self.held_out.look(self._plain(base.fit.x))
         last = model if found else base
         share = self._share(last.fit.x)
@@ -593,7 +604,7 @@ class Analysis:
                 f"the gap itself: {after.gap:.3g} would be {fair:.3g} without "
                 "its error; a smaller timestep in the model takes it away"
             )
-        x, floor_gap = self._plain(last.fit.x), float(measure.gap(floor, scale))
+        x, floor_gap = self._plain(last.fit.x), float(measure.gap(noise, scale))
         return Outcome(
             verdict=verdict_of(bool(found), open_refit, open_after),
             found=found,
@@ -602,7 +613,7 @@ class Analysis:
             refit=refit,
             after=after,
             floor=floor_gap,
-            floor_si=np.sqrt(floor),
+            floor_si=np.sqrt(noise),
             open_refit=open_refit,
             open_after=open_after,
             channels=self.channels,
@@ -626,11 +637,11 @@ class Analysis:
         model: Model,
         rivals: Mapping[str, Sequence[Model]],
         after: Figures,
-        floor: np.ndarray,
+        noise: np.ndarray,
     ) -> list[Found]:
         """What is told of each effect, judged without the error of own steps."""
         scale, x = self.channels.scale, model.fit.x
-        floor_gap = float(measure.gap(floor, scale))
+        floor_gap = float(measure.gap(noise, scale))
         numbers = Numbers(self.selector, model)
         whole = self.held_out.figures(self._plain(x), self._share(x))
         gap = self.held_out.figures(

@@ -77,7 +77,9 @@ def channels(
     scale = np.where(unbounded, change, spread)
     quiet = change < _VISIBLE * noise
     ignored = {
-        names[d]: (
+        names[d]: "not measured"
+        if np.isinf(noise[d])
+        else (
             f"moves by {change[d]:.2g} {units[d]} over a horizon, less than "
             f"{_VISIBLE:g} times its noise of {noise[d]:.2g} {units[d]}"
         )

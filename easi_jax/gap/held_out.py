@@ -15,7 +15,7 @@ from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.result import Figures
 from easi_jax.gap.window_set import Rows, WindowSet
 
-_DRAWS = 20  # of the noise of each window, as the log format asks
+DRAWS = 20  # of the noise of each window, as the log format asks
 
 
 @dataclass
@@ -73,7 +73,7 @@ class HeldOut:
         """Mean squares of a perfect model, ``(nv,)``, at a vector that was looked at:
         `easi_jax.estimation.starts.floor`."""
         rng = np.random.default_rng(0)
-        got = floor(self.starts, x, self._moved, _DRAWS, self.resolution, rng)
+        got = floor(self.starts, x, self._moved, DRAWS, self.resolution, rng)
         return got[:, self.lead + 1 :].mean((0, 1))
 
     def _fitted(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,6 +7,7 @@ import numpy as np
 
 from easi_jax.data.activations import activation_guess, activation_spread
 from easi_jax.data.recording import Run
+from easi_jax.data.unmeasured import start_spread
 from easi_jax.data.windows import lead_rows
 from easi_jax.estimation.starts import Starts
 from easi_jax.gap.predictor import Predictor
@@ -39,17 +40,25 @@ def window_starts(
         m: the model that was recorded.
         runs: that say how far activations may be off.
         scales: of the motion in them.
-        noise: of measured positions, ``(nv,)``, above zero.
+        noise: of measured positions, ``(nv,)``, above zero; infinite for those that
+            nobody measured.
         blocks: of the predictor's windows; all where None.
         count: of them that are no fillers; all where None.
     """
     act = np.zeros(m.na)
     if m.na:
         act = activation_spread(m, runs, [activation_guess(m, run) for run in runs])
-    position = np.maximum(_NOISES * noise, _MOTION * scales.position)
+    own, seen = len(predictor.neutral), np.isfinite(noise)
+    known = np.where(seen, noise, 0.0)
+    position = np.maximum(_NOISES * known, _MOTION * scales.position)
+    # Nothing but the model speaks of what nobody measured.
+    given = np.concatenate([position, scales.speed])
+    free = start_spread(m, runs)
+    spread = np.where(np.isfinite(free), free, given)
     small, part = _DIFFERENCE
-    near = np.maximum(small * scales.position, 3.0 * noise)
-    own = len(predictor.neutral)
+    near = np.maximum(small * scales.position, 3.0 * known)
+    near = np.concatenate([near, part * scales.speed])
+    step = np.where(np.isfinite(free), part * spread, near)
 
     def simulate(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
         return predictor.errors(x[..., :own], blocks, moved)[:, :count]
@@ -57,7 +66,7 @@ def window_starts(
     return Starts(
         simulate,
         noise,
-        np.concatenate([position, scales.speed, act]),
+        np.concatenate([spread, act]),
         2 * lead_rows(runs[0].dt) + 1,
-        np.concatenate([near, part * scales.speed, part * act]),
+        np.concatenate([step, part * act]),
     )
