@@ -122,7 +122,7 @@ def test_results_are_not_overwritten(
     assert "--overwrite" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("after", [5, pytest.param(12, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("after", [2, pytest.param(4, marks=pytest.mark.slow)])
 @pytest.mark.fault("killed (signal 9), then resumed")
 def test_a_stopped_analysis_goes_on(
     after: int,
