@@ -5,6 +5,7 @@
 Held-out windows take part in none but the last.
 """
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -185,15 +186,16 @@ class Analysis:
     @property
     def key(self) -> str:
         """A digest of all that the results depend on, for a `Journal`."""
-        windows, held = vars(self.fit_windows), vars(self.held_out.windows)
+        logs = [(run.qpos, run.ctrl, run.time) for run in self.runs]
+        windows = self.fit_windows, self.held_out.windows
         model = np.zeros(mujoco.mj_sizeModel(self.m), np.uint8)
         mujoco.mj_saveModel(self.m, None, model)
         return key_of(
             model,
             self.fixed,
             *(repr(p) for p in self.space.parameters),
-            *windows.values(),
-            *held.values(),
+            *itertools.chain(*logs),
+            *(at for some in windows for at in (some.run, some.row)),
             self.noise,
             self.predictor.simulator.dt,
             self.predictor.steps,
