@@ -7,7 +7,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from mujoco.mjx._src.collision_driver import geom_pairs
+from mujoco.mjx._src.collision_driver import _COLLISION_FUNC, geom_pairs
 
 from easi_jax.model.quantities import direct_solref
 
@@ -52,6 +52,19 @@ class ContactPair:
 def pair_ids(m: Any) -> list[Pair]:
     """Geoms of every pair that may touch; a pair's place in it is its number."""
     return [(int(a), int(b)) for a, b, _ in geom_pairs(m)]
+
+
+def contacts(m: Any) -> tuple[int, int]:
+    """How many contacts MJX computes at every step, touching or not: with planes, and
+    between other geoms. A pair that MJX lacks counts once."""
+    counts = [0, 0]
+    if m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+        return 0, 0
+    for pair in pair_ids(m):
+        types: Any = tuple(int(m.geom_type[g]) for g in pair)
+        other = mujoco.mjtGeom.mjGEOM_PLANE not in types
+        counts[other] += getattr(_COLLISION_FUNC.get(types), "ncon", 1)
+    return counts[0], counts[1]
 
 
 def geom_name(m: Any, g: int) -> str:

@@ -4,18 +4,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import mujoco
 import numpy as np
+from mujoco import mjx
 
 from easi_jax.devices.runtime import on_cpu
-from easi_jax.model.contact_pairs import pair_ids
+from easi_jax.model.contact_pairs import contacts
 
 if TYPE_CHECKING:
     from easi_jax.simulation.simulator import Simulator
 
 # Seconds of one core: for any program, and besides for each degree of freedom to the
-# power of 1.5 and pair of geoms (benchmarks/results/compile_times.json, of arms with up
-# to twelve joints). Effects take no time that could be measured.
-CONSTANTS = (0.62, 0.901, 3.21)
+# power of 1.5, contact with a plane times degrees of freedom, and other contact
+# (benchmarks/results/compile_times.json: arms with up to twelve joints, and single
+# bodies). Effects take no time that could be measured.
+CONSTANTS = (0.35, 0.8, 0.5, 4.33)
 
 
 @dataclass(frozen=True)
@@ -24,30 +27,32 @@ class Size:
 
     Attributes:
         joints: degrees of freedom.
-        pairs: of geoms that are compiled.
+        on_planes: contacts with planes that MJX computes at every step.
+        others: contacts that it computes between other shapes.
     """
 
     joints: int
-    pairs: int
+    on_planes: int
+    others: int
 
 
-def size_of(simulator: "Simulator") -> Size:
-    """The size of a simulator of MJX."""
-    return Size(simulator.mj_model.nv, len(pair_ids(simulator.base.mjx)))
+def size_of(m: mujoco.MjModel | mjx.Model) -> Size:
+    """The size of a model."""
+    return Size(int(m.nv), *contacts(m))
 
 
 def fitted(sizes: Sequence[Size], seconds: Sequence[float]) -> list[float]:
-    """The constants that fit times best, as shares of each; none is negative."""
-    from scipy.optimize import nnls
+    """The constants by which times are off by the smallest factors; all positive."""
+    from scipy.optimize import least_squares
 
-    times = np.asarray(seconds, float)
-    rows = np.array([_terms(s) for s in sizes])
-    found, _ = nnls(rows / times[:, None], np.ones(len(times)))
-    return [float(x) for x in found]
+    rows, times = np.array([_terms(s) for s in sizes]), np.asarray(seconds, float)
+    start = np.zeros(rows.shape[1])
+    found = least_squares(lambda x: np.log(rows @ np.exp(x) / times), start).x
+    return [float(x) for x in np.exp(found)]
 
 
 def _terms(s: Size) -> tuple[float, ...]:
-    return 1.0, s.joints**1.5, s.pairs
+    return 1.0, s.joints**1.5, s.on_planes * s.joints, s.others
 
 
 def expected_of(size: Size) -> float:
@@ -61,4 +66,4 @@ def expected(simulator: "Simulator") -> float | None:
     """
     if simulator.engine != "mjx" or not on_cpu():
         return None
-    return expected_of(size_of(simulator))
+    return expected_of(size_of(simulator.base.mjx))
