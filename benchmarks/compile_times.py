@@ -2,8 +2,8 @@
 
     python -m benchmarks.compile_times
 
-A replay of 50 control steps by 128 simulations is compiled with the options of a search
-and without the cache. Arms differ in joints, in capsules that the hand may touch, and
+A replay of 50 control steps by as many simulations as a search runs at once (128; more
+than eight degrees of freedom: 32) is compiled with its options and without the cache. Arms differ in joints, in capsules that the hand may touch, and
 in effects of each joint; bodies differ in shape, in how they are guided, and in what
 they lie on. Then the program runs, and beside it native MuJoCo the same replay. Ten
 minutes or so on two cores. Times are of the processor, tracing included, so that other
@@ -35,7 +35,8 @@ BODIES = (
     *(("free", "sphere", "plane"), ("free", "capsule", "plane")),
     ("free", "box", "plane"),
 )
-_STEPS, _BATCH, _PHYSICS_STEPS = 50, 128, 5
+_STEPS, _PHYSICS_STEPS = 50, 5
+_NATIVE = 128  # simulations
 _RUN = 1.0  # s of the processor that runs are repeated for
 _EFFECTS = ("drag.j", "lag.a")
 _GUIDES = {
@@ -136,11 +137,12 @@ def replayed(m: Any, effects: int, engine: Any) -> tuple[float, float]:
         return at_once[0] if at_once else jax.lax.scan(step, first, ctrl)[1]
 
     options = runtime.fast_loops() | runtime.quick_compile()
+    n = simulator.batch if engine == "mjx" else _NATIVE
     given = (
-        jnp.ones((_BATCH, len(vary))),
-        jnp.tile(jnp.asarray(m.qpos0), (_BATCH, 1)),
-        jnp.zeros((_BATCH, m.nv)),
-        jnp.zeros((_BATCH, _STEPS, m.nu)),
+        jnp.ones((n, len(vary))),
+        jnp.tile(jnp.asarray(m.qpos0), (n, 1)),
+        jnp.zeros((n, m.nv)),
+        jnp.zeros((n, _STEPS, m.nu)),
     )
     begin = time.process_time()
     program = jax.jit(jax.vmap(replay), compiler_options=options)
@@ -149,7 +151,7 @@ def replayed(m: Any, effects: int, engine: Any) -> tuple[float, float]:
     while spent < _RUN:
         program(*given).block_until_ready()
         runs, spent = runs + 1, time.process_time() - ready
-    each = spent / (runs * _BATCH * _STEPS * _PHYSICS_STEPS)
+    each = spent / (runs * n * _STEPS * _PHYSICS_STEPS)
     return ready - begin, each
 
 
@@ -208,7 +210,7 @@ def paragraphs(result: dict[str, Any]) -> list[str]:
     return [
         f"`{result['command']}`: a replay by MJX, seconds of one core; what a command "
         "says beforehand is the fit. Contacts are those that MJX computes at every "
-        "step. A step is one of 128 simulations, microseconds of one core.",
+        "step. A step is one of a simulation, microseconds of one core.",
         table(rows, columns),
     ]
 

@@ -3,12 +3,15 @@
 import json
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
+from mujoco import mjx
 
-from benchmarks.compile_times import arm
-from easi_jax.model.contact_pairs import pair_ids
+from benchmarks.compile_times import arm, body
+from benchmarks.parity_models import feature_models
 from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation import engine
 from easi_jax.simulation.compile_time import (
     CONSTANTS,
     Size,
@@ -24,20 +27,53 @@ RESULT = Path(__file__).parents[3] / "benchmarks" / "results" / "compile_times.j
 
 
 def test_the_fit_finds_what_made_the_times() -> None:
-    sizes = [Size(j, p) for j in (1, 3, 6) for p in (0, 4)]
+    sizes = [Size(j, p, o) for j in (1, 3, 6) for p in (0, 4) for o in (0, 3)]
     times = [expected_of(s) for s in sizes]
-    np.testing.assert_allclose(fitted(sizes, times), CONSTANTS, rtol=1e-6)
+    np.testing.assert_allclose(fitted(sizes, times), CONSTANTS, rtol=1e-5)
 
 
 def test_the_constants_are_those_of_the_committed_measurement() -> None:
     told = json.loads(RESULT.read_text())
     assert told["constants"] == pytest.approx(CONSTANTS, rel=0.02, abs=0.01)
-    rows = told["rows"]
-    sizes = [Size(r["joints"], r["pairs"]) for r in rows]
-    times = [r["seconds"] for r in rows]
-    assert told["constants"] == pytest.approx(fitted(sizes, times))
+    sizes = [Size(**r["size"]) for r in told["rows"]]
+    times = [r["seconds"] for r in told["rows"]]
+    assert told["constants"] == pytest.approx(fitted(sizes, times), rel=1e-4)
     off = np.array([expected_of(s) for s in sizes]) / times
-    assert off.min() > 0.5 and off.max() < 2
+    assert off.min() > 0.4 and off.max() < 2.5
+
+
+@pytest.mark.parametrize(
+    ("shape", "floor", "on_planes", "others"),
+    [
+        ("sphere", "plane", 1, 0),
+        ("capsule", "plane", 2, 0),
+        ("box", "plane", 4, 0),
+        ("mesh", "plane", 4, 0),
+        ("sphere", "box", 0, 1),
+        ("box", "box", 0, 4),
+    ],
+)
+def test_contacts_are_counted_as_mjx_makes_them(
+    shape: str, floor: str, on_planes: int, others: int
+) -> None:
+    m = body("free", shape, floor)
+    assert size_of(m) == Size(6, on_planes, others)
+    assert mjx.make_data(m, impl="jax")._impl.ncon == on_planes + others
+    m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    assert size_of(m) == Size(6, 0, 0)
+
+
+def test_auto_goes_by_contacts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One pair of geoms either way; nothing is compiled."""
+    sphere, box = (
+        mujoco.MjModel.from_xml_string(feature_models()[f"contact plane {shape}"])
+        for shape in ("sphere", "box")
+    )
+    assert engine.by_size(sphere) == ("mjx", "a small robot")
+    name, why = engine.by_size(box)
+    assert name == "mujoco" and "4 contacts" in why
+    monkeypatch.setattr(engine, "on_cpu", lambda: False)
+    assert engine.by_size(box)[0] == "mjx"
 
 
 def test_pairs_that_are_left_out_cost_nothing_and_native_compiles_none() -> None:
@@ -46,7 +82,7 @@ def test_pairs_that_are_left_out_cost_nothing_and_native_compiles_none() -> None
     still = Logged(np.zeros((2, 2)), np.zeros((2, 2)), np.zeros((2, 2)))
     every = Simulator(m, space)
     fewer = Simulator(m, space, logged=still)
-    assert size_of(every) == Size(2, len(pair_ids(m))) and pair_ids(m)
-    assert size_of(fewer) == Size(2, 0)
+    assert size_of(every.base.mjx) == size_of(m) == Size(2, 0, 3)
+    assert size_of(fewer.base.mjx) == Size(2, 0, 0)
     assert (expected(fewer) or 0) < (expected(every) or 0)
     assert expected(Simulator(m, space, engine="mujoco")) is None
