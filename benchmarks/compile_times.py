@@ -3,11 +3,12 @@
     python -m benchmarks.compile_times
 
 A replay of 50 control steps by as many simulations as a search runs at once (128; more
-than eight degrees of freedom: 32) is compiled with its options and without the cache. Arms differ in joints, in capsules that the hand may touch, and
-in effects of each joint; bodies differ in shape, in how they are guided, and in what
-they lie on. Then the program runs, and beside it native MuJoCo the same replay. Ten
-minutes or so on two cores. Times are of the processor, tracing included, so that other
-work on the machine does not count. The fit to them has the constants of
+than eight degrees of freedom: 32) is compiled with its options and without the cache.
+Arms differ in joints, in capsules that the hand may touch, and in effects of each
+joint; bodies differ in shape, in how they are guided, and in what they lie on. Then the
+program runs, and beside it native MuJoCo the same replay. Ten minutes or so on two
+cores. Times are of the processor, tracing included, so that other work on the machine
+does not count. The fit to them has the constants of
 `easi_jax.simulation.compile_time`. Written to ``results/compile_times.json``, shown by
 `benchmarks.summary`.
 """

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
 from mujoco import batch as mujoco_batch
 
 from easi_jax.devices.runtime import cores
@@ -544,6 +545,27 @@ def _crossing(x: np.ndarray, like: jax.ShapeDtypeStruct) -> np.ndarray:
     return x.view(np.uint32).reshape(*x.shape, 2)
 
 
+@dataclass(frozen=True)
+class _InPlace:
+    """A call that writes its results into a program's own memory."""
+
+    call: _Call
+
+    def __call__(self, _: Any, out: Sequence[Any], *given: Any) -> None:
+        for to, x in zip(out, self.call(*given), strict=True):
+            np.asarray(to)[...] = x
+
+
+def _calling(call: _Call, *args: Any) -> tuple[jax.Array, ...]:
+    """The call in a program. `jax.pure_callback` puts each argument on a device first,
+    which takes as long as hundreds of steps of a small robot; on a CPU numpy sees the
+    program's memory."""
+    if jax.default_backend() != "cpu":
+        return jax.pure_callback(call, call.crossing, *args, vmap_method="expand_dims")
+    calling = buffer_callback(_InPlace(call), call.crossing, vmap_method="expand_dims")
+    return calling(*args)
+
+
 def run(
     model: NativeModel,
     state: Any,
@@ -598,12 +620,7 @@ def run(
         read,
         stage,
     )
-    crossed = jax.pure_callback(
-        call,
-        call.crossing,
-        *jax.tree.map(_words, (model.changed, given)),
-        vmap_method="expand_dims",
-    )
+    crossed = _calling(call, *jax.tree.map(_words, (model.changed, given)))
     *physics, qpos, qvel, sensed = (
         jax.lax.bitcast_convert_type(x, to.dtype) if to.dtype == jnp.float64 else x
         for x, to in zip(crossed, out, strict=True)
