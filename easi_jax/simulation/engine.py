@@ -17,7 +17,8 @@ import numpy as np
 
 from easi_jax.devices.runtime import on_cpu
 from easi_jax.errors import UserError, nearest
-from easi_jax.model.contact_pairs import Pair, pair_ids
+from easi_jax.model.contact_pairs import Pair
+from easi_jax.simulation.compile_time import expected_of, size_of
 from easi_jax.simulation.guard import Deviation, compare, random_states
 from easi_jax.simulation.logged import Logged
 from easi_jax.simulation.native import failures
@@ -25,14 +26,14 @@ from easi_jax.simulation.native import failures
 Engine = Literal["mjx", "mujoco"]
 CHOICES = ("auto", "mjx", "mujoco")
 
-# On CPU, where MJX compiles for long or steps more slowly than MuJoCo C: more degrees
-# of freedom than are written out by entries, or more pairs of geoms that may touch.
-# benchmarks/engines.py, 300 models on 2 cores: Cartpole (2) is 149 times as fast on
-# MJX; Ant (14) has its first result after 45 s on MJX and 0.6 s, and 0.8 times the
-# steps a second on MJX; Ballbalance (18) 56 and 0.6 s, 0.5 times; Go2 (18) 59 and 0.6
-# s, 0.6 times. Only with a policy is Ant quicker on MJX, 1.3 times once it is compiled.
-LARGEST = 8
-MOST_PAIRS = 4
+# Seconds of one core that MJX may take to compile on a CPU, as told beforehand. What is
+# told to compile in less runs 4 to 130 times as fast on MJX, what in more 0.06 to 1.2
+# times (benchmarks/results/compile_times.json), for code gets too long to be written
+# out. benchmarks/engines.py, 300 models on 2 cores: Cartpole is 149 times as fast on
+# MJX; Ant has its first result after 45 s on MJX and 0.6 s, and 0.8 times the steps a
+# second on MJX; Ballbalance 56 and 0.6 s, 0.5 times; Go2 59 and 0.6 s, 0.6 times. Only
+# with a policy is Ant quicker on MJX, 1.3 times once it is compiled.
+LONGEST = 12.0
 
 
 class EngineError(UserError):
@@ -193,12 +194,15 @@ def by_size(m: mujoco.MjModel) -> tuple[Engine, str]:
     """The engine that is the quicker one, whether MJX is right or not."""
     if not on_cpu():
         return "mjx", "there is an accelerator"
-    if m.nv > LARGEST:
-        return "mujoco", f"{m.nv} degrees of freedom on a CPU"
-    pairs = len(pair_ids(m))
-    if pairs > MOST_PAIRS:
-        return "mujoco", f"{pairs} pairs of geoms that may touch, on a CPU"
-    return "mjx", "a small robot"
+    size = size_of(m)
+    seconds = expected_of(size)
+    if seconds <= LONGEST:
+        return "mjx", "a small robot"
+    contacts = size.on_planes + size.others
+    return "mujoco", (
+        f"{size.joints} degrees of freedom and {contacts} contacts on a CPU, which MJX "
+        f"compiles for about {seconds:.0f} s"
+    )
 
 
 _checks: dict[bytes, Deviation] = {}  # by what is compared

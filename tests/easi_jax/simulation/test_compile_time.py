@@ -6,7 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from mujoco import mjx
+from mujoco.mjx._src.collision_driver import make_condim
 
 from benchmarks.compile_times import arm, body
 from benchmarks.parity_models import feature_models
@@ -58,20 +58,19 @@ def test_contacts_are_counted_as_mjx_makes_them(
 ) -> None:
     m = body("free", shape, floor)
     assert size_of(m) == Size(6, on_planes, others)
-    assert mjx.make_data(m, impl="jax")._impl.ncon == on_planes + others
+    assert make_condim(m).size == on_planes + others
     m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     assert size_of(m) == Size(6, 0, 0)
 
 
 def test_auto_goes_by_contacts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One pair of geoms either way; nothing is compiled."""
-    sphere, box = (
-        mujoco.MjModel.from_xml_string(feature_models()[f"contact plane {shape}"])
-        for shape in ("sphere", "box")
-    )
-    assert engine.by_size(sphere) == ("mjx", "a small robot")
+    """One pair of geoms in each; nothing is compiled."""
+    assert engine.by_size(body("in a plane", "sphere", "plane"))[0] == "mjx"
+    text = feature_models()["contact plane box"]
+    box = mujoco.MjModel.from_xml_string(text)
     name, why = engine.by_size(box)
     assert name == "mujoco" and "4 contacts" in why
+    assert engine.by_size(body("upright", "box", "box"))[0] == "mujoco"
     monkeypatch.setattr(engine, "on_cpu", lambda: False)
     assert engine.by_size(box)[0] == "mjx"
 
