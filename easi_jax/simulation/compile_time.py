@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -11,14 +11,11 @@ from mujoco import mjx
 from easi_jax.devices.runtime import on_cpu
 from easi_jax.model.contact_pairs import contacts
 
-if TYPE_CHECKING:
-    from easi_jax.simulation.simulator import Simulator
-
 # Seconds of one core: for any program, and besides for each degree of freedom to the
 # power of 1.5, contact with a plane times degrees of freedom, and other contact
 # (benchmarks/results/compile_times.json: arms with up to twelve joints, and single
 # bodies). Effects take no time that could be measured.
-CONSTANTS = (0.35, 0.8, 0.5, 4.33)
+CONSTANTS = (0.78, 0.778, 0.708, 4.19)
 
 
 @dataclass(frozen=True)
@@ -60,8 +57,8 @@ def expected_of(size: Size) -> float:
     return float(np.dot(CONSTANTS, _terms(size)))
 
 
-def expected(simulator: "Simulator") -> float | None:
-    """Seconds until a program that simulates is compiled; None where that was not
+def expected(simulator: Any) -> float | None:
+    """Seconds until a program of a `Simulator` is compiled; None where that was not
     measured (accelerators), or there is no physics to compile (``mujoco``).
     """
     if simulator.engine != "mjx" or not on_cpu():
