@@ -50,7 +50,7 @@ class Servo(Simulator):
     def model(self, theta: jax.Array) -> Any:
         return theta
 
-    def start(self, qpos: jax.Array, qvel: jax.Array) -> Physics:
+    def start(self, qpos: jax.Array, qvel: jax.Array, **_: Any) -> Physics:
         return Physics(qpos, qvel, jnp.zeros(0), jnp.zeros(1))
 
     def step(self, model: Any, state: Physics, ctrl: jax.Array) -> Physics:
