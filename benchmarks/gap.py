@@ -36,6 +36,8 @@ class Config:
     """The hidden effect, drawn where not given; give --out gap_contacts.jsonl or so."""
     mechanism: str = ""
     """The machine, drawn where not given."""
+    engine: str = "auto"
+    """Which engine simulates: auto, mjx or mujoco."""
     out: Path = RESULTS / "gap_cases.jsonl"
     """Where a line for each case is added."""
 
