@@ -1,0 +1,356 @@
+"""Whether a gap is called a gap, and only then: models that are right, or nearly.
+
+    python -m benchmarks.floor
+
+Machines of one or two joints are recorded by MuJoCo itself, with the timestep and the
+integrator of the owner's model, at control rates from 50 to 1,000 Hz, slow and fast,
+their readings plain, with velocities (also late ones) or in coarse steps; one drive has
+an activation, one joint is read by nobody, one machine is driven by its own readings,
+one runs against its end stop. ``train.gap`` then sees the true model and the logs: its
+gap should be its floor, and the verdict ``no_gap``. With ``--hidden`` the machine has
+an effect that the model lacks, as strong as raises the gap to about three floors, which
+should be found. One line a case is added to ``floor.jsonl``; a run that was stopped
+goes on, and several share the work by ``--shard``.
+"""
+
+import dataclasses
+import itertools
+import json
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from benchmarks._cells import Share, run_cells
+from benchmarks._common import RESULTS
+from benchmarks._page import Section, met, table
+from train._command import main
+
+RATES = (50, 100, 250, 500, 1000)  # Hz
+SPEEDS = {"slow": 1.0, "fast": 3.0}  # of commands
+READINGS = ("plain", "velocities", "late velocities", "coarse")
+MACHINES = ("pendulum", "arm", "servo", "filtered", "coupled", "closed loop", "stop")
+EFFECTS = ("coulomb_friction", "constant_force", "armature", "actuator_gain")
+NEAR, WIDE, RIGHT, POWER = 0.03, (0.85, 1.2), 0.9, 0.8  # goals
+_SECONDS, _RUNS = 8.0, 3
+_NOISE, _COARSE = 1e-3, 4e-3  # rad; the step of coarse readings, noise of a tenth of it
+_SPEED_NOISE, _LATE = 0.02, 0.012  # rad/s, s
+_HORIZON, _TIMES = 0.2, 3.0  # s; floors that a hidden effect raises the gap to
+_STEP = 0.002  # s, of the physics at most
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A machine, how it is recorded, and what its model lacks."""
+
+    machine: str
+    rate: int
+    speed: str
+    reading: str
+    hidden: str
+    seed: int
+
+    @property
+    def key(self) -> str:
+        """Its name."""
+        hidden = f", {self.hidden}" if self.hidden else ""
+        return (
+            f"{self.machine}, {self.rate} Hz, {self.speed}, {self.reading}{hidden}, "
+            f"{self.seed}"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Config(Share):
+    """Asks train.gap about machines whose model is right, or lacks one effect."""
+
+    hidden: bool = False
+    """Whether the machines have an effect that the model lacks."""
+    seeds: int = 1
+    """Of each machine, rate, speed and reading."""
+    engine: str = "mujoco"
+    """Which engine simulates: auto, mjx or mujoco."""
+    out: Path = RESULTS / "floor.jsonl"
+    """Where a line for each case is added."""
+
+
+def cases(config: Config) -> list[Case]:
+    """Machines in turns, so that any first part of them is a fair one."""
+    drawn = itertools.product(
+        range(config.seeds), READINGS, SPEEDS, EFFECTS if config.hidden else ("",)
+    )
+    out = []
+    for k, (seed, reading, speed, hidden) in enumerate(drawn):
+        for i, machine in enumerate(MACHINES):
+            rates = RATES if not config.hidden else (RATES[(i + k) % len(RATES)],)
+            out += [Case(machine, r, speed, reading, hidden, seed) for r in rates]
+    order = np.random.default_rng(0).permutation(len(out))
+    return [out[i] for i in order]
+
+
+def mjcf(machine: str, timestep: float, hidden: str = "", size: float = 0.0) -> str:
+    """The machine's model; ``hidden`` is what it has besides, of a ``size``."""
+    motor = '<motor name="m" joint="a"/>'
+    drives = {
+        "servo": '<position name="m" joint="a" kp="8" kv="0.4"/>',
+        "filtered": (
+            '<general name="m" joint="a" dyntype="filterexact" dynprm="0.04" '
+            'gainprm="8" biastype="affine" biasprm="0 -8 -0.4"/>'
+        ),
+    }
+    drive, second, coupling = drives.get(machine, motor), "", ""
+    if machine in ("arm", "coupled", "closed loop"):
+        second = (
+            '<body pos="0 0 -0.35"><joint name="b" axis="0 -1 0" damping="0.05"/>'
+            '<geom type="capsule" fromto="0 0 0 0 0 -0.25" size="0.02" mass="0.3"/>'
+            "</body>"
+        )
+    if machine == "coupled":
+        coupling = '<equality><joint joint1="b" joint2="a" polycoef="0 -0.6 0 0 0"/></equality>'
+    limit = 'limited="true" range="-1 0.6"' if machine == "stop" else ""
+    joint = {"coulomb_friction": "frictionloss", "armature": "armature"}.get(hidden)
+    more = f'{joint}="{size}"' if joint else ""
+    m = f"""
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="{timestep}" integrator="implicitfast"/>
+  <worldbody><body>
+    <joint name="a" axis="0 -1 0" damping="0.15" {limit} {more}/>
+    <geom type="capsule" fromto="0 0 0 0 0 -0.35" size="0.02" mass="0.5"/>
+    {second}
+  </body></worldbody>
+  {coupling}
+  <actuator>{drive}</actuator>
+</mujoco>"""
+    return m
+
+
+def _machine(case: Case, size: float = 0.0) -> tuple[mujoco.MjModel, float, float]:
+    """The real one, a torque that is always there, and a gain of its commands."""
+    dt = 1.0 / case.rate
+    step = dt / int(np.ceil(dt / _STEP - 1e-9))
+    own = case.hidden in ("coulomb_friction", "armature")
+    xml = mjcf(case.machine, step, case.hidden if own else "", size)
+    torque = size if case.hidden == "constant_force" else 0.0
+    gain = 1.0 - size if case.hidden == "actuator_gain" else 1.0
+    return mujoco.MjModel.from_xml_string(xml), torque, gain
+
+
+def _recorded(case: Case, seed: int, size: float) -> dict[str, np.ndarray]:
+    """Columns of one run's log."""
+    m, torque, gain = _machine(case, size)
+    rng, d, dt = np.random.default_rng(seed), mujoco.MjData(m), 1.0 / case.rate
+    t = dt * np.arange(round(_SECONDS * case.rate))
+    wave, phase = rng.uniform(0.3, 1.5, 3), rng.uniform(0, 2 * np.pi, 3)
+    wave = wave * (1.5 if case.speed == "fast" else 1.0)
+    ahead = np.sin(2 * np.pi * wave * t[:, None] + phase).sum(1) / 3
+    ahead = ahead * SPEEDS[case.speed]
+    white = _NOISE if case.reading != "coarse" else 0.1 * _COARSE
+    q, v, read, sent = [], [], [], []
+    d.qfrc_applied[0] = torque
+    for u in ahead:
+        seen = d.qpos + white * rng.normal(size=m.nq)
+        if case.reading == "coarse":
+            seen = np.round(seen / _COARSE) * _COARSE
+        if case.machine == "closed loop":
+            u = 3.0 * (0.4 * u - seen[0])
+        q.append(d.qpos.copy())
+        v.append(d.qvel.copy())
+        read.append(seen)
+        sent.append(u)
+        d.ctrl[:] = gain * u
+        for _ in range(round(dt / m.opt.timestep)):
+            mujoco.mj_step(m, d)
+    out = {"time": t, "qpos.a": np.array(read)[:, 0], "ctrl.m": np.array(sent)}
+    speed = np.array(v)
+    if "velocities" in case.reading:
+        if case.reading.startswith("late"):
+            late = [np.interp(t - _LATE, t, x) for x in speed.T]
+            speed = np.stack(late, 1)
+        speed = speed + _SPEED_NOISE * rng.normal(size=speed.shape)
+        out["qvel.a"] = speed[:, 0]
+    if m.nq > 1 and case.machine != "coupled":
+        out["qpos.b"] = np.array(read)[:, 1]
+        if "qvel.a" in out:
+            out["qvel.b"] = speed[:, 1]
+    return out
+
+
+def _strength(case: Case) -> float:
+    """Of the hidden effect, such that predictions over a horizon are off by three times
+    what noise makes of them; by bisection of its logarithm."""
+    if not case.hidden:
+        return 0.0
+    noise = _NOISE if case.reading != "coarse" else _COARSE / np.sqrt(12)
+    dt = 1.0 / case.rate
+    steps = round(_HORIZON * case.rate)
+
+    def times(size: float) -> float:
+        plain = dataclasses.replace(case, hidden="")
+        model, _, _ = _machine(plain)
+        real, torque, gain = _machine(case, size)
+        d, e, rng = mujoco.MjData(real), mujoco.MjData(model), np.random.default_rng(0)
+        parts, off = round(dt / real.opt.timestep), []
+        d.qfrc_applied[0] = torque
+        wave = rng.uniform(0.5, 2.0, 2)
+        for k in range(round(6.0 * case.rate)):
+            if k % steps == 0:
+                e.qpos[:], e.qvel[:], e.act[:] = d.qpos, d.qvel, d.act
+            u = SPEEDS[case.speed] * np.sin(2 * np.pi * wave * k * dt).mean()
+            if case.machine == "closed loop":
+                u = 3.0 * (0.4 * u - d.qpos[0])
+            d.ctrl[:], e.ctrl[:] = gain * u, u
+            for _ in range(parts):
+                mujoco.mj_step(real, d)
+                mujoco.mj_step(model, e)
+            off.append(d.qpos[0] - e.qpos[0])
+        # Start and noise of a perfect model come to some 1.4 times the noise.
+        return float(
+            np.sqrt(np.mean(np.square(off)) + (1.4 * noise) ** 2) / 1.4 / noise
+        )
+
+    low, high = np.log(1e-6), np.log(0.9)
+    for _ in range(24):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if times(np.exp(middle)) < _TIMES else (low, middle)
+    return float(np.exp(low))
+
+
+def solve(case: Case) -> dict[str, Any]:
+    """What ``train.gap`` says of a case."""
+    from train import gap
+
+    size = _strength(case)
+    m, *_ = _machine(dataclasses.replace(case, hidden=""))
+    begin = 1000 * (case.seed + 1) + 10 * MACHINES.index(case.machine)
+    with tempfile.TemporaryDirectory() as folder:
+        at = Path(folder)
+        model = at / "model.xml"
+        model.write_text(mjcf(case.machine, m.opt.timestep))
+        data = []
+        for k in range(_RUNS):
+            columns = _recorded(case, begin + k, size)
+            path = at / f"run{k + 1}.csv"
+            np.savetxt(
+                path,
+                np.stack([*columns.values()], 1),
+                fmt="%.9g",
+                delimiter=",",
+                header=",".join(columns),
+                comments="",
+            )
+            data.append(path)
+        began = time.perf_counter()
+        asked = gap.Config(model=str(model), data=tuple(data), out=at / "gap")
+        gap.run(asked)
+        seconds = time.perf_counter() - began
+        told = json.loads((at / "gap" / "gap.json").read_text())
+    sizes = {k: (v["after"], v["floor"]) for k, v in told["gap_si"].items()}
+    left_out = {row["at"] for row in told["ignored"]}
+    return {
+        "strength": size,
+        "verdict": told["verdict"],
+        "named": [f"{e['effect']}@{e['at']}" for e in told["effects"]],
+        "gap": told["gap"],
+        "ratio": told["gap"]["after"] / told["gap"]["floor"],
+        "refit_ratio": told["gap"]["refit"] / told["gap"]["floor"],
+        "channels": {k: a / f for k, (a, f) in sizes.items() if k not in left_out},
+        "seconds": seconds,
+    }
+
+
+def _told(row: dict[str, Any]) -> str:
+    return (
+        f"{row['verdict']}, {', '.join(row['named']) or 'nothing'}; gap "
+        f"{row['ratio']:.2f} floors, {row['seconds']:.0f} s"
+    )
+
+
+def run(config: Config) -> None:
+    """Runs the cases that have no line yet."""
+    run_cells(cases(config), config, solve, _told)
+
+
+# -- the page of results -----------------------------------------------------------
+
+
+def _spread(rows: list[dict[str, Any]]) -> str:
+    ratios = [x for row in rows for x in row["channels"].values()]
+    low, middle, high = np.quantile(ratios, (0.025, 0.5, 0.975))
+    return f"{middle:.2f} ({low:.2f} to {high:.2f})"
+
+
+def _right(rows: list[dict[str, Any]]) -> str:
+    count = sum(row["verdict"] == "no_gap" for row in rows)
+    return f"{count} of {len(rows)}"
+
+
+def _found(row: dict[str, Any]) -> bool:
+    return any(name.split("@")[0] == row["hidden"] for name in row["named"])
+
+
+def paragraphs(rows: list[dict[str, Any]]) -> list[str]:
+    """Of cases without an effect, by each margin; then of those with one."""
+    clean = [row for row in rows if not row["hidden"]]
+    hidden = [row for row in rows if row["hidden"]]
+    said = []
+    margins = {"rate": RATES, "speed": SPEEDS, "reading": READINGS, "machine": MACHINES}
+    if clean:
+        lines = [("all", clean)]
+        for name, values in margins.items():
+            for value in values:
+                some = [row for row in clean if row[name] == value]
+                lines += [(f"{name}: {value}", some)] if some else []
+        ratios = [x for row in clean for x in row["channels"].values()]
+        low, middle, high = np.quantile(ratios, (0.025, 0.5, 0.975))
+        fine = abs(middle - 1) <= NEAR and low >= WIDE[0] and high <= WIDE[1]
+        right = np.mean([row["verdict"] == "no_gap" for row in clean])
+        said += [
+            "`python -m benchmarks.floor`: the model is right, so the gap should be the "
+            f"floor. Over all channels: median within {NEAR} of 1 and 95 % between "
+            f"{WIDE[0]} and {WIDE[1]}: {met(fine)}. `no_gap` in {100 * right:.0f} %, "
+            f"goal {100 * RIGHT:.0f} %: {met(right >= RIGHT)}.",
+            table(
+                lines,
+                {
+                    "cases": lambda line: line[0],
+                    "gap over floor: median (95 %)": lambda line: _spread(line[1]),
+                    "no gap": lambda line: _right(line[1]),
+                    "median seconds": lambda line: (
+                        f"{np.median([row['seconds'] for row in line[1]]):.0f}"
+                    ),
+                },
+            ),
+        ]
+    if hidden:
+        by_effect = {e: [r for r in hidden if r["hidden"] == e] for e in EFFECTS}
+        share = np.mean([_found(row) for row in hidden])
+        said += [
+            "`python -m benchmarks.floor --hidden`: an effect that raises the gap to "
+            f"about three floors. Found by name: {100 * share:.0f} %, goal "
+            f"{100 * POWER:.0f} %: {met(share >= POWER)}.",
+            table(
+                [(e, some) for e, some in by_effect.items() if some],
+                {
+                    "effect": lambda line: line[0],
+                    "named": lambda line: (
+                        f"{sum(map(_found, line[1]))} of {len(line[1])}"
+                    ),
+                    "explained": lambda line: (
+                        f"{sum(r['verdict'] == 'explained' for r in line[1])}"
+                    ),
+                    "gap over floor after": lambda line: _spread(line[1]),
+                },
+            ),
+        ]
+    return said
+
+
+SECTIONS = (Section("### Gap and floor", "floor.jsonl", "floor", paragraphs),)
+
+
+if __name__ == "__main__":
+    main(Config, run, name="benchmarks.floor")
