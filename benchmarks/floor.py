@@ -109,7 +109,8 @@ def mjcf(machine: str, timestep: float, hidden: str = "", size: float = 0.0) -> 
             "</body>"
         )
     if machine == "coupled":
-        coupling = '<equality><joint joint1="b" joint2="a" polycoef="0 -0.6 0 0 0"/></equality>'
+        law = 'joint1="b" joint2="a" polycoef="0 -0.6 0 0 0"'
+        coupling = f"<equality><joint {law}/></equality>"
     limit = 'limited="true" range="-1 0.6"' if machine == "stop" else ""
     joint = {"coulomb_friction": "frictionloss", "armature": "armature"}.get(hidden)
     more = f'{joint}="{size}"' if joint else ""
@@ -309,8 +310,8 @@ def paragraphs(rows: list[dict[str, Any]]) -> list[str]:
         fine = abs(middle - 1) <= NEAR and low >= WIDE[0] and high <= WIDE[1]
         right = np.mean([row["verdict"] == "no_gap" for row in clean])
         said += [
-            "`python -m benchmarks.floor`: the model is right, so the gap should be the "
-            f"floor. Over all channels: median within {NEAR} of 1 and 95 % between "
+            "`python -m benchmarks.floor`: the model is right, so the gap should be "
+            f"the floor. Over all channels: median within {NEAR} of 1 and 95 % between "
             f"{WIDE[0]} and {WIDE[1]}: {met(fine)}. `no_gap` in {100 * right:.0f} %, "
             f"goal {100 * RIGHT:.0f} %: {met(right >= RIGHT)}.",
             table(

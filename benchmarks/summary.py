@@ -411,6 +411,7 @@ SECTIONS = (
     ),
     *crash_summary.SECTIONS,
     *gap_summary.SECTIONS,
+    *floor.SECTIONS,
     *paper_tables.SECTIONS,
     *rivals_summary.SECTIONS,
     *scaling_summary.SECTIONS,
