@@ -19,6 +19,7 @@ from benchmarks import (
     coverage_summary,
     crash_summary,
     engines,
+    floor,
     gap_summary,
     lines,
     paper_tables,
