@@ -14,7 +14,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from easi_jax.data.noise import resolutions
+from easi_jax.data.noise import pooled, resolutions
 from easi_jax.data.recording import Run, physics_steps
 from easi_jax.data.windows import lead_rows
 from easi_jax.errors import UserError
@@ -161,6 +161,7 @@ class Analysis:
         )
         self.resolution = np.max([resolutions(run) for run in self.runs], axis=0)
         given = mj_model, self.predictor, fit, self.scales, self.noise
+        self.noise_is_bound = pooled(fit).is_bound[: mj_model.nv]
         self.fit_starts = window_starts(*given, self.fit_blocks, count)
         self.held_out = HeldOut(
             mj_model,
@@ -616,6 +617,7 @@ class Analysis:
             after=after,
             floor=floor_gap,
             floor_si=np.sqrt(noise),
+            floor_is_bound=self.noise_is_bound & (self.fit_starts.noise >= self.noise),
             open_refit=open_refit,
             open_after=open_after,
             channels=self.channels,

@@ -88,6 +88,8 @@ class Outcome:
             moved.
         disagreeing: runs that the model predicts far worse than the others, with how
             many times.
+        floor_is_bound: channels whose noise cannot be told from motion, so that their
+            floor may be less, ``(nv,)`` bool.
         open_refit, open_after: errors beside their floor.
         horizon: of the predictions [s].
         start: time on either side of a start that it is fitted to [s].
@@ -101,6 +103,7 @@ class Outcome:
     after: Figures
     floor: float
     floor_si: np.ndarray
+    floor_is_bound: np.ndarray
     open_refit: Openness
     open_after: Openness
     channels: Channels

@@ -172,6 +172,8 @@ class GapResult:
         start: time on either side of a start that it is fitted to [s].
         open: channels whose error is surely beyond 1.25 times their floor; the empty
             name stands for all together.
+        bounded: channels whose floor is an upper bound, since their noise cannot be
+            told from motion.
         undecided: channels of which these data do not tell.
         notes: what the user should know.
         where: places of the remaining error, largest first; None where not known.
@@ -201,6 +203,7 @@ class GapResult:
     start: float = 0.0
     open: tuple[str, ...] = ()
     undecided: tuple[str, ...] = ()
+    bounded: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     where: tuple[ErrorPlace, ...] | None = None
     record_next: tuple[str, ...] = ()

@@ -116,6 +116,7 @@ def test_gap_json_holds_every_key_of_the_format() -> None:
     }
     channel = told["gap_si"]["hinge"]
     assert channel["unit"] == "rad" and channel["open"] is True
+    assert "floor_is_upper_bound" not in channel
     assert channel["after_95"] == (0.8, 1.3) and told["gap"]["open"] is False
     assert told["unexplained_share"] == pytest.approx(1.0)
     assert told["undecided"] == ["cart"]

@@ -278,7 +278,8 @@ def _channel_json(
         interval = figures.si_intervals[at] if figures.si_intervals else None
         if interval is not None:
             out[key] = interval
-    return {**out, "floor": floor, "open": name in r.open}
+    marked = {"floor_is_upper_bound": True} if name in r.bounded else {}
+    return {**out, "floor": floor, **marked, "open": name in r.open}
 
 
 def _tables(r: GapResult) -> list[Table]:
