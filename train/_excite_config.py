@@ -13,10 +13,10 @@ class Config(EngineOptions, BaseOptions):
 
     Multisines, chirps, pulses and steps of several sizes are simulated in the model,
     and in the model with mass and friction 20 % wrong either way, and scaled down
-    until every joint stays inside its range less a margin, every command inside its
-    ctrlrange and every force inside its forcerange. Each test is then judged by how
-    far apart its data would set the effects that train.gap knows, in units of sensor
-    noise, with the model's own parameters refitted. The best is written to
+    until every joint (play aside) stays inside its range less a margin, every command
+    inside its ctrlrange and every force inside its forcerange. Each test is then judged
+    by how far apart its data would set the effects that train.gap knows, in units of
+    sensor noise, with the model's own parameters refitted. The best is written to
     commands.csv, with the positions that the model predicts: look at them before you
     play it. excite.json holds the limits, what was tried and what to expect.
 

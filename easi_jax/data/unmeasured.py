@@ -86,13 +86,13 @@ def _placed(m: mujoco.MjModel, j: int, known: Collection[int]) -> str:
             continue
         if other in known:
             return f"coupled to {given_name(m, other)}"
-    if not _is_play(m, j):
+    if not is_play(m, j):
         return ""
     beside = next((k for k in known if _beside(m, j, k)), None)
     return "" if beside is None else f"play beside {given_name(m, beside)}"
 
 
-def _is_play(m: mujoco.MjModel, j: int) -> bool:
+def is_play(m: mujoco.MjModel, j: int) -> bool:
     """Whether joint ``j`` has no drive and can hardly move."""
     if _is_driven(m, j):
         return False
@@ -177,7 +177,7 @@ def with_guess(m: mujoco.MjModel, run: Run) -> Run:
         rest = np.array(m.qpos_spring if sprung else m.qpos0)[at]
         if is_scalar(m, j):
             rest = _within_range(m, j, rest)
-            if sprung and _is_play(m, j):
+            if sprung and is_play(m, j):
                 stiff.append(j)
         qpos[:, at] = rest
     _close(m, run.hidden, stiff, qpos)

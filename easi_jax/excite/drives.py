@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from easi_jax.data.unmeasured import is_play
 from easi_jax.errors import UserError
 from easi_jax.model.joint_space import is_scalar, joint_name, scalar_dofs
 from easi_jax.model.quantities import (
@@ -61,7 +62,8 @@ def limits_of(
     travel: np.ndarray,
     speed: np.ndarray,
 ) -> Limits:
-    """Limits of a model.
+    """Limits of a model; play (`easi_jax.data.unmeasured.is_play`) has none, for it
+    is made to reach its ends.
 
     Args:
         margin: share of a joint's range that is left free at both ends.
@@ -74,6 +76,8 @@ def limits_of(
     assumed = []
     moved_by = driven(m)
     for j, (q, d) in scalar_dofs(m).items():
+        if is_play(m, j):
+            continue
         if m.jnt_limited[j]:
             a, b = m.jnt_range[j]
             low[d], high[d] = a + margin * (b - a), b - margin * (b - a)

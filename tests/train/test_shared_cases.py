@@ -62,8 +62,7 @@ def test_a_joint_that_no_encoder_sees() -> None:
         # estimated yet: no_gap would be right.
         ("filter_act", "log.csv", ("no_gap", "unexplained")),
         ("backlash_joint", "full.csv", ("no_gap",)),
-        # The start of a joint without a reading is not estimated yet.
-        ("backlash_joint", "log.csv", ("no_gap", "unexplained")),
+        ("backlash_joint", "log.csv", ("no_gap",)),
     ],
 )
 def test_a_gap_ends_with_files(

@@ -158,3 +158,14 @@ def test_the_seed_decides() -> None:
         np.testing.assert_array_equal(one, same)
         assert np.abs(one - other).max() > 0.1
         np.testing.assert_array_equal(one[time < 0.99], 0.0)
+
+
+def test_play_may_reach_its_ends() -> None:
+    """A joint without a drive and with hardly a way to go has no limit to keep."""
+    text = ARM.replace("{z}", "-").replace("{low}", "-2.4").replace("{drives}", MOTORS)
+    body = '<body name="fore" pos="0 0 -0.3">'
+    play = '<joint name="play" axis="0 -1 0" range="-0.04 0.04"/>'
+    m = mujoco.MjModel.from_xml_string(text.replace(body, body + play))
+    limits, _ = bench_of(m)
+    free = np.isinf(limits.low) & np.isinf(limits.high)
+    assert np.flatnonzero(free).tolist() == [m.joint("play").dofadr[0]]
