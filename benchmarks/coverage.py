@@ -10,9 +10,11 @@ determine, and how large the error is beside the Cramer-Rao bound of the same da
 line a target is added to ``coverage.jsonl``; a run that was stopped goes on, and
 several share the work by ``--shard`` (the second of four is 2/4).
 
-With ``--late`` the targets' commands come late, which the model knows nothing of: what
-it then says of its parameters is wrong, and has to say so. Lines are in
-``coverage_late.jsonl``.
+With ``--late`` the targets' commands come late, which the model knows nothing of. The
+finish is then made with doubts (`easi_jax.estimation.doubts`), as that of measured logs
+is, and what it says of the parameters has to hold. Lines are in
+``coverage_late.jsonl``. ``--doubts`` shows what doubts cost where commands come in
+time.
 """
 
 import copy
@@ -39,12 +41,14 @@ class Config:
     generations: int = 50
     """Generations of each search."""
     late: float = 0.0
-    """How late the targets' commands come [s]."""
+    """How late the targets' commands come [s]; fitted with doubts, as measured logs."""
+    doubts: bool = False
+    """Fit with doubts where commands come in time, too."""
     shard: str = "1/1"
     """Which part of the targets this process runs."""
     out: Path | None = None
-    """Where a line for each target is added; coverage.jsonl of the results, or
-    coverage_late.jsonl, where not given."""
+    """Where a line for each target is added; coverage.jsonl of the results,
+    coverage_late.jsonl or coverage_doubts.jsonl, where not given."""
 
 
 def run(config: Config) -> None:
@@ -57,7 +61,8 @@ def run(config: Config) -> None:
     if not 0 <= config.late < 1:
         raise UserError(f"--late {config.late}: seconds, 0 or more and below 1")
     part, parts = shard(config.shard)
-    out = config.out or RESULTS / f"coverage{'_late' * (config.late > 0)}.jsonl"
+    kind = "_late" if config.late > 0 else "_doubts" if config.doubts else ""
+    out = config.out or RESULTS / f"coverage{kind}.jsonl"
     mine = list(range(config.targets))[part - 1 :: parts]
     rows = read_rows(out, ("seed",))
     alike = (r for r in rows if r.get("late", 0.0) == config.late)
@@ -86,6 +91,7 @@ def _solver(config: Config) -> Any:
 
     from easi_jax.data.segments import windows
     from easi_jax.devices.runtime import fast_loops
+    from easi_jax.estimation.doubts import doubts_of
     from easi_jax.estimation.identifiability import identifiability
     from easi_jax.estimation.levenberg_marquardt import step_weights
     from easi_jax.estimation.normal_equations import PairedFit
@@ -109,6 +115,8 @@ def _solver(config: Config) -> Any:
         simulator, preset("default", generations=config.generations, horizon=8)
     )
     noise = jnp.asarray(NOISE)
+    doubted = config.late > 0 or config.doubts
+    doubts = doubts_of(simulator, space) if doubted else None
 
     @functools.partial(jax.jit, compiler_options=fast_loops())
     def find(key: jax.Array, truth: jax.Array) -> Any:
@@ -124,12 +132,13 @@ def _solver(config: Config) -> Any:
 
     @jax.jit
     def judge(demos: Any, mean: jax.Array, cov: jax.Array, truth: jax.Array) -> Any:
-        pieces = finish_pieces(simulator, demos)
+        pieces = finish_pieces(doubts.simulator if doubts else simulator, demos)
         found = [
             estimate(
                 *(simulator, search.space, mean, cov, pieces, noise, *how),
                 restarts=RESTARTS,
                 adjusted=True,
+                doubts=doubts,
             ).distribution
             for how in ((False, False), (False, True), (True, True))
         ]

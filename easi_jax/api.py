@@ -26,6 +26,7 @@ from easi_jax.estimation.from_runs import (
     search_data,
 )
 from easi_jax.estimation.identifiability import seed_result
+from easi_jax.estimation.posterior import diverged
 from easi_jax.estimation.problem import HORIZON, Problem, checked_horizon, problem_of
 from easi_jax.export.mjcf import written_machine
 from easi_jax.export.policy import Interface, interface_of, policy_files
@@ -310,8 +311,8 @@ def _estimated(
     (found,) = estimates
     space, unit = search.space, found.distribution.mean
     root = np.asarray(found.distribution.factor, float)
-    if not (np.isfinite(unit).all() and np.isfinite(root).all()):
-        raise UserError("the fit is not finite: try another seed, or fewer parameters")
+    if why := diverged(found):
+        raise UserError(f"the fit diverged ({why}): try another seed")
     result = seed_result(space, unit, root @ root.T, found.hessian)
     errors = ready_errors(problem, space)
     return Estimated(

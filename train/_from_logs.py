@@ -15,8 +15,6 @@ def run(config: Any) -> None:
     """Reads, searches, finishes and reports; ``config`` is that of ``train.easi``."""
     problem = read_problem(config)
     seeds = config.seeds or (0,)
-    import jax
-
     from easi_jax.io.runs.folder import RunFolder
     from easi_jax.search.easi import Search
 
@@ -31,8 +29,7 @@ def run(config: Any) -> None:
     ) as folder:
         from easi_jax.devices.distributed import started
         from easi_jax.estimation.from_runs import ready_errors, ready_finish
-        from train._log_results import write
-        from train._stages import found_check
+        from train._log_results import sound, write
 
         finish = started(
             lambda: ready_finish(
@@ -42,13 +39,11 @@ def run(config: Any) -> None:
         states = _search(folder, config, search, problem, seeds)
         errors = started(lambda: ready_errors(problem, search.space))
         estimates, outliers = finish()(states.result_mean, states.result_cov)
-        for seed, found in zip(seeds, estimates, strict=True):
-            one = jax.tree.map(lambda x: x[None], found.distribution)
-            found_check([seed], search.space.names, one)
+        good, lost = sound(seeds, estimates)
         problem.notes.extend(outliers)
         report = write(
             *(folder, problem, search.space, search.config.generations),
-            *(estimates, seeds, errors()),
+            *(list(good.values()), list(good), errors(), lost),
         )
     from easi_jax.io.report.parameters import parameter_table
 

@@ -1,6 +1,6 @@
 """What an identification from logs leaves in its folder."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,29 @@ if TYPE_CHECKING:
     from easi_jax.model.parameters import ParameterSpace
 
 
+def sound(
+    seeds: Sequence[int], estimates: Sequence["Estimate"]
+) -> tuple[dict[int, "Estimate"], dict[int, str]]:
+    """Estimates by seed, and why other seeds have none.
+
+    Raises:
+        UserError: every fit diverged.
+    """
+    from easi_jax.errors import UserError
+    from easi_jax.estimation.posterior import diverged
+
+    every = dict(zip(seeds, estimates, strict=True))
+    why = {seed: diverged(found) for seed, found in every.items()}
+    lost = {seed: reason for seed, reason in why.items() if reason}
+    if len(lost) == len(every):
+        seed, reason = next(iter(lost.items()))
+        raise UserError(
+            f"the fit diverged (seed {seed}: {reason}): narrow the initial ranges, "
+            "lower the model's timestep, or try another seed"
+        )
+    return {s: e for s, e in every.items() if s not in lost}, lost
+
+
 def write(
     folder: "RunFolder",
     problem: "Problem",
@@ -27,10 +50,12 @@ def write(
     estimates: Sequence["Estimate"],
     seeds: Sequence[int],
     errors_of: Callable[[Any], Any],
+    diverged: Mapping[int, str],
 ) -> "Report":
     """Writes distribution.json, figures and report.html; returns the report.
 
-    ``errors_of`` is of `easi_jax.estimation.from_runs.ready_errors`.
+    ``errors_of`` is of `easi_jax.estimation.from_runs.ready_errors`; ``diverged`` are
+    seeds without a result, and why.
     """
     import numpy as np
 
@@ -62,6 +87,7 @@ def write(
                 "after": {str(s): e for s, e in zip(seeds, errors.after, strict=True)},
                 "noise_floor": errors.floor[best],
             },
+            diverged={str(seed): why for seed, why in diverged.items()},
         ),
     )
     report = logs_report(
@@ -75,7 +101,10 @@ def write(
         problem.noise[seen].tolist(),
         [problem.simulator.state_names[i] for i in seen],
         command="python -m train.easi --data ...",
-        notes=problem.notes,
+        notes=[
+            *(f"seed {s} has no result: {why}" for s, why in diverged.items()),
+            *problem.notes,
+        ],
         config=folder.config,
         versions=versions(),
     )

@@ -26,7 +26,7 @@ def run(config: Config) -> None:
     if config.run is not None:
         read_config(config.run)  # refuses what holds no run
         known = engine_of(config.run) or ("not known", "no simulation was made yet")
-        rows = [("engine", known[0]), ("why", known[1])]
+        rows = [("engine", known[0]), ("why", known[1]), *_ended(config.run)]
         show_table(f"Run {config.run}", ("", "found"), rows)
     found = versions()
     packages = {k: v or "not installed" for k, v in found["packages"].items()}
@@ -49,6 +49,23 @@ def run(config: Config) -> None:
     show_table(
         "Runtime measures", ("measure", "in force", "detail"), measures(state, printed)
     )
+
+
+def _ended(folder: Path) -> list[tuple[str, str]]:
+    """How the fits of a run's seeds ended."""
+    from easi_jax.io.runs.schemas import read_distribution
+
+    path = folder / "distribution.json"
+    if not path.is_file():
+        return []
+    found = read_distribution(path)
+    ends = {s: (r.get("outcome"), r.get("reason")) for s, r in found["seeds"].items()}
+    ends |= {s: ("diverged", why) for s, why in (found.get("diverged") or {}).items()}
+    return [
+        (f"fit of seed {seed}", f"{end}{f' ({why})' if why else ''}")
+        for seed, (end, why) in ends.items()
+        if end
+    ]
 
 
 def measures(state: dict[str, object], printed: str) -> list[tuple[str, str, str]]:

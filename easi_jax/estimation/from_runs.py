@@ -12,12 +12,20 @@ import numpy as np
 from easi_jax.data import unmeasured
 from easi_jax.data.activations import activation_guess, activation_spread
 from easi_jax.data.recording import Run
-from easi_jax.data.segments import to_device
+from easi_jax.data.segments import Segments, to_device
 from easi_jax.devices import distributed
 from easi_jax.devices.mesh import make_mesh, placed, replicated
 from easi_jax.devices.runtime import quick_compile
+from easi_jax.estimation.doubts import Doubts, doubts_of, told
+from easi_jax.estimation.identifiability import identifiability
 from easi_jax.estimation.pieces import effective_noise, few, segments_from_runs
-from easi_jax.estimation.posterior import Estimate, estimate, polished, widened
+from easi_jax.estimation.posterior import (
+    Estimate,
+    diverged,
+    estimate,
+    polished,
+    widened,
+)
 from easi_jax.estimation.prediction_error import (
     errors_and_floor,
     misfit_of,
@@ -36,10 +44,12 @@ Tell = Callable[[str], None]
 
 _STEPS = 500_000  # physics steps in a generation that are worth their time
 _PASSES = 3  # of the finish: the model's own error is learned from the one before
-_ENDINGS = 2  # of a larger robot's, on all pieces
+_ENDINGS = 2  # on all pieces, with all doubts
 _ROBUST = 12  # rounds of the first pass; later ones know which pieces fit badly
 _LACKING = 1.5  # times wider spreads, that are worth a note
 _FINISH = 0.5  # s, of pieces in the least-squares finish
+_COMPARED = 8  # runs at most that are fitted alone as well
+_FAR, _DIFFERENT = 5.0, 0.1  # standard deviations, and log ratio, that contradict
 _OUTLIER = 2.5  # times the median error: windows beyond it weigh less
 
 
@@ -123,102 +133,155 @@ def ready_finish(
 
     Returns:
         Takes means ``(S, n)`` and covariances ``(S, n, n)`` of searches, unit
-        coordinates, and returns an `Estimate` each, and notes on pieces that fit badly.
+        coordinates, and returns an `Estimate` each, and notes on pieces and runs that
+        fit badly and on what the model lacks.
     """
-    simulator, space = problem.simulator, search.space
-    steps = max(problem.steps, round(_FINISH / simulator.dt))
-    steps = min(steps, max(len(r) for r in problem.fit) - 1)
-    # Twice over, each counted half: where pieces begin matters less.
-    every = max(1, steps // 2)
-    whole = to_device(segments_from_runs(simulator, problem.fit, steps, every))
-    whole = replace(whole, weight=whole.weight * every / steps)
-    pieces = few(simulator, whole) if refined else whole
-    more = pieces.count < whole.count
-    noise = jnp.asarray(problem.noise, jnp.result_type(float))
-    # Velocities derived from the positions say nothing that those do not.
-    seen = jnp.asarray(
-        np.concatenate([np.ones(simulator.mj_model.nv), problem.measured])
-    )
-    hidden = jnp.where(seen > 0, 0.0, jnp.inf)
-    start = start_spread(problem, effective_noise(simulator, whole, noise))
+    finish = _Finish(problem, search, refined, restarts, tell)
+    finish.compile()
 
-    def finish(
-        mean: Any, cov: Any, pieces: Any, misfit: Any, robust: Any, near: Any
-    ) -> Any:
+    def estimates(means: Any, covs: Any) -> tuple[list[Estimate], list[str]]:
+        every = [finish.passes(*both) for both in zip(means, covs, strict=True)]
+        sound = [e for e in every if not diverged(e[0])]
+        return [found for found, _ in every], finish.notes(*sound[0]) if sound else []
+
+    return estimates
+
+
+class _Finish:
+    """The programs of a finish and what they are given.
+
+    Attributes:
+        whole: all pieces, M of them; `pieces` those that many trials are made with.
+        owner: run of each of ``whole``, ``(M,)``.
+        hidden: misfit that leaves out velocities that were derived from positions.
+        start: what is known of starts.
+        doubts: what the model may lack; None where nothing is refined.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        search: Search,
+        refined: bool,
+        restarts: int,
+        tell: Tell,
+    ) -> None:
+        self.problem, self.search, self.tell = problem, search, tell
+        self.refined, self.restarts = refined, restarts
+        simulator = problem.simulator
+        self.doubts = doubts_of(simulator, search.space) if refined else None
+        # With commands before each piece, where one that comes late needs them.
+        cutting = self.doubts.simulator if self.doubts else simulator
+        steps = max(problem.steps, round(_FINISH / simulator.dt))
+        self.steps = min(steps, max(len(r) for r in problem.fit) - 1)
+        # Twice over, each counted half: where pieces begin matters less.
+        every = max(1, self.steps // 2)
+        whole = segments_from_runs(cutting, problem.fit, self.steps, every)
+        whole = to_device(whole)
+        self.whole = replace(whole, weight=whole.weight * every / self.steps)
+        starts = [len(range(0, len(r) - self.steps, every)) for r in problem.fit]
+        self.owner = np.repeat(np.arange(len(starts)), starts)
+        self.pieces = few(simulator, self.whole) if refined else self.whole
+        self.noise = jnp.asarray(problem.noise, jnp.result_type(float))
+        # Velocities derived from the positions say nothing that those do not.
+        seen = np.concatenate([np.ones(simulator.mj_model.nv), problem.measured])
+        self.hidden = jnp.asarray(np.where(seen > 0, 0.0, np.inf), self.noise.dtype)
+        assumed = effective_noise(simulator, self.whole, self.noise)
+        self.start = start_spread(problem, assumed)
+        self.mesh = search.mesh or make_mesh()
+
+    def compile(self) -> None:
+        """Compiles both programs; the second only where it is needed."""
+        n = self.search.space.size
+        like = jnp.zeros(n), jnp.eye(n), self.pieces, self.hidden, _ROBUST, False
+        self._fit = jax.jit(self.fit).lower(*placed(like)).compile(quick_compile())
+        self.more = self.doubts is not None or self.pieces.count < self.whole.count
+        if self.more:
+            like = jnp.zeros(n), jnp.eye(n), self.whole, self.hidden
+            self._end = jax.jit(self.end).lower(*placed(like)).compile(quick_compile())
+
+    def fit(
+        self, mean: Any, cov: Any, pieces: Any, misfit: Any, robust: Any, near: Any
+    ) -> tuple[Estimate, jax.Array]:
+        """A fit from ``mean``, and what it leaves."""
         found = estimate(
-            simulator,
-            space,
-            mean,
-            cov,
-            pieces,
-            noise,
-            refined,
-            search.config.informed_spread,
-            search.mesh,
-            misfit,
-            robust,
+            *(self.problem.simulator, self.search.space, mean, cov, pieces),
+            *(self.noise, self.refined, self.search.config.informed_spread),
+            *(self.search.mesh, misfit, robust),
             near=near,
-            restarts=restarts,
-            start=start,
+            restarts=self.restarts,
+            start=self.start,
         )
-        return found, errors(found, pieces)
+        return found, self.errors(found, pieces)
 
-    def ending(center: Any, cov: Any, whole: Any, misfit: Any) -> Any:
-        how = search.config.informed_spread, search.mesh, misfit
-        given = simulator, space, center, cov, whole, noise
-        found = polished(*given, *how, start=start)
-        return found, errors(found, whole)
+    def end(
+        self, center: Any, cov: Any, whole: Any, misfit: Any
+    ) -> tuple[Estimate, jax.Array]:
+        """The last steps, on all pieces and with all doubts."""
+        found = polished(
+            *(self.problem.simulator, self.search.space, center, cov, whole),
+            *(self.noise, self.search.config.informed_spread, self.search.mesh, misfit),
+            start=self.start,
+            doubts=self.doubts,
+        )
+        return found, self.errors(found, whole, self.doubts)
 
-    def errors(found: Any, pieces: Any) -> Any:
-        model = simulator.model(space.to_si(found.fit))
+    def errors(
+        self, found: Estimate, pieces: Segments, doubts: Doubts | None = None
+    ) -> jax.Array:
+        """Measured less predicted, from the fitted starts, ``(M, H, 2 nv)``."""
+        simulator, space, unit = self.problem.simulator, self.search.space, found.fit
+        if doubts is not None:
+            simulator, space = doubts.simulator, doubts.space
+            unit = space.clip(jnp.concatenate([unit, found.doubts[:, 0]]))
+        model = simulator.model(space.to_si(unit))
         # Whole on every device: one of them calls native MuJoCo, out here.
-        starts = replicated(shift_start(simulator, pieces, found.delta), mesh)
+        starts = replicated(shift_start(simulator, pieces, found.delta), self.mesh)
         return open_loop.errors_from(simulator, model, starts, pieces)
 
-    n, mesh = space.size, search.mesh or make_mesh()
-    like = placed((jnp.zeros(n), jnp.eye(n), pieces, hidden, _ROBUST, False))
-    fitted = jax.jit(finish).lower(*like).compile(quick_compile())
-    if more:
-        like = placed((jnp.zeros(n), jnp.eye(n), whole, hidden))
-        ended = jax.jit(ending).lower(*like).compile(quick_compile())
-
-    def passes(mean: Any, cov: Any) -> tuple[Any, Any]:
-        misfit, weighed, center = hidden, pieces, mean
-        assumed = effective_noise(simulator, pieces, noise)
-
-        def judged(error: Any, weight: Any, assumed: Any) -> tuple[Any, Any]:
-            misfit = jnp.maximum(misfit_of(error, assumed, weight), hidden)
-            return misfit, outlier_weights(error, assumed, misfit, _OUTLIER)
-
+    def passes(self, mean: Any, cov: Any) -> tuple[Estimate, jax.Array]:
+        """The finish of one search, and the weights that its pieces end with."""
+        center, misfit, pieces = mean, self.hidden, self.pieces
+        weighed = pieces
         for k in range(_PASSES):
-            given = (center, cov, weighed, misfit, 0 if k else _ROBUST, k > 0)
-            found, error = distributed.local(fitted(*placed(given)))
-            misfit, weight = judged(error, weighed.weight, assumed)
+            given = center, cov, weighed, misfit, 0 if k else _ROBUST, k > 0
+            found, error = distributed.local(self._fit(*placed(given)))
+            misfit, weight = self.judged(error, weighed, pieces)
             weighed = replace(pieces, weight=pieces.weight * weight)
             center = found.fit
-            tell(f"least-squares finish: pass {k + 1} of {_PASSES}")
-        assumed = effective_noise(simulator, whole, noise)
-        weighed = whole
-        for k in range(_ENDINGS if more else 0):
+            self.tell(f"least-squares finish: pass {k + 1} of {_PASSES}")
+        if self.more and self.pieces.count < self.whole.count:
+            weighed = self.whole
+        for k in range(_ENDINGS if self.more and not diverged(found) else 0):
             given = center, cov, weighed, misfit
-            found, error = distributed.local(ended(*placed(given)))
-            misfit, weight = judged(error, weighed.weight, assumed)
-            weighed = replace(whole, weight=whole.weight * weight)
+            found, error = distributed.local(self._end(*placed(given)))
+            misfit, weight = self.judged(error, weighed, self.whole)
+            weighed = replace(self.whole, weight=self.whole.weight * weight)
             center = found.fit
-            tell(f"on all of the logs: pass {k + 1} of {_ENDINGS}")
+            self.tell(f"on all of the logs: pass {k + 1} of {_ENDINGS}")
         return found.replace(search_mean=mean, search_cov=cov), weight
 
-    def estimates(means: Any, covs: Any) -> tuple[list[Any], list[str]]:
-        results = [passes(*both) for both in zip(means, covs, strict=True)]
-        odd = np.flatnonzero(np.asarray(results[0][1]) < 0.5)
+    def judged(
+        self, error: jax.Array, weighed: Segments, pieces: Segments
+    ) -> tuple[jax.Array, jax.Array]:
+        """What the model errs by, and new weights, from what a fit leaves."""
+        assumed = effective_noise(self.problem.simulator, pieces, self.noise)
+        misfit = misfit_of(error, assumed, weighed.weight)
+        misfit = jnp.maximum(misfit, self.hidden)
+        return misfit, outlier_weights(error, assumed, misfit, _OUTLIER)
+
+    def notes(self, found: Estimate, weight: jax.Array) -> list[str]:
+        """What fits badly, and what the model lacks."""
         notes = []
+        odd = np.flatnonzero(np.asarray(weight) < 0.5)
         if odd.size:
             notes.append(
-                f"{odd.size} of {whole.count} pieces of {steps * simulator.dt:g} s "
+                f"{odd.size} of {len(weight)} pieces of "
+                f"{self.steps * self.problem.simulator.dt:g} s "
                 "fit much worse than the rest and weigh less than half "
                 "(a bump, a wrong reading, or motion that the model lacks)"
             )
-        times = float(widened(results[0][0].excess))
+        times = float(widened(found.excess))
         if times > _LACKING:
             notes.append(
                 "the model errs by more than the noise explains, so it lacks "
@@ -226,9 +289,48 @@ def ready_finish(
                 f"{times:.2g} times as wide for it. train.gap with these logs names "
                 "what is missing; then give --effects"
             )
-        return [found for found, _ in results], notes
+        if self.doubts is not None and found.doubts.size:
+            notes += told(self.doubts, np.asarray(found.doubts, float))
+        return notes + self.contradictions(found, weight)
 
-    return estimates
+    def contradictions(self, found: Estimate, weight: jax.Array) -> list[str]:
+        """Notes on runs that lead elsewhere than all of them together do."""
+        runs = self.problem.fit
+        if not (self.more and 2 <= len(runs) <= _COMPARED):
+            return []
+        notes = []
+        for i, run in enumerate(runs):
+            mine = self.whole.weight * weight * (self.owner == i)
+            if not np.any(mine > 0):
+                continue
+            given = (
+                *(found.fit, found.search_cov),
+                *(replace(self.whole, weight=mine), found.misfit),
+            )
+            alone = distributed.local(self._end(*placed(given)))[0]
+            notes += _contradiction(self.search.space, run.name, alone, found)
+        return notes
+
+
+def _contradiction(
+    space: ParameterSpace, name: str, alone: Estimate, found: Estimate
+) -> list[str]:
+    """A note where a run ``alone`` leads far from what all runs say."""
+    if diverged(alone):
+        return []
+    known = identifiability(space, np.asarray(alone.hessian))
+    off = np.asarray(alone.fit - found.fit, float) * known.scale
+    std = known.std * float(widened(alone.excess))
+    far = known.determined & (np.abs(off) > np.maximum(_FAR * std, _DIFFERENT))
+    if not far.any():
+        return []
+    i = int(np.argmax(np.where(far, np.abs(off) / np.maximum(std, 1e-12), 0.0)))
+    one, all_ = (float(space.to_si(e.fit)[i]) for e in (alone, found))
+    return [
+        f"{name} contradicts the other runs: alone it says {space.names[i]} "
+        f"{one:.3g} {space.units[i]}, all together {all_:.3g} (something was changed "
+        "between them, or it moves the robot in a way that shows what the model lacks)"
+    ]
 
 
 def ready_errors(

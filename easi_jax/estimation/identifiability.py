@@ -1,6 +1,7 @@
 """Which parameters, and which combinations of them, data determine."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from easi_jax.model.parameters import Parameter, ParameterSpace
 from easi_jax.model.results import (
     LEAK,
     Flag,
+    Outcome,
     SeedResult,
     Undetermined,
 )
@@ -175,6 +177,16 @@ def flags(
     ]
 
 
+def ended(names: Sequence[str], flags: Sequence[Flag]) -> tuple[Outcome, str]:
+    """How a fit ended that did not diverge, and what it is about."""
+    if "determined" not in flags and "at bound" not in flags:
+        return "not determined", f"the data determine none of {', '.join(names)}"
+    at = [n for n, f in zip(names, flags, strict=True) if f == "at bound"]
+    if at:
+        return "at bound", f"{', '.join(at)}: wider bounds may fit better"
+    return "converged", ""
+
+
 def seed_result(
     space: ParameterSpace, unit_mean: ArrayLike, unit_cov: ArrayLike, hessian: ArrayLike
 ) -> SeedResult:
@@ -188,16 +200,20 @@ def seed_result(
     ident = identifiability(space, np.asarray(hessian))
     mean, cov = np.asarray(unit_mean), np.asarray(unit_cov, float)
     below, above = _ends(space, mean, cov)
+    believed = flags(space, ident, mean)
+    outcome, reason = ended(space.names, believed)
     return SeedResult(
         mean=_si(space, mean).tolist(),
         std=(0.5 * (above - below)).tolist(),
         interval_68=np.stack([below, above], 1).tolist(),
         unit_mean=np.asarray(mean, float).tolist(),
         unit_covariance=cov.tolist(),
-        flags=flags(space, ident, mean),
+        flags=believed,
         cramer_rao_std=ident.std.tolist(),
         determined_directions=ident.rank,
         undetermined=[Undetermined(d, describe(d)) for d in ident.undetermined],
+        outcome=outcome,
+        reason=reason,
     )
 
 

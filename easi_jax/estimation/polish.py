@@ -5,6 +5,8 @@ tenth of a long recording shows where that is. How far along it the best place l
 matter of all the data, and near it a few steps are enough.
 """
 
+from typing import Any
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -24,7 +26,7 @@ from easi_jax.estimation.normal_equations import Normal, PairedFit
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.simulator import Simulator
 
-_LOOKS = 8  # at most: at the fit, then after each step
+_LOOKS = 8  # at most: at the fit, then after each step; with doubts twice as many
 _SETTLED = 0.01  # of the cost, that the next step is foretold to gain
 _STEPPING, _RAISING, _FINISHED = range(3)
 _PULL = 0.1  # information added to a unit coordinate, for what the data do not show
@@ -58,6 +60,7 @@ def polish(
     misfit: jax.Array | None = None,
     free_starts: bool = True,
     start: jax.Array | None = None,
+    doubts: int = 0,
 ) -> RefineResult:
     """A fit ``unit (n,)`` after steps on ``segments``; pure, for use inside jit.
 
@@ -66,10 +69,13 @@ def polish(
         noise: standard deviations of the measurement, ``(2 nv,)``, above zero.
         misfit, free_starts, start: as in
             `easi_jax.estimation.levenberg_marquardt.refine`.
+        doubts: how many of the last parameters are effects of which something is known
+            before: a unit coordinate of 0, with a standard deviation of 1. The last
+            step of all takes them beyond their bounds where the data lead there.
 
     Returns:
         The place of least cost among the fit's own, its starts as they were measured,
-        and those after each step; information, starts and costs, ``(8,)`` and infinite
+        and those after each step; information, starts and costs, ``(K,)`` and infinite
         where it had settled, are those of ``segments``. A piece that the simulation
         does not get through at ``unit`` counts nothing; at a place where one of the
         others explodes the cost is infinite.
@@ -79,6 +85,16 @@ def polish(
     weight = step_weights(segments, noise, misfit)
     low, high = space.unit_bounds
     unmoved = paired.unmoved
+    looks = _LOOKS * (2 if doubts else 1)
+    doubted = jnp.arange(space.size) >= space.size - doubts
+    known = jnp.where(doubted, 1.0, 0.0)
+
+    def step(at: jax.Array, told: Normal, loose: Any, damping: Any) -> Any:
+        """Gradient and step at ``at (n,)``."""
+        gradient = told.gradient + known * at
+        free = not_held_back(space, at, gradient) | loose
+        held = told.hessian + jnp.diag(jnp.maximum(known, _PULL))
+        return gradient, newton_step(held, gradient, free, damping)
 
     def going(c: _Look) -> jax.Array:
         return c.phase < _FINISHED
@@ -88,6 +104,7 @@ def polish(
         stepping = c.phase == _STEPPING
         used = jnp.where(c.k == 0, jnp.isfinite(eq.costs), c.used)
         cost = jnp.where(used, eq.costs, 0.0).sum()
+        cost += 0.5 * jnp.sum(known * c.unit**2)
         better = stepping & ((c.k == 0) | (cost < c.least))
         best = jax.tree.map(
             lambda new, old: jnp.where(better, new, old),
@@ -96,14 +113,12 @@ def polish(
         )
         damping = c.damping * jnp.where(better, _FALLS_BY, _RISES_BY)
         at, starts, told = best
-        free = not_held_back(space, at, told.gradient)
-        held = told.hessian + _PULL * jnp.eye(space.size)
-        du = newton_step(held, told.gradient, free, damping)
+        gradient, du = step(at, told, False, damping)
         new = jnp.clip(moved(space, at, du), low, high)
-        here = jnp.arange(_LOOKS) == c.k
+        here = jnp.arange(looks) == c.k
         follow = starts + told.start_step + told.start_gain @ (new - at)
-        gain = -0.5 * told.gradient @ du
-        done = ~stepping | (better & (gain < _SETTLED)) | (c.k + 1 >= _LOOKS)
+        gain = -0.5 * gradient @ du
+        done = ~stepping | (better & (gain < _SETTLED)) | (c.k + 1 >= looks)
         raised = raised_to_range(space, at)
         below = (raised != at).any() & stepping
         over = jnp.where(below, _RAISING, _FINISHED)
@@ -132,10 +147,14 @@ def polish(
         used=jnp.ones(segments.count, bool),
         least=jnp.asarray(jnp.inf),
         seen=nothing.hessian,
-        cost=jnp.full(_LOOKS, jnp.inf),
+        cost=jnp.full(looks, jnp.inf),
     )
     end = jax.lax.while_loop(going, look, begin)
     unit, starts, told = end.best
+    below = (raised_to_range(space, unit) != unit).any()
+    if doubts:
+        new = moved(space, unit, step(unit, told, doubted, 0.0)[1])
+        unit = jnp.where(doubted, new, jnp.clip(new, low, high))
     raised = raised_to_range(space, unit)
     whole = paired.points * segments.count * segments.horizon
     return RefineResult(
@@ -144,7 +163,7 @@ def polish(
         cost=end.cost,
         delta=starts,
         raised=raised,
-        raised_hessian=jnp.where((raised != unit).any(), end.seen, told.hessian),
+        raised_hessian=jnp.where(below, end.seen, told.hessian),
         excess=excess(jnp.where(end.used, told.costs, jnp.inf), weight),
         simulated=1.0 * whole * end.k,
     )

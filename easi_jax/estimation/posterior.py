@@ -6,9 +6,11 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import Mesh
 
 from easi_jax.data.segments import Segments
+from easi_jax.estimation.doubts import Doubts, without
 from easi_jax.estimation.levenberg_marquardt import (
     RefineResult,
     excess,
@@ -53,6 +55,8 @@ class Estimate:
         pieces: M segments that all this is about, with their weights.
         misfit: what the model errs by in every step, ``(2 nv,)``, beyond the noise.
         start: what was known of starts, standard deviations ``(S,)``.
+        doubts: of effects that the model may lack, means and standard deviations in
+            those before any data, ``(k, 2)`` (`easi_jax.estimation.doubts`).
     """
 
     distribution: Distribution
@@ -68,6 +72,7 @@ class Estimate:
     pieces: Segments
     misfit: jax.Array
     start: jax.Array
+    doubts: jax.Array
 
 
 def estimate(
@@ -88,6 +93,7 @@ def estimate(
     adjusted: bool = False,
     rest: Segments | None = None,
     start: jax.Array | None = None,
+    doubts: Doubts | None = None,
 ) -> Estimate:
     """The result of a search at ``mean``, ``cov`` (unit coordinates); pure.
 
@@ -107,7 +113,8 @@ def estimate(
     (`Simulator.by_differences`). ``rest`` is more of the
     recording, ``pieces`` among it: the fit ends on that (`easi_jax.estimation.polish`).
     ``start (S,)`` is what is known of starts, as in
-    `easi_jax.estimation.normal_equations.PairedFit`.
+    `easi_jax.estimation.normal_equations.PairedFit`. With ``doubts`` the fit ends on
+    the same pieces with these, and nothing is adjusted.
     What may be as good as zero is stated as `_near_zero` says.
     """
     assumed = effective_noise(simulator, pieces, noise)
@@ -131,9 +138,10 @@ def estimate(
         if adjusted and free_starts and simulator.mj_model.nv <= FORWARD_MODE:
             given = simulator, space, fit.unit, pieces, assumed, mesh, misfit
             fit = _adjusted(fit, adjust(*given))
-        if rest is not None:
+        if rest is not None or doubts is not None:
+            rest = pieces if rest is None else rest
             given = simulator, space, fit.unit, cov, rest, noise, informed, mesh, misfit
-            more = polished(*given, start=start)
+            more = polished(*given, free_starts, False, start, doubts)
             simulated = fit.simulated + more.simulated
             return replace(more, search_mean=mean, simulated=simulated)
         return _of_fit(space, fit, mean, cov, assumed, informed, pieces, off, start)
@@ -164,6 +172,7 @@ def estimate(
         pieces=pieces,
         misfit=off,
         start=start,
+        doubts=jnp.zeros((0, 2)),
     )
 
 
@@ -180,6 +189,7 @@ def polished(
     free_starts: bool = True,
     adjusted: bool = False,
     start: jax.Array | None = None,
+    doubts: Doubts | None = None,
 ) -> Estimate:
     """The `estimate` of a fit at ``center (n,)`` after `easi_jax.estimation.polish`;
     pure.
@@ -188,12 +198,20 @@ def polished(
         cov: of the search, ``(n, n)``.
         rest: pieces of the whole recording, R of them: cost, corrections of starts
             ``(R, S)`` and information are theirs.
-        noise, informed, misfit, free_starts, adjusted, start: as in `estimate`.
+        noise, informed, misfit, free_starts, adjusted, start, doubts: as in
+            `estimate`.
     """
     assumed = effective_noise(simulator, rest, noise)
     start = assumed if start is None else start
     off = jnp.zeros_like(assumed) if misfit is None else misfit
-    fit = polish(simulator, space, center, rest, assumed, mesh, off, free_starts, start)
+    how = rest, assumed, mesh, off, free_starts, start
+    if doubts is not None:
+        begin = jnp.concatenate([center, jnp.zeros(doubts.count)])
+        fit = polish(doubts.simulator, doubts.space, begin, *how, doubts.count)
+        fit, told = without(fit, doubts.count)
+        found = _of_fit(space, fit, center, cov, assumed, informed, rest, off, start)
+        return replace(found, doubts=told)
+    fit = polish(simulator, space, center, *how)
     if adjusted and free_starts and simulator.mj_model.nv <= FORWARD_MODE:
         given = simulator, space, fit.unit, rest, assumed, mesh, off
         fit = _adjusted(fit, adjust(*given))
@@ -233,6 +251,7 @@ def _of_fit(
         pieces=pieces,
         misfit=misfit,
         start=start,
+        doubts=jnp.zeros((0, 2)),
     )
 
 
@@ -307,6 +326,18 @@ def _trusted(excess: jax.Array) -> jax.Array:
 def widened(excess: jax.Array) -> jax.Array:
     """How many times wider spreads are for what the model errs by beyond the noise."""
     return 1.0 / jnp.sqrt(_trusted(excess))
+
+
+def diverged(found: Estimate) -> str:
+    """Why an estimate is none; empty where it is one."""
+    stated = found.distribution.mean, found.distribution.factor
+    if found.cost.size and not np.isfinite(found.cost).any():
+        return "no simulation of the measured pieces stays finite"
+    if not all(np.isfinite(x).all() for x in stated):
+        return "its mean or its spread is not finite"
+    if not np.isfinite(found.hessian).all():
+        return "what the data say of the parameters is not finite"
+    return ""
 
 
 def _posterior(hessian: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -19,6 +19,7 @@ import numpy as np
 from easi_jax.devices import distributed
 from easi_jax.devices.mesh import placed
 from easi_jax.devices.runtime import quick_compile
+from easi_jax.estimation.doubts import doubts_of
 from easi_jax.estimation.identifiability import (
     WEAK,
     identifiability,
@@ -47,17 +48,18 @@ def seed_results(
     """
 
     @functools.cache
-    def held(taken: tuple[int, ...]) -> tuple[ParameterSpace, Any]:
+    def held(taken: tuple[int, ...], doubted: bool) -> tuple[ParameterSpace, Any]:
         """The other parameters, and their fit."""
         given = [space.parameters[i] for i in taken]
         rest = tuple(p for p in space.parameters if p not in given)
         rest = ParameterSpace(rest)
         fixed = {a: p.nominal for p in given for a in p.addresses}
         machine = simulator.rebuilt(space=rest, fixed={**simulator.fixed, **fixed})
+        doubts = doubts_of(machine, rest) if doubted else None
 
         def fit(unit: Any, pieces: Any, noise: Any, misfit: Any, start: Any) -> Any:
             nothing = jnp.eye(rest.size)
-            how = True, None, misfit, free_starts, adjusted, start
+            how = True, None, misfit, free_starts, adjusted, start, doubts
             return polished(machine, rest, unit, nothing, pieces, noise, *how)
 
         compiled: list[Any] = []
@@ -80,7 +82,7 @@ def seed_results(
         scaled = np.asarray(found.fit, float) * ident.scale
         off = scaled[taken] - nominal[taken] * ident.scale[taken]
         start = np.clip((scaled - gain @ off) / ident.scale, low, high)
-        rest, fit = held(tuple(taken))
+        rest, fit = held(tuple(taken), bool(found.doubts.size))
         at = np.delete(np.arange(space.size), taken)
         new = fit(
             jnp.asarray(start[at], found.fit.dtype),

@@ -10,6 +10,7 @@ import numpy as np
 from easi_jax.model.found_effects import EffectEntry, FoundEffects
 
 Flag = Literal["determined", "not determined", "at bound"]
+Outcome = Literal["converged", "at bound", "not determined", "diverged"]
 LEAK = 0.05  # part of a parameter in what is unseen, above which it is not known
 # Steps (s,) and returns (s, seeds) of a training.
 Curve = tuple[list[int], list[list[float]]]
@@ -290,6 +291,8 @@ class SeedResult:
         determined_directions: how many there are.
         undetermined: the other directions.
         relative: None where no mass or length settles a direction.
+        outcome: how its fit ended; ``reason`` names what it is about. One that diverged
+            has no result, and is no `SeedResult`.
     """
 
     mean: list[float]
@@ -302,6 +305,8 @@ class SeedResult:
     determined_directions: int
     undetermined: list[Undetermined]
     relative: Relative | None = None
+    outcome: Outcome = "converged"
+    reason: str = ""
 
 
 @dataclass(frozen=True)

@@ -77,6 +77,12 @@ def logs_report(
                 if "less" in better
                 else "no listed parameter can express what the model lacks",
             ),
+            Diagnostic(
+                "the fit",
+                results[best].outcome,
+                ok=results[best].outcome == "converged",
+                note=results[best].reason,
+            ),
             lost(non_finite),
             doubtful(rows),
             Diagnostic(

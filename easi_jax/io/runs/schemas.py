@@ -19,7 +19,13 @@ TRAINED = {
     "target_effects?": {},
 }
 POLICIES = {**TRAINED, "methods": [str]}
-_SEED = {"mean": [float], "unit_mean": [float], "unit_covariance": [[float]]}
+_SEED = {
+    "mean": [float],
+    "unit_mean": [float],
+    "unit_covariance": [[float]],
+    "outcome?": str,
+    "reason?": str,
+}
 DISTRIBUTION = {
     "parameters": [
         {
@@ -34,6 +40,7 @@ DISTRIBUTION = {
     ],
     "seeds": {"*": _SEED},
     "best_seed?": int,
+    "diverged?": {"*": str},
 }
 GAP = {"effects": [{"effect": str, "at": str, "indistinguishable": [str]}]}
 _WORDS = {int: "a whole number", float: "a number", str: "a text"}

@@ -86,6 +86,7 @@ class Bench:
             pieces=pieces,
             misfit=jnp.zeros(4),
             start=noise,
+            doubts=jnp.zeros((0, 2)),
         )
 
     def stated(self, estimates: Sequence[Estimate]) -> list[SeedResult]:
