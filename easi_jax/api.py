@@ -311,7 +311,7 @@ def _estimated(
     (found,) = estimates
     space, unit = search.space, found.distribution.mean
     root = np.asarray(found.distribution.factor, float)
-    if why := diverged(found):
+    if why := diverged(found, space.names):
         raise UserError(f"the fit diverged ({why}): try another seed")
     result = seed_result(space, unit, root @ root.T, found.hessian)
     errors = ready_errors(problem, space)

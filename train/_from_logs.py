@@ -39,7 +39,7 @@ def run(config: Any) -> None:
         states = _search(folder, config, search, problem, seeds)
         errors = started(lambda: ready_errors(problem, search.space))
         estimates, outliers = finish()(states.result_mean, states.result_cov)
-        good, lost = sound(seeds, estimates)
+        good, lost = sound(seeds, estimates, search.space.names)
         problem.notes.extend(outliers)
         report = write(
             *(folder, problem, search.space, search.config.generations),

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def sound(
-    seeds: Sequence[int], estimates: Sequence["Estimate"]
+    seeds: Sequence[int], estimates: Sequence["Estimate"], names: Sequence[str]
 ) -> tuple[dict[int, "Estimate"], dict[int, str]]:
     """Estimates by seed, and why other seeds have none.
 
@@ -31,7 +31,7 @@ def sound(
     from easi_jax.estimation.posterior import diverged
 
     every = dict(zip(seeds, estimates, strict=True))
-    why = {seed: diverged(found) for seed, found in every.items()}
+    why = {seed: diverged(found, names) for seed, found in every.items()}
     lost = {seed: reason for seed, reason in why.items() if reason}
     if len(lost) == len(every):
         seed, reason = next(iter(lost.items()))

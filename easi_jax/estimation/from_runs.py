@@ -141,7 +141,7 @@ def ready_finish(
 
     def estimates(means: Any, covs: Any) -> tuple[list[Estimate], list[str]]:
         every = [finish.passes(*both) for both in zip(means, covs, strict=True)]
-        sound = [e for e in every if not diverged(e[0])]
+        sound = [e for e in every if not finish.lost(e[0])]
         return [found for found, _ in every], finish.notes(*sound[0]) if sound else []
 
     return estimates
@@ -252,7 +252,7 @@ class _Finish:
             self.tell(f"least-squares finish: pass {k + 1} of {_PASSES}")
         if self.more and self.pieces.count < self.whole.count:
             weighed = self.whole
-        for k in range(_ENDINGS if self.more and not diverged(found) else 0):
+        for k in range(_ENDINGS if self.more and not self.lost(found) else 0):
             given = center, cov, weighed, misfit
             found, error = distributed.local(self._end(*placed(given)))
             misfit, weight = self.judged(error, weighed, self.whole)
@@ -260,6 +260,10 @@ class _Finish:
             center = found.fit
             self.tell(f"on all of the logs: pass {k + 1} of {_ENDINGS}")
         return found.replace(search_mean=mean, search_cov=cov), weight
+
+    def lost(self, found: Estimate) -> bool:
+        """Whether a fit is none."""
+        return bool(diverged(found, self.search.space.names))
 
     def judged(
         self, error: jax.Array, weighed: Segments, pieces: Segments
@@ -316,7 +320,7 @@ def _contradiction(
     space: ParameterSpace, name: str, alone: Estimate, found: Estimate
 ) -> list[str]:
     """A note where a run ``alone`` leads far from what all runs say."""
-    if diverged(alone):
+    if diverged(alone, space.names):
         return []
     known = identifiability(space, np.asarray(alone.hessian))
     off = np.asarray(alone.fit - found.fit, float) * known.scale

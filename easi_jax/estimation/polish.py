@@ -26,12 +26,16 @@ from easi_jax.estimation.normal_equations import Normal, PairedFit
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.simulator import Simulator
 
-_LOOKS = 8  # at most: at the fit, then after each step; with doubts twice as many
+_LOOKS = 8, 48  # at most: at the fit, then after each step; with doubts
+_STALE = 6  # looks without progress that end it
+_ROUNDING = 3e-6  # of the cost, that single precision takes for progress
 _SETTLED = 0.01  # of the cost, that the next step is foretold to gain
 _STEPPING, _RAISING, _FINISHED = range(3)
 _PULL = 0.1  # information added to a unit coordinate, for what the data do not show
 _DAMPING = 1e-6  # of a step, relative to the information
-_FALLS_BY, _RISES_BY = 0.1, 1e4  # after a step that helped, and one that did not
+_FALLS_BY, _RISES_BY = 0.1, 10.0  # after a step that helped, and one that did not
+_RISES_TO = 1e-2  # at least
+_SHORTER, _LONGER = 0.3, 3.0  # share of its step that a start takes, likewise
 
 
 @flax.struct.dataclass
@@ -39,9 +43,11 @@ class _Look:
     """Where it looks, and the best place so far."""
 
     k: jax.Array
+    progressed: jax.Array  # the look that brought some last
     phase: jax.Array
     unit: jax.Array
     starts: jax.Array
+    share: jax.Array  # of its step that each start takes, at most all
     damping: jax.Array
     best: tuple[jax.Array, jax.Array, Normal]  # parameters, starts, what is seen there
     used: jax.Array  # pieces that the simulation gets through at the fit
@@ -85,7 +91,7 @@ def polish(
     weight = step_weights(segments, noise, misfit)
     low, high = space.unit_bounds
     unmoved = paired.unmoved
-    looks = _LOOKS * (2 if doubts else 1)
+    looks = _LOOKS[1 if doubts else 0]
     doubted = jnp.arange(space.size) >= space.size - doubts
     known = jnp.where(doubted, 1.0, 0.0)
 
@@ -111,22 +117,34 @@ def polish(
             (c.unit, c.starts, eq),
             c.best,
         )
-        damping = c.damping * jnp.where(better, _FALLS_BY, _RISES_BY)
+        risen = jnp.maximum(_RISES_BY * c.damping, _RISES_TO)
+        damping = jnp.where(better, _FALLS_BY * c.damping, risen)
+        # A start that is thrown across a change of sign of a speed would hide what all
+        # others gain.
+        thrown = ~(eq.costs <= c.best[2].costs) & (c.k > 0)
+        longer = jnp.where(better, jnp.minimum(_LONGER * c.share, 1.0), c.share)
+        share = jnp.where(thrown, _SHORTER * c.share, longer)
         at, starts, told = best
         gradient, du = step(at, told, False, damping)
         new = jnp.clip(moved(space, at, du), low, high)
         here = jnp.arange(looks) == c.k
-        follow = starts + told.start_step + told.start_gain @ (new - at)
+        follow = starts + share[:, None] * told.start_step
+        follow = follow + told.start_gain @ (new - at)
         gain = -0.5 * gradient @ du
+        progress = c.least - cost > _SETTLED + _ROUNDING * cost
+        progressed = jnp.where(better & progress, c.k, c.progressed)
         done = ~stepping | (better & (gain < _SETTLED)) | (c.k + 1 >= looks)
+        done |= c.k - progressed >= _STALE
         raised = raised_to_range(space, at)
         below = (raised != at).any() & stepping
         over = jnp.where(below, _RAISING, _FINISHED)
         return _Look(
             k=c.k + 1,
+            progressed=progressed,
             phase=jnp.where(done, over, _STEPPING),
             unit=jnp.where(done, raised, new),
             starts=jnp.where(done, starts, follow),
+            share=share,
             damping=damping,
             best=best,
             used=used,
@@ -139,9 +157,11 @@ def polish(
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
     begin = _Look(
         k=jnp.asarray(0),
+        progressed=jnp.asarray(0),
         phase=jnp.asarray(_STEPPING),
         unit=unit,
         starts=unmoved,
+        share=jnp.ones(segments.count),
         damping=jnp.asarray(_DAMPING),
         best=(unit, unmoved, nothing),
         used=jnp.ones(segments.count, bool),

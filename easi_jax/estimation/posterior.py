@@ -1,5 +1,6 @@
 """From the end of a search to an honest distribution over parameters."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -328,13 +329,15 @@ def widened(excess: jax.Array) -> jax.Array:
     return 1.0 / jnp.sqrt(_trusted(excess))
 
 
-def diverged(found: Estimate) -> str:
-    """Why an estimate is none; empty where it is one."""
-    stated = found.distribution.mean, found.distribution.factor
+def diverged(found: Estimate, names: Sequence[str]) -> str:
+    """Why an estimate of parameters ``names`` is none; empty where it is one."""
+    stated = found.distribution.mean[:, None], found.distribution.factor
+    bad = np.isfinite(np.concatenate(stated, 1)).min(1) == 0
     if found.cost.size and not np.isfinite(found.cost).any():
         return "no simulation of the measured pieces stays finite"
-    if not all(np.isfinite(x).all() for x in stated):
-        return "its mean or its spread is not finite"
+    if bad.any():
+        odd = ", ".join(n for n, b in zip(names, bad, strict=True) if b)
+        return f"its mean or its spread is not finite for {odd}"
     if not np.isfinite(found.hessian).all():
         return "what the data say of the parameters is not finite"
     return ""

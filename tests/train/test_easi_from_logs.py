@@ -168,7 +168,7 @@ def test_the_truth_is_found(fitted: Fitted) -> None:
 
 
 def test_every_program_is_compiled_once(fitted: Fitted) -> None:
-    assert COMPILED.count("jit(finish)") == 1
+    assert COMPILED.count("jit(fit)") == COMPILED.count("jit(end)") == 1
     assert COMPILED.count("jit(advance)") == 1
 
 
@@ -360,7 +360,8 @@ def test_a_result_that_is_no_number_is_an_error(files, capsys, monkeypatch):
         call(*arguments(files))
     assert stop.value.code == 2
     said = capsys.readouterr().err.splitlines()[-1]
-    assert said.startswith("error: seed 0") and "not finite for damping" in said
+    assert said.startswith("error: the fit diverged (seed 0:")
+    assert "not finite for damping" in said
     assert not (files["out"] / "distribution.json").exists()
 
 
