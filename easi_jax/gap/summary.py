@@ -68,7 +68,7 @@ def gap_result(
         seconds=o.seconds,
         start=o.start,
         bounded=_named(c.names, np.append(o.floor_is_bound, False)),
-        open=_named(c.names, o.open_after.open),
+        open=_named(c.names, o.open_after.is_open),
         undecided=_named(c.names, o.open_after.undecided),
         notes=(*notes, *o.notes, *_not_finite(lost, len(o.held))),
     )

@@ -26,14 +26,14 @@ class Openness:
     high: np.ndarray
 
     @property
-    def open(self) -> np.ndarray:
+    def is_open(self) -> np.ndarray:
         """Surely beyond `GOAL`, ``(nv + 1,)`` bool."""
         return self.low > GOAL
 
     @property
     def undecided(self) -> np.ndarray:
         """Perhaps beyond `GOAL`, ``(nv + 1,)`` bool: more data would tell."""
-        return (self.high > GOAL) & ~self.open
+        return (self.high > GOAL) & ~self.is_open
 
 
 def openness(square: np.ndarray, floor: np.ndarray, scale: np.ndarray) -> Openness:
@@ -75,7 +75,7 @@ def verdict_of(found: bool, refit: Openness, after: Openness) -> str:
         after: with the effects that joined.
     """
     last = after if found else refit
-    if last.open.any():
+    if last.is_open.any():
         return "unexplained"
     return "explained" if found else "no_gap"
 

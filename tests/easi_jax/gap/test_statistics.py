@@ -159,8 +159,9 @@ def test_every_effect_of_the_table_moves_the_prediction(
     for place, errors in zip(found, moved, strict=True):
         assert np.abs(errors - base).max() > 1e-5, place.key
     names = {p.effect for p in found} | {"torque_ripple"}
-    contacts = {"contact_friction", "contact_softness", "backlash"}
-    assert names | contacts == set(EFFECTS)
+    elsewhere = {"contact_friction", "contact_softness", "backlash"}
+    elsewhere |= {"drive_stiffness", "drive_damping", "actuator_strength"}
+    assert names | elsewhere == set(EFFECTS)
 
 
 def test_ripples_are_at_the_joint(model: mujoco.MjModel, runs: list[Run]) -> None:
