@@ -13,9 +13,9 @@ from easi_jax.model.contact_pairs import contacts
 
 # Seconds of one core: for any program, and besides for each degree of freedom to the
 # power of 1.5, contact with a plane times degrees of freedom, and other contact
-# (benchmarks/results/compile_times.json: arms with up to twelve joints, and single
+# (benchmarks/results/compile_times.json: arms with up to six joints, and single
 # bodies). Effects take no time that could be measured.
-CONSTANTS = (0.78, 0.778, 0.708, 4.19)
+CONSTANTS = (0.159, 0.759, 0.742, 4.15)
 
 
 @dataclass(frozen=True)

@@ -27,13 +27,13 @@ Engine = Literal["mjx", "mujoco"]
 CHOICES = ("auto", "mjx", "mujoco")
 
 # Seconds of one core that MJX may take to compile on a CPU, as told beforehand. What is
-# told to compile in less runs 4 to 130 times as fast on MJX, what in more 0.06 to 1.2
+# told to compile in less runs 3.8 to 107 times as fast on MJX, what in more 0.08 to 1.1
 # times (benchmarks/results/compile_times.json), for code gets too long to be written
 # out. benchmarks/engines.py, 300 models on 2 cores: Cartpole is 149 times as fast on
 # MJX; Ant has its first result after 45 s on MJX and 0.6 s, and 0.8 times the steps a
 # second on MJX; Ballbalance 56 and 0.6 s, 0.5 times; Go2 59 and 0.6 s, 0.6 times. Only
 # with a policy is Ant quicker on MJX, 1.3 times once it is compiled.
-LONGEST = 12.0
+LONGEST = 11.0
 
 
 class EngineError(UserError):

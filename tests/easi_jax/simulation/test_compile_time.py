@@ -42,6 +42,12 @@ def test_the_constants_are_those_of_the_committed_measurement() -> None:
     assert off.min() > 0.4 and off.max() < 2.5
 
 
+def test_the_limit_of_auto_parts_what_is_faster_on_mjx() -> None:
+    for r in json.loads(RESULT.read_text())["rows"]:
+        small = expected_of(Size(**r["size"])) <= engine.LONGEST
+        assert r["mujoco"] / r["mjx"] > 3 if small else r["mujoco"] / r["mjx"] < 1.5, r
+
+
 @pytest.mark.parametrize(
     ("shape", "floor", "on_planes", "others"),
     [
