@@ -2,9 +2,16 @@
 
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from train._command import main, say, show_table
 from train._options import EngineOptions, RobotOptions, RunOptions, TrainingOptions
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from easi_jax.io.report.html import Picture, Table
+    from easi_jax.io.runs.folder import RunFolder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,10 +67,7 @@ def run(config: Config) -> None:
     import numpy as np
 
     from easi_jax.io.report.easi_report import motion_strip
-    from easi_jax.io.report.figures import returns_by_step
-    from easi_jax.io.report.html import Picture, Report, Table, write_report
     from easi_jax.io.runs.folder import RunFolder
-    from easi_jax.io.runs.versions import versions
     from easi_jax.pipeline.stages import (
         Pipeline,
         PipelineConfig,
@@ -71,18 +75,16 @@ def run(config: Config) -> None:
         stage_keys,
         target_parameters,
     )
-    from easi_jax.rl.presets import algorithm_of
     from easi_jax.simulation.compile_time import expected
     from envs import open_env
     from train._results import per_seed_json
-    from train._stages import jit_chunks, run_stage, training_curve, training_rows
+    from train._stages import jit_chunks, run_stage, training_rows
 
     given = read_given(config)
     env, real = robots(open_env(config.robot, config.env, config.option), given)
     training = training_config(env, config.env_steps, config.algorithm)
     theta = target_parameters((real or env).space, config.target)
     method = "Fixed" if config.fixed else "UDR"
-    how = "in the target itself" if config.fixed else "under uniform randomization"
     settings = PipelineConfig(training=training, eval_episodes=config.eval_episodes)
     if config.fixed:
         env, real = real or env, None
@@ -121,54 +123,85 @@ def run(config: Config) -> None:
         returns, motion = jax.jit(pipe.play)(policies, target, keys["evaluate"])
         per_seed = np.asarray(returns).mean(1)
         save_policies(folder, method, policies)
-        results = {
-            "robot": env.name,
-            "env": None if config.env is None else str(config.env),
-            "option": list(config.option),
-            "seeds": list(config.seeds),
-            "env_steps": training.env_steps,
-            "algorithm": algorithm_of(training),
-            "methods": [method],
+        made = {
+            **_settings(config, method, env.name, training),
             "target": dict(zip(pipe.real.space.names, theta.tolist(), strict=True)),
             "returns": {method: per_seed_json(config.seeds, per_seed)},
             **given.results(),
         }
-        folder.write_json("results.json", results)
-        steps, curve = training_curve(folder.path, "train", config.seeds)
+        folder.write_json("results.json", made)
         pictures = motion_strip(env.mj_model, env.dt, motion[0], method, notes)
-        if steps:
-            svg = returns_by_step({method: (steps, curve)})
-            folder.write("figures/returns.svg", svg)
-            pictures.append(
-                Picture(
-                    "Return by training step",
-                    svg,
-                    f"Return of the {method} policy in the target by training step",
-                    "Deterministic policy in the target, every seed and their median.",
-                )
-            )
-        rows = [(s, f"{r:.1f}") for s, r in zip(config.seeds, per_seed, strict=True)]
-        title = f"{method} on {env.name}: return in the target"
-        write_report(
-            folder.path / "report.html",
-            Report(
-                title=f"{method} on {env.name}",
-                headline=[
-                    f"The policy trained {how} returns "
-                    f"{np.median(per_seed):.1f} in the target (median of "
-                    f"{len(config.seeds)} seed{'s' if len(config.seeds) > 1 else ''}, "
-                    f"{config.eval_episodes} episodes each)."
-                ],
-                command="python -m train.udr",
-                tables=[Table(title, ("seed", "return"), rows)],
-                pictures=pictures,
-                notes=notes,
-                config=folder.config,
-                versions=versions(),
-            ),
-        )
-    show_table(title, ("seed", "return"), rows)
+        table = _report(folder, config, method, env.name, per_seed, pictures, notes)
+    show_table(table.title, table.columns, table.rows)
     say(f"report: {config.out / 'report.html'}")
+
+
+def _settings(config: Config, method: str, robot: str, training: Any) -> dict[str, Any]:
+    """What ``results.json`` says of how a policy was made."""
+    from easi_jax.rl.presets import algorithm_of
+
+    return {
+        "robot": robot,
+        "env": None if config.env is None else str(config.env),
+        "option": list(config.option),
+        "seeds": list(config.seeds),
+        "env_steps": training.env_steps,
+        "algorithm": algorithm_of(training),
+        "methods": [method],
+    }
+
+
+def _report(
+    folder: "RunFolder",
+    config: Config,
+    method: str,
+    robot: str,
+    returns: "np.ndarray",
+    pictures: "list[Picture]",
+    notes: list[str],
+) -> "Table":
+    """Writes the report; the table of ``returns`` in the target, one a seed."""
+    import numpy as np
+
+    from easi_jax.io.report.figures import returns_by_step
+    from easi_jax.io.report.html import Picture, Report, Table, write_report
+    from easi_jax.io.runs.versions import versions
+    from train._stages import training_curve
+
+    steps, curve = training_curve(folder.path, "train", config.seeds)
+    if steps:
+        svg = returns_by_step({method: (steps, curve)})
+        folder.write("figures/returns.svg", svg)
+        picture = Picture(
+            "Return by training step",
+            svg,
+            f"Return of the {method} policy in the target by training step",
+            "Deterministic policy in the target, every seed and their median.",
+        )
+        pictures = [*pictures, picture]
+    rows = [(s, f"{r:.1f}") for s, r in zip(config.seeds, returns, strict=True)]
+    title = f"{method} on {robot}: return in the target"
+    table = Table(title, ("seed", "return"), rows)
+    how = "in the target itself" if config.fixed else "under uniform randomization"
+    write_report(
+        folder.path / "report.html",
+        Report(
+            title=f"{method} on {robot}",
+            headline=[
+                f"The policy trained {how} returns "
+                f"{np.median(returns):.1f} in the target (median of "
+                f"{len(config.seeds)} seed{'s' if len(config.seeds) > 1 else ''}, "
+                f"{config.eval_episodes} episodes each)."
+            ],
+            command="python -m train.udr",
+            tables=[table],
+            pictures=pictures,
+            notes=notes,
+            config=folder.config,
+            versions=versions(),
+        ),
+    )
+    return table
 
 
 if __name__ == "__main__":

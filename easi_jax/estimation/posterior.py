@@ -146,9 +146,17 @@ def estimate(
             simulated = fit.simulated + more.simulated
             return replace(more, search_mean=mean, simulated=simulated)
         return _of_fit(space, fit, mean, cov, assumed, informed, pieces, off, start)
-    weight = step_weights(pieces, assumed, misfit)
     given = simulator, space, pieces, assumed, mesh, free_starts
     paired = PairedFit(*given, start=start)
+    return _of_search(paired, mean, cov, informed, off)
+
+
+def _of_search(
+    paired: PairedFit, mean: jax.Array, cov: jax.Array, informed: bool, off: jax.Array
+) -> Estimate:
+    """What is stated of a search's end that nothing refines; ``off`` is its misfit."""
+    space, pieces, assumed = paired.space, paired.segments, paired.noise
+    weight = step_weights(pieces, assumed, off)
     eq = paired.normal(mean, paired.unmoved, weight)
     left = excess(eq.costs, weight)
     open_cov, seen, _ = _posterior(eq.hessian * _trusted(left))
@@ -172,7 +180,7 @@ def estimate(
         simulated=simulated,
         pieces=pieces,
         misfit=off,
-        start=start,
+        start=paired.spread,
         doubts=jnp.zeros((0, 2)),
     )
 
