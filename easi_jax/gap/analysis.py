@@ -41,7 +41,7 @@ from easi_jax.gap.scales import scales_of
 from easi_jax.gap.table import Place, covered, does
 from easi_jax.gap.verdict import openness, surely_better, verdict_of
 from easi_jax.gap.whitening import make_residuals
-from easi_jax.gap.window_set import join, reach, spread, window_set
+from easi_jax.gap.window_set import WindowSet, join, reach, spread, window_set
 from easi_jax.gap.window_starts import known_noise, window_starts
 from easi_jax.io.runs.step_cache import key_of
 from easi_jax.model.joint_space import is_hinge, scalar_dofs
@@ -106,37 +106,26 @@ class Analysis:
             for p in ripples(mj_model, j, self.scales, self._cycles(j))
         ]
         layout = Layout(mj_model, [*self.everywhere, *self.ripples])
-        fitted = window_set(mj_model, fit, horizon, self.scales.longest)
-        kept = window_set(mj_model, held, horizon, self.scales.longest, len(fit))
-        if fitted is None or kept is None:
-            what = "to fit" if fitted is None else "held out"
-            raise UserError(
-                f"no run {what} is longer than a horizon of {horizon:g} s: record "
-                "more, or shorten --horizon"
-            )
-        physics = fitted.ctrl.shape[1] * physics_steps(dt, mj_model.opt.timestep)
-        most = min(max(_STEPS // physics, _FITTED[0]), _FITTED[1])
-        chosen = spread(fitted, most, reach(mj_model, fit, fitted))
-        self.fit_windows = fitted.take(chosen)
-        pad = -len(self.fit_windows) % BLOCK
-        repeated = np.r_[np.arange(len(chosen)), np.full(pad, len(chosen) - 1)]
+        self.bounds = bounds_of(space, layout)
+        self.fit_windows, filled, kept = self._windows(fit, held, horizon)
         self.predictor = Predictor(
             mj_model,
             space,
             layout,
-            join([fitted.take(chosen[repeated]), kept]),
+            join([filled, kept]),
             dt,
             fixed,
             Logged.of(self.runs),
             wait,
         )
-        self.fit_blocks = np.arange(len(repeated) // BLOCK)
-        self.held_blocks = np.arange(len(repeated) // BLOCK, self.predictor.blocks)
+        own = len(filled) // BLOCK
+        self.fit_blocks = np.arange(own)
+        self.held_blocks = np.arange(own, self.predictor.blocks)
         simulator = self.predictor.simulator
         self.channels = measure.channels(
             mj_model,
             [n.removeprefix("qpos.") for n in simulator.state_names[: mj_model.nv]],
-            self.runs,
+            fit,
             self.noise,
             self.predictor.steps - self.lead,
         )
@@ -147,7 +136,6 @@ class Analysis:
             )
         self.step = dt / simulator.substeps
         self.dropped: set[str] = set()  # found, and then found to say nothing
-        self.bounds = bounds_of(space, layout)
         count = len(self.fit_windows)
         self.group = np.arange(count) * min(_BLOCKS, count) // count
         self.selector = Selector(
@@ -173,6 +161,30 @@ class Analysis:
             self.lead,
             self.resolution,
         )
+
+    def _windows(
+        self, fit: Sequence[Run], held: Sequence[Run], horizon: float
+    ) -> tuple[WindowSet, WindowSet, WindowSet]:
+        """Windows that fits see, the same filled to whole blocks, and those held out.
+
+        Raises:
+            UserError: runs too short.
+        """
+        m, longest = self.m, self.scales.longest
+        fitted = window_set(m, fit, horizon, longest)
+        kept = window_set(m, held, horizon, longest, len(fit))
+        if fitted is None or kept is None:
+            what = "to fit" if fitted is None else "held out"
+            raise UserError(
+                f"no run {what} is longer than a horizon of {horizon:g} s and the "
+                f"{self.lead * fit[0].dt:.3g} s before it: record more, or shorten "
+                "--horizon"
+            )
+        physics = fitted.ctrl.shape[1] * physics_steps(fit[0].dt, m.opt.timestep)
+        most = min(max(_STEPS // physics, _FITTED[0]), _FITTED[1])
+        chosen = spread(fitted, most, reach(m, fit, fitted))
+        pad = np.full(-len(chosen) % BLOCK, chosen[-1])
+        return fitted.take(chosen), fitted.take(np.r_[chosen, pad]), kept
 
     def _plain(self, x: np.ndarray) -> np.ndarray:
         """Vectors without the share of the own steps' error."""
@@ -238,6 +250,15 @@ class Analysis:
         square, due = measure.squares(errors[:, after:]), noise[:, after:].mean((0, 1))
         low = openness(square, due, self.channels.scale).low
         return bool(np.nanmax(low) <= _CLOSED)
+
+    def _moves_in_the_model(self) -> bool:
+        """Takes channels in that stand still in the log, but not in the model."""
+        errors = self.selector.errors(self.predictor.neutral[None])[0].astype(float)
+        moved = errors[:, -1] - errors[:, self.lead]
+        changed = measure.with_moving(self.channels, moved, self.noise)
+        more = changed is not self.channels
+        self.channels = self.held_out.channels = changed
+        return more
 
     def watch_steps(self) -> None:
         """Lets fits see what the model's own steps do, where that can be seen.
@@ -311,6 +332,8 @@ class Analysis:
         own = list(range(self.space.size))
         self.tell("compiling the predictions ...")
         self.whiten(self.predictor.neutral)
+        if self._moves_in_the_model():
+            self.whiten(self.predictor.neutral)
         self.watch_steps()
         self.tell(
             f"gap {self.fit_gap:.3g} on the fitting data, noise floor "

@@ -1,7 +1,7 @@
 """The gap: open-loop prediction error in units of the motion, and its noise floor."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import mujoco
 import numpy as np
@@ -32,6 +32,7 @@ class Channels:
         units: m or rad.
         scale: errors are divided by it; infinite where left out, ``(nv,)``.
         ignored: reason for each that is left out.
+        still: what the scale of a channel that moves too little would be, ``(nv,)``.
     """
 
     names: tuple[str, ...]
@@ -39,6 +40,7 @@ class Channels:
     units: tuple[str, ...]
     scale: np.ndarray
     ignored: dict[str, str]
+    still: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 def channels(
@@ -85,8 +87,27 @@ def channels(
         )
         for d in np.flatnonzero(quiet).tolist()
     }
+    still = np.maximum(scale, noise)
     scale = np.where(quiet | (scale <= 0), np.inf, scale)
-    return Channels(tuple(names), tuple(joints), tuple(units), scale, ignored)
+    return Channels(tuple(names), tuple(joints), tuple(units), scale, ignored, still)
+
+
+def with_moving(found: Channels, moved: np.ndarray, noise: np.ndarray) -> Channels:
+    """The channels with those of no motion in the log that move in the model: a stuck
+    joint is not left out.
+
+    Args:
+        moved: predicted changes over a horizon, ``(W, nv)``.
+        noise: of measured positions, ``(nv,)``; infinite where not measured.
+    """
+    size = np.sqrt(np.nanmedian(moved**2, 0))
+    stuck = ~np.isfinite(found.scale) & np.isfinite(noise) & (size > _VISIBLE * noise)
+    if not stuck.any():
+        return found
+    names = {found.names[d] for d in np.flatnonzero(stuck).tolist()}
+    ignored = {k: v for k, v in found.ignored.items() if k not in names}
+    scale = np.where(stuck, found.still, found.scale)
+    return replace(found, scale=scale, ignored=ignored)
 
 
 def gap(square: np.ndarray, scale: np.ndarray) -> np.ndarray:

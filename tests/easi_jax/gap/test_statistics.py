@@ -315,6 +315,20 @@ def test_a_mass_at_its_joints_may_move_away() -> None:
     assert right < 0.03 * wrong
 
 
+def test_a_stuck_joint_is_not_left_out() -> None:
+    noise = np.array([1e-3, 1e-3, np.inf])
+    names = ("a", "b", "c")
+    scale = np.array([np.inf, np.inf, np.inf])
+    still = np.array([2e-3, 1e-3, np.inf])
+    told: dict[str, str] = dict.fromkeys(names, "still")
+    found = measure.Channels(names, names, ("rad",) * 3, scale, told, still)
+    moved = np.array([[0.1, 1e-3, 0.1]] * 20)
+    some = measure.with_moving(found, moved, noise)
+    assert some.scale.tolist() == [2e-3, np.inf, np.inf]
+    assert list(some.ignored) == ["b", "c"]
+    assert measure.with_moving(found, 0 * moved, noise) is found
+
+
 def test_a_run_that_the_others_contradict_is_told() -> None:
     rng = np.random.default_rng(0)
     run = np.repeat(np.arange(4), 10)

@@ -53,8 +53,8 @@ def test_verdicts(refit: float, after: float, found: bool, verdict: str) -> None
 def test_better_by_more_than_chance() -> None:
     before = errors(1.5, 1.0, 1.0)
     assert surely_better(errors(1.0, 1.0, 1.0), before, SCALE)
-    chance = [
-        surely_better(*(errors(1.5, 1.0, 1.0, seed=s) for s in (k, 100 + k)), SCALE)
-        for k in range(40)
-    ]
+    chance = []
+    for k in range(40):
+        first, second = (errors(1.5, 1.0, 1.0, seed=s) for s in (k, 100 + k))
+        chance.append(surely_better(first, second, SCALE))
     assert np.mean(chance) <= 0.15, "of noise alone one in twenty"
