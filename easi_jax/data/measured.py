@@ -8,7 +8,7 @@ import numpy as np
 
 from easi_jax.data.cleaning import split_at_resets, to_common_step, without_odd_ends
 from easi_jax.data.holdout import split_held_out
-from easi_jax.data.noise import pooled
+from easi_jax.data.noise import pooled_noise
 from easi_jax.data.recording import Log, Run, check_run
 from easi_jax.data.unmeasured import measured_alike
 
@@ -26,8 +26,6 @@ class MeasuredRuns:
         fit, held: runs, cleaned.
         held_name: which data are held out.
         notes: what a user should know of the data, one line each.
-        noise_is_bound: where noise cannot be told from motion and may be less, ``(2
-            nv,)`` bool.
     """
 
     recorded: tuple[Run, ...]
@@ -36,7 +34,6 @@ class MeasuredRuns:
     held: list[Run]
     held_name: str
     notes: list[str]
-    noise_is_bound: np.ndarray | None = None
 
 
 def measured_runs(
@@ -63,26 +60,25 @@ def measured_runs(
     notes += unused
     recorded, kept_out = alike[: len(log.runs)], alike[len(log.runs) :]
     # Before interpolation, which would smooth the noise.
-    noise = pooled(recorded)
+    noise = pooled_noise(recorded)
     parts: list[Sequence[Run]] = []
     for given in (recorded, kept_out):
-        cut, leaps = split_at_resets(given, noise.std)
+        cut, leaps = split_at_resets(given, noise)
         notes += leaps
         parts.append(cut)
     if parts[0] != recorded:
         # Bad readings have no part in the noise, where there are rows enough.
-        noise = pooled([r for r in parts[0] if len(r) > _FEW_ROWS] or recorded)
+        noise = pooled_noise([r for r in parts[0] if len(r) > _FEW_ROWS] or recorded)
     runs, changed = to_common_step([*parts[0], *parts[1]])
     notes += changed
-    runs, odd = without_odd_ends(runs, noise.std)
+    runs, odd = without_odd_ends(runs, noise)
     notes += odd
     fit, held = runs[: len(parts[0])], runs[len(parts[0]) :]
     if held_out is None:
         fit, held, name = split_held_out(mj_model, fit, horizon)
     else:
         name = ", ".join(run.name for run in held)
-    said = tuple(recorded), noise.std, fit, held, name, notes
-    return MeasuredRuns(*said, noise.is_bound)
+    return MeasuredRuns(tuple(recorded), noise, fit, held, name, notes)
 
 
 def _states(m: mujoco.MjModel) -> list[str]:
