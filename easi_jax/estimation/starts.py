@@ -219,17 +219,20 @@ def floor(
         step: between two readings of each channel; 0 where they are fine, ``(c,)``.
     """
     exact = starts.simulate(x[None], begin[None])[0].astype(float)
-    rounded = step / np.sqrt(12.0)
+    least = step / np.sqrt(12.0)
     known = np.isfinite(starts.noise)
     noise = np.where(known, starts.noise, 0.0)
-    coarse = np.logical_and(step > 0, rounded > 0.5 * noise)
-    white = np.sqrt(np.maximum(noise**2 - (coarse * rounded) ** 2, 0.0))
+    coarse = np.logical_and(step > 0, least > 0.5 * noise)
+    white = np.sqrt(np.maximum(noise**2 - (coarse * least) ** 2, 0.0))
     total, count = np.zeros(exact.shape), np.zeros(len(exact))
     for first in range(0, draws, _TOGETHER):
         many = min(_TOGETHER, draws - first)
         read = exact + white * rng.normal(size=(many, *exact.shape))
         size = np.where(coarse, step, 1.0)
-        read = np.where(coarse, np.round(read / size) * size, read)
+        # Of the same grid the fitted motion would give the readings it was fitted to.
+        phase = size * rng.uniform(size=(many, len(exact), 1, len(size)))
+        rounded = np.round((read + phase) / size) * size - phase
+        read = np.where(coarse, rounded, read)
         vectors = np.repeat(x[None], many, 0)
         at = np.broadcast_to(begin, (many, *begin.shape))
         _, errors = starts.fit(vectors, at, read)
