@@ -1,0 +1,75 @@
+"""How a fit ended: a result with a reason, never a number that is none."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from easi_jax.errors import UserError
+from easi_jax.estimation.from_runs import _contradiction
+from easi_jax.estimation.identifiability import ended, seed_result
+from easi_jax.estimation.posterior import diverged
+from easi_jax.model.parameters import Parameter, ParameterSpace
+from train._log_results import sound
+
+NAMES = ("kp", "kv")
+SPACE = ParameterSpace(
+    tuple(
+        Parameter(n, (f"actuator.a.{n}",), 1.0, (0.5, 2.0), (0.01, 100.0))
+        for n in NAMES
+    )
+)
+SURE = np.diag([1e4, 1e4])
+
+
+def found(mean: Any = (0.5, 0.5), **changes: Any) -> Any:
+    given: dict[str, Any] = {
+        "distribution": SimpleNamespace(mean=np.array(mean), factor=0.01 * np.eye(2)),
+        "cost": np.ones(3),
+        "hessian": SURE,
+        "fit": np.array(mean),
+        "excess": np.zeros(()),
+    }
+    return SimpleNamespace(**{**given, **changes})
+
+
+@pytest.mark.parametrize(
+    ("mean", "hessian", "outcome", "reason"),
+    [
+        ((0.5, 0.5), SURE, "converged", ""),
+        ((float(SPACE.unit_bounds[1][0]), 0.5), SURE, "at bound", "kp: wider bounds"),
+        ((0.5, 0.5), 0 * SURE, "not determined", "none of kp, kv"),
+    ],
+)
+def test_each_seed_says_how_its_fit_ended(
+    mean: Any, hessian: np.ndarray, outcome: str, reason: str
+) -> None:
+    result = seed_result(SPACE, np.array(mean), 1e-4 * np.eye(2), hessian)
+    assert result.outcome == outcome and reason in result.reason
+    assert ended(SPACE.names, result.flags) == (result.outcome, result.reason)
+
+
+def test_a_seed_that_diverged_has_a_reason_and_no_number() -> None:
+    lost = found((0.5, np.nan))
+    exploded = found(cost=np.full(3, np.inf))
+    assert not diverged(found(), NAMES)
+    assert diverged(lost, NAMES).endswith("not finite for kv")
+    assert "stays finite" in diverged(exploded, NAMES)
+    assert "not finite" in diverged(found(hessian=np.nan * SURE), NAMES)
+    good, why = sound((3, 7), (lost, found()), NAMES)
+    assert list(good) == [7] and list(why) == [3]
+    with pytest.raises(UserError, match=r"the fit diverged \(seed 3: .*kv"):
+        sound((3, 7), (lost, exploded), NAMES)
+
+
+def test_a_run_that_leads_elsewhere_is_named() -> None:
+    everything = found()
+    assert not _contradiction(SPACE, "a.csv", found((0.505, 0.5)), everything)
+    (line,) = _contradiction(SPACE, "a.csv", found((0.7, 0.5)), everything)
+    assert line.startswith("a.csv contradicts the other runs: alone it says kp 1.32")
+    # Not where the run determines nothing, or its fit is none.
+    assert not _contradiction(
+        SPACE, "a.csv", found((0.7, 0.5), hessian=0 * SURE), everything
+    )
+    assert not _contradiction(SPACE, "a.csv", found((np.nan, 0.5)), everything)
