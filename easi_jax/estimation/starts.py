@@ -196,8 +196,12 @@ class Starts:
         with np.errstate(divide="ignore", invalid="ignore"):
             free = np.maximum(self.rows * due / self.noise**2, 1.0)
             ratio = got / due / (1 - 2 / (9 * free)) ** 3
-        middle = np.nanmedian(np.where(np.isfinite(ratio), ratio, np.nan), 0)
-        return np.where(np.isfinite(self.noise), self.noise * np.sqrt(middle), np.inf)
+        out = np.full(len(self.noise), np.inf)
+        for c in np.flatnonzero(np.isfinite(self.noise)).tolist():
+            known = ratio[np.isfinite(ratio[:, c]), c]
+            if len(known):
+                out[c] = self.noise[c] * np.sqrt(np.median(known))
+        return out
 
 
 def floor(

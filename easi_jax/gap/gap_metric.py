@@ -15,6 +15,7 @@ from easi_jax.model.joint_space import (
     tangent_units,
     widths,
 )
+from easi_jax.model.results import UNMEASURED
 
 _VISIBLE = 5.0  # times the noise
 _ODD = 3.0  # times the error of other runs
@@ -79,7 +80,7 @@ def channels(
     scale = np.where(unbounded, change, spread)
     quiet = change < _VISIBLE * noise
     ignored = {
-        names[d]: "not measured"
+        names[d]: UNMEASURED
         if np.isinf(noise[d])
         else (
             f"moves by {change[d]:.2g} {units[d]} over a horizon, less than "

@@ -17,6 +17,9 @@ Curve = tuple[list[int], list[list[float]]]
 Values = Mapping[str, tuple[float, float, str]]  # value, standard deviation, unit
 
 
+UNMEASURED = "not measured"  # the reason why a joint without readings is no channel
+
+
 @dataclass(frozen=True)
 class NamedEffect:
     """One effect that a model lacks, or that is in a sensor's readings.

@@ -15,6 +15,7 @@ from easi_jax.io.report.numbers import (
 )
 from easi_jax.model.effect_catalog import CATALOG
 from easi_jax.model.results import (
+    UNMEASURED,
     ErrorMap,
     GapFigures,
     GapResult,
@@ -251,9 +252,10 @@ def _change(e: NamedEffect, none: str) -> str:
 
 
 def _channels(r: GapResult) -> list[tuple[str, str, float, float, float, float]]:
-    """Name, unit and errors of each channel."""
+    """Name, unit and errors of each channel that was measured."""
     sizes = (r.before.si, r.refit.si, r.after.si, r.floor_si)
-    return list(zip(r.channels, r.units, *sizes, strict=True))
+    every = zip(r.channels, r.units, *sizes, strict=True)
+    return [row for row in every if r.ignored.get(row[0]) != UNMEASURED]
 
 
 def _state(r: GapResult, name: str) -> str:
