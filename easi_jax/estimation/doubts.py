@@ -25,6 +25,8 @@ LATE = "commands come late"
 _LATE = 0.005  # s, or a control step, that commands may well be late: a deviation
 _FARTHEST = 3.0  # deviations that a simulation goes
 _NEVER = 1e-4  # deviations: at none at all the slope would be that of an early command
+_SHOWN = 4.0  # standard deviations from nothing, that are worth a note
+_SMALL = 0.02  # deviations before any data: nobody would look for so little
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,17 +107,23 @@ def without(fit: RefineResult, count: int) -> tuple[RefineResult, jax.Array]:
 
 def told(doubts: Doubts, found: np.ndarray) -> list[str]:
     """Notes on effects that the data show; ``found (k, 2)`` as of `without`."""
-    return [
-        f"{name}, by {mean * size:.2g} ± {std * size:.1g} {unit}, which the model does "
-        "not know: values are stated as if it did, so they are truer, but alone they "
-        "do not predict better. train.gap with these logs names what is missing; then "
-        "give --effects"
-        for name, unit, size, (mean, std) in zip(
-            doubts.names, doubts.units, doubts.deviations, found, strict=True
-        )
-        if mean > _SHOWN * std and mean > _SMALL
-    ]
-
-
-_SHOWN = 4.0  # standard deviations from nothing, that are worth a note
-_SMALL = 0.02  # deviations before any data: nobody would look for so little
+    step = doubts.simulator.dt / doubts.simulator.substeps
+    notes = []
+    for name, unit, size, (mean, std) in zip(
+        doubts.names, doubts.units, doubts.deviations, found, strict=True
+    ):
+        if mean <= _SHOWN * std or mean <= _SMALL:
+            continue
+        by = f"{name}, by {mean * size:.2g} ± {std * size:.1g} {unit}, which the model "
+        held = "does not know: values are stated as if it did"
+        if mean * size < step:
+            notes.append(
+                f"{by}{held} (a timestep of {step:g} s makes about half of itself; a "
+                "smaller one predicts better)"
+            )
+        else:
+            notes.append(
+                f"{by}{held}, so they are truer, but alone they do not predict better. "
+                "train.gap with these logs names what is missing; then give --effects"
+            )
+    return notes
