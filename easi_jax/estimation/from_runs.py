@@ -1,5 +1,6 @@
 """From measured runs to an estimate: the search's data, and its finish."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,8 +12,10 @@ import numpy as np
 
 from easi_jax.data import unmeasured
 from easi_jax.data.activations import activation_guess, activation_spread
+from easi_jax.data.noise import resolutions
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import Segments, to_device
+from easi_jax.data.windows import lead_rows
 from easi_jax.devices import distributed
 from easi_jax.devices.mesh import make_mesh, placed, replicated
 from easi_jax.devices.runtime import quick_compile
@@ -27,11 +30,12 @@ from easi_jax.estimation.posterior import (
     widened,
 )
 from easi_jax.estimation.prediction_error import (
-    errors_and_floor,
     misfit_of,
     outlier_weights,
+    rms_of_steps,
 )
 from easi_jax.estimation.problem import Problem
+from easi_jax.estimation.starts import Starts, better_noise, floor
 from easi_jax.model.joint_space import tangent_units
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.results import HeldOutErrors
@@ -42,6 +46,9 @@ from easi_jax.simulation.slopes import shift_start
 
 Tell = Callable[[str], None]
 
+_HELD_WINDOWS, _FIT_WINDOWS = 200, 96  # that errors are measured on, at most
+_DRAWS = 20  # of the noise of each, for the floor
+_FINEST = 1e-6  # of the motion: noise of a log that has none
 _STEPS = 500_000  # physics steps in a generation that are worth their time
 _PASSES = 3  # of the finish: the model's own error is learned from the one before
 _ENDINGS = 2  # on all pieces, with all doubts
@@ -339,32 +346,92 @@ def _contradiction(
 
 def ready_errors(
     problem: Problem, space: ParameterSpace
-) -> Callable[[jax.Array], tuple[Any, Any, Any]]:
-    """Compiles what takes SI parameters ``(n,)`` to
-    `easi_jax.estimation.prediction_error.errors_and_floor`."""
-    simulator, every = problem.simulator, max(1, problem.steps // 2)
-    held, fit = (
-        to_device(
-            segments_from_runs(simulator, runs, problem.steps, every, fitted=True)
+) -> Callable[[jax.Array], tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Compiles what takes SI parameters ``(n,)`` to RMS errors ``(nv,)`` of predicted
+    positions, held out and fitted, and what a perfect model would leave of the first.
+
+    By the measure of the log format: starts are fitted with the model's own dynamics,
+    and the floor goes through the same fit (`easi_jax.estimation.starts`). A window
+    whose prediction is not finite counts as an error of the largest motion.
+    """
+    simulator, nv = problem.simulator, problem.simulator.mj_model.nv
+    lead, every = lead_rows(simulator.dt), max(1, problem.steps // 2)
+    steps = lead + problem.steps
+
+    def cut(runs: Sequence[Run], most: int) -> Segments:
+        found = segments_from_runs(simulator, runs, steps, every, fitted=True)
+        return to_device(found.spread(most) if found.count > most else found)
+
+    held, fit = cut(problem.held, _HELD_WINDOWS), cut(problem.fit, _FIT_WINDOWS)
+    whole = jax.tree.map(lambda *x: jnp.concatenate(x), held, fit)
+    largest = np.asarray(jnp.abs(open_loop.motion(simulator, held)[..., :nv]))
+    largest = jnp.asarray(largest.max((0, 1)))
+
+    def errors(theta: Any, moved: Any) -> Any:
+        first = shift_start(simulator, whole, moved)
+        found = open_loop.errors_from(simulator, simulator.model(theta), first, whole)
+        return jnp.concatenate([moved[:, None, :nv], -found[..., :nv]], 1)
+
+    starts = _starts_of(problem, lead)
+    still = np.zeros((whole.count, len(starts.step)), np.float32)
+    like = placed((jnp.zeros(space.size), jnp.asarray(still)))
+    compiled = jax.jit(errors).lower(*like).compile(quick_compile())
+
+    def simulate(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        asked = [
+            placed((jnp.asarray(a, like[0].dtype), jnp.asarray(b, like[1].dtype)))
+            for a, b in zip(x, moved, strict=True)
+        ]
+        return np.stack([jax.device_get(compiled(*both)) for both in asked])
+
+    starts.simulate, rows = simulate, starts.noise
+    resolution = np.max([resolutions(r) for r in (*problem.fit, *problem.held)], 0)
+
+    def measured(theta: jax.Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        x = np.asarray(theta)
+        starts.noise = rows
+        moved, found = starts.solve(x, still)
+        starts.noise = better_noise(starts, found, rows, resolution / math.sqrt(12.0))
+        rng = np.random.default_rng(0)
+        least = floor(starts, x, moved, _DRAWS, resolution, rng)
+        after = found[:, lead + 1 :]
+        return (
+            np.asarray(rms_of_steps(jnp.asarray(after[: held.count]), largest)),
+            np.asarray(rms_of_steps(jnp.asarray(after[held.count :]), largest)),
+            np.sqrt(least[: held.count, lead + 1 :].mean((0, 1))),
         )
-        for runs in (problem.held, problem.fit)
+
+    return measured
+
+
+def _starts_of(problem: Problem, lead: int) -> Starts:
+    """Of windows that begin ``lead`` rows before they are measured from; what
+    simulates them is still to be set."""
+    m, runs = problem.simulator.mj_model, [*problem.fit, *problem.held]
+    moved = [r.configuration.difference(r.qpos[:1], r.qpos) for r in runs]
+    size = np.maximum(np.concatenate(moved).std(0), 1e-9)
+    noise = np.maximum(problem.noise[: m.nv], _FINEST * size)
+    seen = np.isfinite(noise)
+    wide = np.asarray(
+        spread_of_starts(m, runs, jnp.asarray(problem.noise), np.zeros(m.nv, bool))
     )
-    noise = _with_start_spread(problem)
-
-    def errors(theta: Any) -> Any:
-        model = simulator.model(theta)
-        return errors_and_floor(simulator, model, held, fit, noise, jax.random.key(0))
-
-    like = placed(jnp.zeros(space.size))
-    compiled = jax.jit(errors).lower(like).compile(quick_compile())
-    return lambda theta: jax.device_get(compiled(placed(theta)))
+    known = np.where(seen, noise, 0.0)
+    position = np.where(seen, np.maximum(30 * known, 0.03 * size), wide[: m.nv])
+    near = np.where(seen, np.maximum(3e-3 * size, 3 * known), 0.03 * wide[: m.nv])
+    return Starts(
+        lambda *_: np.zeros(0),
+        noise,
+        np.concatenate([position, np.maximum(wide[m.nv :], 1e-9)]),
+        2 * lead + 1,
+        np.concatenate([near, np.maximum(0.03 * wide[m.nv :], 1e-9)]),
+    )
 
 
 def held_out_errors(
     problem: Problem,
     space: ParameterSpace,
     means: Sequence[jax.Array],
-    errors_of: Callable[[jax.Array], tuple[Any, Any, Any]],
+    errors_of: Callable[[jax.Array], tuple[np.ndarray, np.ndarray, np.ndarray]],
 ) -> HeldOutErrors:
     """Open-loop errors of the model as given and at each of ``means (n,)``, unit
     coordinates, of the joints that were measured; ``errors_of`` is of `ready_errors`.

@@ -1,54 +1,8 @@
 """Errors of open-loop predictions of measured pieces, and what noise explains of
 them."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
-
-from easi_jax.data.segments import Segments
-from easi_jax.simulation import open_loop
-from easi_jax.simulation.simulator import Simulator
-from easi_jax.simulation.slopes import shift_start
-
-
-def errors_and_floor(
-    simulator: Simulator,
-    model: Any,
-    held: Segments,
-    fit: Segments,
-    noise: jax.Array,
-    key: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """RMS over all steps of the position error on ``held``, on ``fit``, and what the
-    first would be for a perfect model, ``(nv,)`` each.
-
-    For the floor noise ``(2 nv,)`` is drawn for starts and targets and pushed through
-    the model. A piece whose prediction is not finite counts as an error of the largest
-    motion in a piece that is held out, and in the floor as the noise alone.
-    """
-    nv = simulator.mj_model.nv
-    k_start, k_end = jax.random.split(key)
-    z = noise * jax.random.normal(k_start, (held.count, 2 * nv))
-    moved = shift_start(simulator, held, z)
-    # One simulation, since compiling it takes longer than running it.
-    every = jax.tree.map(lambda *x: jnp.concatenate(x), held, fit, moved)
-    states = open_loop.predict(simulator, model, every)
-    target = (every.next_qpos, every.next_qvel)
-    error = open_loop.prediction_residuals(simulator, states, target)[..., :nv]
-    sharp, noisy = (
-        jax.tree.map(lambda x, at=at: x[at], states)
-        for at in (slice(held.count), slice(held.count + fit.count, None))
-    )
-    shift = open_loop.prediction_residuals(simulator, sharp, noisy)[..., :nv]
-    shift = shift + noise[:nv] * jax.random.normal(k_end, shift.shape)
-    first, second = error[: held.count], error[held.count : held.count + fit.count]
-    largest = jnp.abs(open_loop.motion(simulator, held)[..., :nv]).max((0, 1))
-    return (
-        rms_of_steps(first, largest),
-        rms_of_steps(second, largest),
-        rms_of_steps(shift, noise[:nv]),
-    )
 
 
 def rms_of_steps(error: jax.Array, instead: jax.Array) -> jax.Array:

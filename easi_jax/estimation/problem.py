@@ -11,6 +11,7 @@ from easi_jax.data.cleaning import true_readings, trusted_velocity
 from easi_jax.data.measured import MeasuredRuns
 from easi_jax.data.recording import Run
 from easi_jax.data.unmeasured import hidden_in_any
+from easi_jax.data.windows import lead_rows
 from easi_jax.errors import UserError
 from easi_jax.estimation.pieces import visible_steps
 from easi_jax.model.found_effects import FoundEffects, joined
@@ -156,11 +157,12 @@ def problem_of(
 def _check_lengths(
     fit: Sequence[Run], held: Sequence[Run], steps: int, dt: float
 ) -> None:
+    lead = lead_rows(dt)
     for runs, what in ((fit, "to fit"), (held, "held out")):
         longest = max(runs, key=len)
-        if len(longest) <= steps:
+        if len(longest) <= steps + lead:
             raise UserError(
                 f"the longest run {what} ({longest.name}) has {len(longest)} rows, too "
-                f"few for a horizon of {steps} steps ({steps * dt:g} s): record more, "
-                "or shorten --horizon"
+                f"few for a horizon of {steps} steps ({steps * dt:g} s) and the {lead} "
+                "before it: record more, or shorten --horizon"
             )

@@ -23,6 +23,7 @@ _LINEARIZED = 4  # times, at most, that slopes are taken
 _WORTH = 0.05  # of half the weighted squared error of a row: worth new slopes
 _FAR = 2.0  # times what noise makes of a row: far off
 _NEAREST, _NEAR = 4, 3  # rows at least, and what part of them, that are met first
+_SAME_NOISE = 1.05  # times the noise that rows tell: as much
 _TOGETHER = 4  # draws of the noise that are simulated at once
 
 
@@ -202,6 +203,21 @@ class Starts:
             if len(known):
                 out[c] = self.noise[c] * np.sqrt(np.median(known))
         return out
+
+
+def better_noise(
+    starts: Starts, errors: np.ndarray, told: np.ndarray, least: np.ndarray
+) -> np.ndarray:
+    """Noise ``(c,)`` as the errors at fitted starts show it, where that is no more than
+    rows alone tell: rows may take motion for noise, and a model its own errors.
+
+    Args:
+        errors: of `Starts.fit`, ``(W, T, c)``.
+        told: by rows alone, ``(c,)``.
+        least: what resolution makes, ``(c,)``.
+    """
+    seen = np.maximum(starts.measured_noise(errors), least)
+    return np.where(seen < _SAME_NOISE * told, seen, told)
 
 
 def floor(

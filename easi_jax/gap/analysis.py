@@ -18,7 +18,7 @@ from easi_jax.data.noise import pooled, resolutions
 from easi_jax.data.recording import Run, physics_steps
 from easi_jax.data.windows import lead_rows
 from easi_jax.errors import UserError
-from easi_jax.estimation.starts import floor
+from easi_jax.estimation.starts import better_noise, floor
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.batched_least_squares import Bounds, bounds_of, window_weights
 from easi_jax.gap.candidates import places, ripples
@@ -65,7 +65,6 @@ _NOTHING = 1e-3  # of the largest error: a change that shows nowhere
 _STEPS_SEEN = 0.75  # of the floor: less is lost in noise
 _WHOLE = 1.15  # of the error of steps; a finer simulation leaves some of it
 _TOLD = 0.8  # of the gap without the own steps' error: worth a note
-_SAME_NOISE = 1.05  # times the noise that rows tell: the errors of starts tell better
 _LET_PASS = 0.05  # of what the model errs by, that no fit hangs on
 
 Tell = Callable[[str], None]
@@ -228,10 +227,8 @@ class Analysis:
                 "up from the measured states; check its timestep, masses and contacts, "
                 "or shorten --horizon"
             )
-        # Rows alone may have taken motion for noise, a model its own errors.
         least = known_noise(self.resolution / math.sqrt(12), self.scales)
-        told = np.maximum(starts.measured_noise(errors), least)
-        starts.noise = np.where(told < _SAME_NOISE * self.noise, told, self.noise)
+        starts.noise = better_noise(starts, errors, self.noise, least)
         self.held_out.starts.noise = starts.noise
         rms = np.sqrt(np.mean(errors.astype(float) ** 2, (0, 1)))
         chosen.residuals = make_residuals(

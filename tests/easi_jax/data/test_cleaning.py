@@ -3,14 +3,12 @@
 import dataclasses
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from easi_jax.data.cleaning import (
-    rows_of,
     split_at_resets,
     to_common_step,
     true_readings,
@@ -20,20 +18,19 @@ from easi_jax.data.cleaning import (
 from easi_jax.data.noise import estimate_noise
 from easi_jax.data.recording import Run
 from easi_jax.data.resampling import mean_held
-from easi_jax.data.segments import to_device
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.errors import UserError
+from easi_jax.estimation.from_runs import ready_errors
 from easi_jax.estimation.pieces import segments_from_runs, visible_steps
 from easi_jax.estimation.prediction_error import (
-    errors_and_floor,
     misfit_of,
     outlier_weights,
 )
+from easi_jax.estimation.problem import Problem
 from easi_jax.io.logs.reader import read_logs
 from easi_jax.model.found_effects import EffectEntry
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace, declare
-from easi_jax.simulation import open_loop
 from easi_jax.simulation.simulator import Simulator
 
 XML = """<mujoco><option timestep="0.01"/><worldbody><body>
@@ -261,38 +258,32 @@ def test_segments_never_cross_runs(simulator):
 def test_error_of_the_true_model_is_the_noise_floor(simulator):
     """Motion by MuJoCo C, noise added: errors are what the floor says."""
     model = simulator.mj_model
-    data = mujoco.MjData(model)
     rng = np.random.default_rng(3)
-    rows, sigma = 2000, 2e-3
-    ctrl = 5 * np.sin(0.03 * np.arange(rows))
-    qpos = np.empty(rows)
-    for t in range(rows):
-        qpos[t], data.ctrl[0] = data.qpos[0], ctrl[t]
-        mujoco.mj_step(model, data)
-    run = make_run(qpos + sigma * rng.standard_normal(rows))
-    run = dataclasses.replace(run, ctrl=ctrl[:, None])
-    pieces = to_device(segments_from_runs(simulator, [run], 20, 10, fitted=True))
-    noise = jnp.asarray(estimate_noise(run), jnp.float32)
-    truth = simulator.model(jnp.asarray(simulator.space.nominal, jnp.float32))
+    rows, sigma = 1500, 2e-3
 
-    def error_of(model: Any, pieces: Any) -> Any:
-        error = open_loop.errors(simulator, model, pieces)[..., :1]
-        return np.sqrt(np.mean(error**2, (0, 1)))
+    def recorded(phase: float) -> Any:
+        data = mujoco.MjData(model)
+        ctrl = 5 * np.sin(0.03 * np.arange(rows) + phase)
+        qpos = np.empty(rows)
+        for t in range(rows):
+            qpos[t], data.ctrl[0] = data.qpos[0], ctrl[t]
+            mujoco.mj_step(model, data)
+        run = make_run(qpos + sigma * rng.standard_normal(rows))
+        return dataclasses.replace(run, ctrl=ctrl[:, None])
 
-    error = error_of(truth, pieces)
-    odd = pieces.take(slice(1, None, 2))
-    key = jax.random.key(0)
-    same, on_odd, floor = errors_and_floor(simulator, truth, pieces, odd, noise, key)
-    np.testing.assert_allclose(error, floor, rtol=0.15)
-    np.testing.assert_allclose(same, error, rtol=1e-4)
-    np.testing.assert_allclose(on_odd, error_of(truth, odd), rtol=1e-4)
-    wrong = error_of(simulator.model(jnp.asarray([5.0])), pieces)
-    assert float(wrong[0]) > 2 * float(error[0])
-    first = rows_of(run, 0, 21)
-    one = to_device(segments_from_runs(simulator, [first], 20, 20, fitted=True))
-    again = error_of(truth, one)
-    assert one.count == 1
-    assert float(again[0]) < 5 * float(error[0])
+    fit, held = recorded(0.0), recorded(1.0)
+    asked = fit, held, estimate_noise(fit)
+    problem = Problem(
+        *("cart", simulator, [asked[0]], [asked[1]], "held", asked[2]),
+        *(np.zeros(1, bool), 20, 20, 20 * simulator.dt, []),
+    )
+    errors_of = ready_errors(problem, simulator.space)
+    first, second, least = errors_of(jnp.asarray(simulator.space.nominal))
+    np.testing.assert_allclose(first, least, rtol=0.1)
+    np.testing.assert_allclose(second, least, rtol=0.15)
+    wrong, _, noise = errors_of(jnp.asarray([5.0]))
+    assert wrong[0] > 2 * first[0]
+    assert noise[0] < 1.5 * least[0], "errors of a model are no noise"
 
 
 def test_misfit_counts_only_what_noise_does_not_explain():
