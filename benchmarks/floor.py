@@ -39,6 +39,7 @@ _SECONDS, _RUNS = 8.0, 3
 _NOISE, _COARSE = 1e-3, 4e-3  # rad; the step of coarse readings, noise of a tenth of it
 _SPEED_NOISE, _LATE = 0.02, 0.012  # rad/s, s
 _HORIZON, _TIMES = 0.2, 3.0  # s; floors that a hidden effect raises the gap to
+_CLEAR = 1.5  # floors: fewer is no gap that a verdict is about
 _STEP = 0.002  # s, of the physics at most
 
 
@@ -335,11 +336,14 @@ def paragraphs(rows: list[dict[str, Any]]) -> list[str]:
         ]
     if hidden:
         by_effect = {e: [r for r in hidden if r["hidden"] == e] for e in EFFECTS}
-        share = np.mean([_found(row) for row in hidden])
+        # Of a coupled joint that nobody reads the floor is higher than was reckoned.
+        clear = [row for row in hidden if row["refit_ratio"] >= _CLEAR]
+        share = np.mean([_found(row) for row in clear]) if clear else 0.0
         said += [
             "`python -m benchmarks.floor --hidden`: an effect that raises the gap to "
-            f"about three floors. Found by name: {100 * share:.0f} %, goal "
-            f"{100 * POWER:.0f} %: {met(share >= POWER)}.",
+            f"about three floors. It did raise it to {_CLEAR:g} at least in "
+            f"{len(clear)} of {len(hidden)} cases; of these it is found by name in "
+            f"{100 * share:.0f} %, goal {100 * POWER:.0f} %: {met(share >= POWER)}.",
             table(
                 [(e, some) for e, some in by_effect.items() if some],
                 {

@@ -1,6 +1,7 @@
 """Joints that nobody measured: which the model places, the guess, how far it may be."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import mujoco
@@ -38,7 +39,7 @@ def model(
     )
 
 
-def run_of(m: mujoco.MjModel, hidden: list[bool], rows: int = 60, **more) -> Run:
+def run_of(m: mujoco.MjModel, hidden: Sequence[float], rows: int = 60, **more) -> Run:
     c, t = Configuration.of(m), DT * np.arange(rows)
     qpos = np.tile(m.qpos0, (rows, 1))
     qpos[:, 0] = 0.6 * np.sin(4 * t)

@@ -1,5 +1,6 @@
 """The search is not told what nobody measured."""
 
+import dataclasses
 from dataclasses import replace
 
 import jax
@@ -39,7 +40,8 @@ def _recorded(m: mujoco.MjModel, rows: int) -> Run:
         mujoco.mj_step(m, d, 2)
     out[:, :, 1] = 0.0
     hidden = np.array([False, True])
-    return Run("r", "r", DT, t, *out, True, ctrl, c, hidden=hidden)
+    qpos, qvel = out
+    return Run("r", "r", DT, t, qpos, qvel, True, ctrl, c, hidden=hidden)
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +103,7 @@ def test_the_discriminator_is_not_told(
     outcome = jnp.ones((3, problem.piece * 4))
     told = np.asarray(search._told(data, outcome)).reshape(3, -1, 4)
     assert told[..., 0::2].all() and not told[..., 1::2].any()
-    assert search._told(data.replace(hidden=()), outcome) is outcome
+    assert search._told(dataclasses.replace(data, hidden=()), outcome) is outcome
     if innovations:
         state, info = jax.jit(search.step)(search.init(jax.random.key(0), data), data)
         assert np.isfinite(info.loss) and np.isfinite(state.mean).all()

@@ -194,7 +194,8 @@ def test_a_row_that_a_direction_barely_moves_does_not_spoil_the_search(
 ) -> None:
     """A contact opens at 0.5 m/s^2, the minimum is at 0.9 with only the mass left; the
     other contact, which rounding moves, would open far behind."""
-    rows = np.float32([[-0.5, -1e-3], [1.0, barely], [1e3, 1e3], [0, 0], [np.inf] * 2])
+    given = [[-0.5, -1e-3], [1.0, barely], [1e3, 1e3], [0.0, 0.0], [np.inf] * 2]
+    rows = np.array(given, np.float32)
     x, jv, stiff, low, high = map(jnp.asarray, rows)
     curve = jnp.float32(0.73)
     step = constraint_solver._exact_step(x, jv, stiff, low, high, -0.9 * curve, curve)
