@@ -7,8 +7,8 @@ import numpy as np
 from easi_jax.data.recording import Run
 from easi_jax.model.joint_space import Configuration
 
-FIT_SECONDS = 0.02
-FIT_ROWS = 5
+_FIT_SECONDS = 0.02
+_FIT_ROWS = 5
 MIN_STEPS = 10
 _START_ROWS = 5  # and seconds, on either side of a window's start, that it is fitted to
 _START_SECONDS = 0.03
@@ -112,25 +112,14 @@ def make_windows(
     )
 
 
-def velocity_weights(rows: int, row: int, dt: float) -> tuple[int, np.ndarray]:
-    """How `fitted_velocity` weighs the positions around a row of a run.
-
-    Returns:
-        First row that it reads, counted from ``row``, and the weights [1/s] of that and
-        the following rows.
-    """
-    low, high = (int(x) - row for x in _fitted_rows(rows, np.array(row), dt))
-    return low, _derivative_weights(low, high) / dt
-
-
 def _fitted_rows(
     rows: int, row: np.ndarray, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """First and last row of each row's own span: within reach, inside the run, at
-    least `FIT_ROWS` rows."""
-    reach = max(int(FIT_SECONDS / dt + 1e-6), FIT_ROWS // 2)
-    low = np.minimum(np.maximum(row - reach, 0), max(rows - FIT_ROWS, 0))
-    high = np.maximum(np.minimum(row + reach, rows - 1), min(FIT_ROWS, rows) - 1)
+    least `_FIT_ROWS` rows."""
+    reach = max(int(_FIT_SECONDS / dt + 1e-6), _FIT_ROWS // 2)
+    low = np.minimum(np.maximum(row - reach, 0), max(rows - _FIT_ROWS, 0))
+    high = np.maximum(np.minimum(row + reach, rows - 1), min(_FIT_ROWS, rows) - 1)
     return low, high
 
 

@@ -35,7 +35,15 @@ from easi_jax.estimation.prediction_error import (
     rms_of_steps,
 )
 from easi_jax.estimation.problem import Problem
-from easi_jax.estimation.starts import Starts, better_noise, floor
+from easi_jax.estimation.starts import (
+    DRAWS,
+    Simulate,
+    Starts,
+    better_noise,
+    floor,
+    known_noise,
+    starts_about,
+)
 from easi_jax.model.joint_space import tangent_units
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.results import HeldOutErrors
@@ -47,8 +55,6 @@ from easi_jax.simulation.slopes import shift_start
 Tell = Callable[[str], None]
 
 _HELD_WINDOWS, _FIT_WINDOWS = 200, 96  # that errors are measured on, at most
-_DRAWS = 20  # of the noise of each, for the floor
-_FINEST = 1e-6  # of the motion: noise of a log that has none
 _STEPS = 500_000  # physics steps in a generation that are worth their time
 _PASSES = 3  # of the finish: the model's own error is learned from the one before
 _ENDINGS = 2  # on all pieces, with all doubts
@@ -372,8 +378,7 @@ def ready_errors(
         found = open_loop.errors_from(simulator, simulator.model(theta), first, whole)
         return jnp.concatenate([moved[:, None, :nv], -found[..., :nv]], 1)
 
-    starts = _starts_of(problem, lead)
-    still = np.zeros((whole.count, len(starts.step)), np.float32)
+    still = np.zeros((whole.count, 2 * nv + simulator.mj_model.na), np.float32)
     like = placed((jnp.zeros(space.size), jnp.asarray(still)))
     compiled = jax.jit(errors).lower(*like).compile(quick_compile())
 
@@ -384,7 +389,8 @@ def ready_errors(
         ]
         return np.stack([jax.device_get(compiled(*both)) for both in asked])
 
-    starts.simulate, rows = simulate, starts.noise
+    starts = _starts_of(problem, lead, simulate)
+    rows = starts.noise
     resolution = np.max([resolutions(r) for r in (*problem.fit, *problem.held)], 0)
 
     def measured(theta: jax.Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -393,7 +399,7 @@ def ready_errors(
         moved, found = starts.solve(x, still)
         starts.noise = better_noise(starts, found, rows, resolution / math.sqrt(12.0))
         rng = np.random.default_rng(0)
-        least = floor(starts, x, moved, _DRAWS, resolution, rng)
+        least = floor(starts, x, moved, DRAWS, resolution, rng)
         after = found[:, lead + 1 :]
         return (
             np.asarray(rms_of_steps(jnp.asarray(after[: held.count]), largest)),
@@ -404,26 +410,21 @@ def ready_errors(
     return measured
 
 
-def _starts_of(problem: Problem, lead: int) -> Starts:
-    """Of windows that begin ``lead`` rows before they are measured from; what
-    simulates them is still to be set."""
+def _starts_of(problem: Problem, lead: int, simulate: Simulate) -> Starts:
+    """Of windows that begin ``lead`` rows before they are measured from."""
     m, runs = problem.simulator.mj_model, [*problem.fit, *problem.held]
     moved = [r.configuration.difference(r.qpos[:1], r.qpos) for r in runs]
     size = np.maximum(np.concatenate(moved).std(0), 1e-9)
-    noise = np.maximum(problem.noise[: m.nv], _FINEST * size)
-    seen = np.isfinite(noise)
-    wide = np.asarray(
-        spread_of_starts(m, runs, jnp.asarray(problem.noise), np.zeros(m.nv, bool))
-    )
-    known = np.where(seen, noise, 0.0)
-    position = np.where(seen, np.maximum(30 * known, 0.03 * size), wide[: m.nv])
-    near = np.where(seen, np.maximum(3e-3 * size, 3 * known), 0.03 * wide[: m.nv])
-    return Starts(
-        lambda *_: np.zeros(0),
-        noise,
-        np.concatenate([position, np.maximum(wide[m.nv :], 1e-9)]),
-        2 * lead + 1,
-        np.concatenate([near, np.maximum(0.03 * wide[m.nv :], 1e-9)]),
+    given = jnp.asarray(problem.noise), np.zeros(m.nv, bool)
+    wide = np.asarray(spread_of_starts(m, runs, *given))
+    return starts_about(
+        simulate,
+        known_noise(problem.noise, size),
+        size,
+        np.maximum(wide[m.nv : 2 * m.nv], 1e-9),
+        unmeasured.start_spread(m, runs, np.isinf(problem.noise[: m.nv])),
+        np.maximum(wide[2 * m.nv :], 1e-9),
+        lead,
     )
 
 

@@ -16,6 +16,12 @@ import numpy as np
 # Takes vectors (B, n) and offsets of starts (B, W, s); returns errors (B, W, T, c).
 Simulate = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
+DRAWS = 20  # of the noise of each window, for a floor, as the log format asks
+# A start may be off by so much from what the log says of it: so wide that the rows of
+# its window decide. A position, times its noise and its motion; speeds by their motion.
+_NOISES, _MOTION = 30.0, 0.03
+_DIFFERENCE = 3e-3, 0.03  # of positions and speeds, in units of their motion
+_FINEST = 1e-6  # of the motion: noise of a log that has none
 _ROUNDS = 6  # looks at each start
 _SHORTER = 0.3  # times the step of a start that was not improved
 _SETTLED = 0.02  # of half the weighted squared error: no step is worth less
@@ -204,6 +210,46 @@ class Starts:
             if len(known):
                 out[c] = self.noise[c] * np.sqrt(np.median(known))
         return out
+
+
+def known_noise(noise: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Noise of positions ``(nv,)``, above zero; ``position`` is their motion."""
+    return np.maximum(noise[: len(position)], _FINEST * position)
+
+
+def starts_about(
+    simulate: Simulate,
+    noise: np.ndarray,
+    position: np.ndarray,
+    speed: np.ndarray,
+    free: np.ndarray,
+    act: np.ndarray,
+    lead: int,
+) -> Starts:
+    """Starts of windows that begin where a log says, ``lead`` rows early.
+
+    Args:
+        simulate: as for `Starts`.
+        noise: of positions, `known_noise`; infinite where nobody measured.
+        position, speed: motion of each degree of freedom, ``(nv,)``.
+        free: how far what nobody measured may be off, ``(2 nv,)``; infinite elsewhere.
+        act: how far activations may be off, ``(na,)``.
+    """
+    known = np.where(np.isfinite(noise), noise, 0.0)
+    small, part = _DIFFERENCE
+    wide = np.maximum(_NOISES * known, _MOTION * position)
+    # Nothing but the model speaks of what nobody measured.
+    spread = np.where(np.isfinite(free), free, np.concatenate([wide, speed]))
+    near = np.maximum(small * position, 3.0 * known)
+    near = np.concatenate([near, part * speed])
+    step = np.where(np.isfinite(free), part * spread, near)
+    return Starts(
+        simulate,
+        noise,
+        np.concatenate([spread, act]),
+        2 * lead + 1,
+        np.concatenate([step, part * act]),
+    )
 
 
 def better_noise(

@@ -7,7 +7,7 @@ import numpy as np
 
 from easi_jax.data.recording import Run
 from easi_jax.data.windows import lead_rows
-from easi_jax.estimation.starts import Starts
+from easi_jax.estimation.starts import Starts, known_noise
 from easi_jax.excite.separation import Design
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.batched_least_squares import Bounds
@@ -16,7 +16,7 @@ from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.table import Place
 from easi_jax.gap.whitening import make_residuals
 from easi_jax.gap.window_set import WindowSet, join, window_set
-from easi_jax.gap.window_starts import known_noise, window_starts
+from easi_jax.gap.window_starts import window_starts
 from easi_jax.model.effect_catalog import Scales
 from easi_jax.model.parameters import ParameterSpace
 
@@ -82,7 +82,7 @@ def products_of(
     """
     p, nv = design.predictor, m.nv
     windows, lead = join(list(parts)), lead_rows(runs[0].dt)
-    starts = window_starts(m, p, runs, scales, known_noise(noise, scales))
+    starts = window_starts(m, p, runs, scales, known_noise(noise, scales.position))
     still = np.zeros((len(windows), p.size))
     moved, _ = starts.solve(design.base, still)
     groups: list[np.ndarray] = []

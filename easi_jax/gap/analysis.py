@@ -18,7 +18,7 @@ from easi_jax.data.noise import pooled, resolutions
 from easi_jax.data.recording import Run, physics_steps
 from easi_jax.data.windows import lead_rows
 from easi_jax.errors import UserError
-from easi_jax.estimation.starts import better_noise, floor
+from easi_jax.estimation.starts import DRAWS, better_noise, floor, known_noise
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.batched_least_squares import Bounds, bounds_of, window_weights
 from easi_jax.gap.candidates import places, ripples
@@ -26,7 +26,7 @@ from easi_jax.gap.discretization_error import error_of_steps, within_a_step
 from easi_jax.gap.effect_set import Candidate, Model
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.forward_selection import Selector, shortlist
-from easi_jax.gap.held_out import DRAWS, HeldOut
+from easi_jax.gap.held_out import HeldOut
 from easi_jax.gap.model_comparison import (
     HELPS,
     better,
@@ -42,7 +42,7 @@ from easi_jax.gap.table import Place, covered, does
 from easi_jax.gap.verdict import openness, surely_better, verdict_of
 from easi_jax.gap.whitening import make_residuals
 from easi_jax.gap.window_set import WindowSet, join, reach, spread, window_set
-from easi_jax.gap.window_starts import known_noise, window_starts
+from easi_jax.gap.window_starts import window_starts
 from easi_jax.io.runs.step_cache import key_of
 from easi_jax.model.joint_space import is_hinge, scalar_dofs
 from easi_jax.model.parameters import ParameterSpace
@@ -96,7 +96,7 @@ class Analysis:
         dt = fit[0].dt
         self.lead = lead_rows(dt)
         self.scales = scales_of(mj_model, fit)
-        self.noise = known_noise(np.asarray(noise), self.scales)
+        self.noise = known_noise(np.asarray(noise), self.scales.position)
         self.everywhere = places(mj_model, self.scales)
         self.places = [p for p in self.everywhere if not covered(p, space, mj_model)]
         self.ripples = [
@@ -227,7 +227,7 @@ class Analysis:
                 "up from the measured states; check its timestep, masses and contacts, "
                 "or shorten --horizon"
             )
-        least = known_noise(self.resolution / math.sqrt(12), self.scales)
+        least = known_noise(self.resolution / math.sqrt(12), self.scales.position)
         starts.noise = better_noise(starts, errors, self.noise, least)
         self.held_out.starts.noise = starts.noise
         rms = np.sqrt(np.mean(errors.astype(float) ** 2, (0, 1)))

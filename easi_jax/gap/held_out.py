@@ -7,15 +7,13 @@ import mujoco
 import numpy as np
 
 from easi_jax.data.recording import Run
-from easi_jax.estimation.starts import Starts, floor
+from easi_jax.estimation.starts import DRAWS, Starts, floor
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.error_localization import Conditions
 from easi_jax.gap.gap_metric import Channels
 from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.result import Figures
 from easi_jax.gap.window_set import Rows, WindowSet
-
-DRAWS = 20  # of the noise of each window, as the log format asks
 
 
 @dataclass
