@@ -1,6 +1,7 @@
 # make demo   set up, train and identify Cartpole, print the results
 # make test   set up, lint, type-check and test
-# make test-slow   every test, as users compile, with the coverage of lines; hours
+# make test-slow   every test, as users compile, with the coverage of lines; hours,
+#                  and goes on where it was stopped
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -24,9 +25,7 @@ test: $(DEV_STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations=10
 
 test-slow: $(DEV_STAMP)
-	EASI_JAX_TESTS=optimized $(BIN)/python -m pytest -n 2 --dist loadfile \
-	    --no-loadscope-reorder -m 'not gpu' --durations=25 \
-	    --cov=easi_jax --cov=envs --cov=train --cov-report=term-missing:skip-covered
+	$(BIN)/python -m benchmarks.slow_tests
 
 install: $(RUN_STAMP)
 

@@ -4,6 +4,7 @@ A run that was stopped goes on, and several processes or batch jobs share the wo
 ``--shard`` (the second of four is 2/4) or ``--only``.
 """
 
+import concurrent.futures
 import contextlib
 import dataclasses
 import fcntl
@@ -35,12 +36,17 @@ def run_cells(
     share: Share,
     solve: Callable[[Any], dict[str, Any]],
     told: Callable[[dict[str, Any]], str],
+    *,
+    workers: int = 1,
+    passed: Callable[[dict[str, Any]], bool] = lambda row: True,
 ) -> None:
     """Runs the cells that have no line yet; each is a dataclass with a ``key``.
 
     Args:
         solve: runs a cell and returns what its line says of it.
         told: what is said of a line.
+        workers: threads that run cells, for cells that are processes of their own.
+        passed: whether a cell with this line is done.
 
     Raises:
         UserError: no such cell, or no such part.
@@ -55,18 +61,32 @@ def run_cells(
     if not every:
         raise UserError("no cells: none of these methods can run here")
     part, parts = shard(share.shard)
-    done = {row["key"] for row in read_rows(share.out, ("key",))}
+    done = {row["key"] for row in read_rows(share.out, ("key",)) if passed(row)}
     if share.list:
         for c in every:
             say(f"{'done' if c.key in done else 'open'}  {c.key}")
         return
     check_out(share.out)
-    for c in every[part - 1 :: parts]:
-        if c.key in done:
-            continue
+
+    def one(c: Any) -> None:
         row = {"key": c.key, **dataclasses.asdict(c), **solve(c)}
         add_row(share.out, {**row, "versions": versions()})
         say(f"{c.key}: {told(row)}")
+
+    left = [c for c in every[part - 1 :: parts] if c.key not in done]
+    if workers == 1:
+        for c in left:
+            one(c)
+        return
+    with concurrent.futures.ThreadPoolExecutor(workers) as pool:
+        for ended in concurrent.futures.as_completed(
+            [pool.submit(one, c) for c in left]
+        ):
+            try:
+                ended.result()
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
 
 
 def shard(text: str) -> tuple[int, int]:
