@@ -22,20 +22,20 @@ def activation_guess(m: mujoco.MjModel, run: Run) -> np.ndarray:
     """Activations at each row of a run as far as commands and positions tell,
     ``(T, na)``.
 
-    A filter or a muscle follows its commands, from the first one on. An integrator of a
-    servo is where its transmission is; any other one sums its commands.
+    A filter or a muscle follows its commands, from the first known one on. An
+    integrator of a servo is where its transmission is; any other one sums its commands.
     """
     out = np.zeros((len(run), m.na))
-    lengths = _lengths(m, run) if _servos(m) else None
+    lengths, known = _lengths(m, run) if _servos(m) else None, len(run.before)
     for i, at in _places(m).items():
-        u = _clipped(run.ctrl[:, i], bool(m.actuator_ctrllimited[i]), m, i)
+        u = _clipped(run.sent_until[:, i], bool(m.actuator_ctrllimited[i]), m, i)
         if m.actuator_dyntype[i] in _FOLLOWING:
-            path = _followed(u, run.dt, float(m.actuator_dynprm[i, 0]))
+            path = _followed(u, run.dt, float(m.actuator_dynprm[i, 0]))[known:]
         elif i in _servos(m):
             assert lengths is not None
             path = lengths[:, i]
         elif m.actuator_dyntype[i] == _INTEGRATOR:
-            path = np.concatenate([[0.0], np.cumsum(u[:-1])]) * run.dt
+            path = np.concatenate([[0.0], np.cumsum(u[:-1])])[known:] * run.dt
         else:
             path = np.zeros(len(run))
         if m.actuator_actlimited[i]:

@@ -96,6 +96,7 @@ def split_at_resets(
         derived = _derived(run)
         for k, p in enumerate(whole, 1):
             part = rows_of(run, int(p[0]), int(p[-1]) + 1)
+            part = replace(part, before=run.ctrl[:0])  # a reset
             if derived.any():
                 speed = fitted_velocity(part.qpos, part.dt, part.configuration)
                 part = replace(part, qvel=np.where(derived, speed, part.qvel))
@@ -172,6 +173,7 @@ def to_common_step(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
                 qpos=even.qpos,
                 qvel=qvel,
                 ctrl=mean_held(run.time, sent, even.time, dt),
+                before=sent[:0],
                 sent=None,
                 sensors=even.sensors,
             )
@@ -184,9 +186,11 @@ def to_common_step(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
 
 
 def rows_of(run: Run, first: int, last: int) -> Run:
+    """Some rows of a run, with the commands that were sent before them."""
     part = slice(first, last)
     return replace(
         run,
+        before=np.concatenate([run.before, run.ctrl[:first]]),
         time=run.time[part],
         qpos=run.qpos[part],
         qvel=run.qvel[part],

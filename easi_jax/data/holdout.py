@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -9,41 +10,34 @@ import numpy as np
 from easi_jax.data.cleaning import rows_of
 from easi_jax.data.drive_forces import exertion
 from easi_jax.data.recording import Run
+from easi_jax.data.windows import lead_rows, window_steps
 from easi_jax.errors import UserError
 
 HELD_OUT = 0.25  # of the rows, where whole runs are held out
-LAST = 0.3  # of a single run
+_OF_ONE = 0.3  # of a single run
+_BLOCKS = 3  # in which that lies, where each has room for two horizons
 _REACHED = 99.8  # percentile
 _FURTHER = 4.0  # times as bad as not as far: what fits never see cannot be found
 
 
 def split_held_out(
-    m: mujoco.MjModel, runs: Sequence[Run], gap_s: float
+    m: mujoco.MjModel, runs: Sequence[Run], horizon: float
 ) -> tuple[list[Run], list[Run], str]:
     """Runs to fit, runs held out, and a sentence that says which.
 
     Of two runs or more, whole runs with a quarter of the rows, and hardly more, whose
     speeds and drive forces reach about as far as those of the runs left to fit, and
-    rather less far than further; of equals the last. Of a single run its last 30 %
-    behind a gap of ``gap_s`` seconds.
+    rather less far than further; of equals the last. Of a single run blocks that are
+    spread over it (`_blocks_of`).
+
+    Args:
+        horizon: of predictions [s].
 
     Raises:
         UserError: a single run too short to be split.
     """
     if len(runs) == 1:
-        run = runs[0]
-        first = round((1 - LAST) * len(run))
-        last = first - math.ceil(gap_s / run.dt)
-        if last < 2 or len(run) - first < 2:
-            raise UserError(
-                f"{run.source}: {len(run)} rows are too few to hold some out behind a "
-                f"gap of {gap_s:g} s: record more, or shorten --horizon"
-            )
-        return (
-            [rows_of(run, 0, last)],
-            [rows_of(run, first, len(run))],
-            f"the last {100 * LAST:.0f} % of {run.name}",
-        )
+        return _blocks_of(runs[0], horizon)
     total = sum(len(run) for run in runs)
     reach = np.array([_reach(m, run) for run in runs])
 
@@ -68,6 +62,42 @@ def split_held_out(
         held,
         ", ".join(run.name for run in held),
     )
+
+
+def _blocks_of(run: Run, horizon: float) -> tuple[list[Run], list[Run], str]:
+    """30 % of a run in three blocks, each in the middle of a third of it and behind a
+    gap of one horizon; where those would be shorter than two horizons in two, else the
+    last 30 %. What is left between them are runs to fit.
+    """
+    rows, gap = len(run), window_steps(run.dt, horizon)
+    least = lead_rows(run.dt) + gap + 1  # of one prediction
+    if _OF_ONE * rows < least:
+        raise UserError(
+            f"{run.source}: {rows} rows ({rows * run.dt:.3g} s) are too few to hold "
+            f"some out with a horizon of {horizon:g} s, which needs "
+            f"{math.ceil(least / _OF_ONE)}: record more, or shorten --horizon"
+        )
+    room = int(_OF_ONE * rows / (least + gap))
+    count = min(max(room, 1), _BLOCKS)
+    size = round(_OF_ONE * rows / count)
+    first = [round((k + 0.5) * rows / count - size / 2) for k in range(count)]
+    if count == 1:
+        first = [rows - size]
+    begin = [0, *(f + size for f in first)]
+    end = [*(f - gap for f in first), rows]
+    fit = [_piece(run, *of) for of in zip(begin, end, strict=True) if of[0] < of[1]]
+    held = [_piece(run, f, f + size) for f in first]
+    times = ", ".join(_span(part) for part in held)
+    return fit, held, f"{100 * _OF_ONE:.0f} % of {run.name}: {times}"
+
+
+def _piece(run: Run, first: int, last: int) -> Run:
+    part = replace(rows_of(run, first, last), part_of=run.recording)
+    return replace(part, name=f"{run.name}, {_span(part)}")
+
+
+def _span(run: Run) -> str:
+    return f"{run.time[0]:.2f} to {run.time[-1]:.2f} s"
 
 
 def _reach(m: mujoco.MjModel, run: Run) -> np.ndarray:

@@ -35,6 +35,10 @@ class Run:
         hidden: degrees of freedom that nobody measured, ``(nv,)`` bool; whole joints.
             Their ``qpos`` and ``qvel`` are a guess (`easi_jax.data.unmeasured`). None
             are hidden where it is not given.
+        before: commands sent in the rows before the first, oldest first, ``(D, nu)``;
+            none where nothing is known of them.
+        part_of: name of the recording that the run was cut out of; empty where it is
+            whole.
         stamps: times of the rows as they were recorded [s]; None where they were even,
             and nothing was interpolated.
         sent: mean over each step of the commands held in it, ``(T, nu)``; None where
@@ -54,15 +58,29 @@ class Run:
     stamps: np.ndarray | None = None
     sent: np.ndarray | None = None
     hidden: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    before: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    part_of: str = ""
 
     def __post_init__(self) -> None:
         if not len(self.hidden):
             nothing = np.zeros(self.configuration.nv, bool)
             object.__setattr__(self, "hidden", nothing)
+        if not len(self.before):
+            object.__setattr__(self, "before", self.ctrl[:0])
 
     def __len__(self) -> int:
         """Number of rows, T."""
         return len(self.time)
+
+    @property
+    def recording(self) -> str:
+        """Name of the recording that the run is, or was cut out of."""
+        return self.part_of or self.name
+
+    @property
+    def sent_until(self) -> np.ndarray:
+        """Commands of all rows, and of those `before` them, ``(D + T, nu)``."""
+        return np.concatenate([self.before, self.ctrl])
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +108,8 @@ def check_run(run: Run, mj_model: mujoco.MjModel) -> None:
     sizes = {"time": (), "qpos": (mj_model.nq,), "qvel": (mj_model.nv,)}
     for name, size in {**sizes, "ctrl": (mj_model.nu,)}.items():
         checked_array(f"{run.name}: {name}", getattr(run, name), (len(run), *size))
+    size = len(run.before), mj_model.nu
+    checked_array(f"{run.name}: before", run.before, size)
     hidden = np.asarray(run.hidden)
     if hidden.shape != (mj_model.nv,) or hidden.dtype != bool:
         raise UserError(

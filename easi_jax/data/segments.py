@@ -19,7 +19,7 @@ class Segments:
             ``(M, H, nv)``.
         weight: ``(M,)``, 1 where the piece counts, 0 beyond an episode's end.
         past: commands before the start, oldest first, ``(M, D, nu)``; what comes before
-            a run's or an episode's first command is that command. () where no
+            the first known command of a run or an episode is that command. () where no
             simulation has use for them.
         act: activations of the start, ``(M, na)``, of a log a guess; () where the model
             has none. Zero where they are left out.
@@ -66,16 +66,19 @@ def cut(
     every: int,
     past: int = 0,
     act: np.ndarray | None = None,
+    before: np.ndarray | None = None,
 ) -> Segments | None:
     """Segments of one uninterrupted recording ``(T, ...)``, None if too short.
 
     ``past``: how many commands before each start they hold. ``act``: activations at
-    each row, ``(T, na)``.
+    each row, ``(T, na)``. ``before``: commands before the first row, ``(D, nu)``.
     """
     starts = np.arange(0, len(qpos) - horizon, every)
     if not len(starts):
         return None
     steps = starts[:, None] + np.arange(horizon)
+    sent = ctrl if before is None else np.concatenate([before, ctrl])
+    earlier = len(sent) - len(ctrl) + starts[:, None] + np.arange(-past, 0)
     return Segments(
         qpos=qpos[starts],
         qvel=qvel[starts],
@@ -83,7 +86,7 @@ def cut(
         next_qpos=qpos[steps + 1],
         next_qvel=qvel[steps + 1],
         weight=np.ones(len(starts)),
-        past=ctrl[np.maximum(starts[:, None] + np.arange(-past, 0), 0)] if past else (),
+        past=sent[np.maximum(earlier, 0)] if past else (),
         act=act[starts] if act is not None and act.shape[1] else (),
     )
 

@@ -75,6 +75,11 @@ def lead_rows(dt: float) -> int:
     return max(_START_ROWS, round(_START_SECONDS / dt))
 
 
+def window_steps(dt: float, horizon_s: float) -> int:
+    """Control steps of a horizon: to the nearest, at least `MIN_STEPS`."""
+    return max(MIN_STEPS, round(horizon_s / dt))
+
+
 def make_windows(
     run: Run, horizon_s: float, every_s: float | None = None, lead: int = 0
 ) -> Windows:
@@ -95,7 +100,7 @@ def make_windows(
     """
     if horizon_s <= 0 or (every_s is not None and every_s <= 0):
         raise ValueError("horizon and spacing of windows must be positive")
-    steps = max(MIN_STEPS, round(horizon_s / run.dt))
+    steps = window_steps(run.dt, horizon_s)
     spacing = steps / 2 if every_s is None else every_s / run.dt
     stride = max(1, round(spacing))
     steps += lead

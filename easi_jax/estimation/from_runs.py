@@ -165,7 +165,7 @@ class _Finish:
 
     Attributes:
         whole: all pieces, M of them; `pieces` those that many trials are made with.
-        owner: run of each of ``whole``, ``(M,)``.
+        owner: recording of each of ``whole``, ``(M,)``.
         hidden: misfit that leaves out velocities that were derived from positions.
         start: what is known of starts.
         doubts: what the model may lack; None where nothing is refined.
@@ -193,7 +193,7 @@ class _Finish:
         whole = to_device(whole)
         self.whole = replace(whole, weight=whole.weight * every / self.steps)
         starts = [len(range(0, len(r) - self.steps, every)) for r in problem.fit]
-        self.owner = np.repeat(np.arange(len(starts)), starts)
+        self.owner = np.repeat([r.recording for r in problem.fit], starts)
         self.pieces = few(simulator, self.whole) if refined else self.whole
         self.noise = jnp.asarray(problem.noise, jnp.result_type(float))
         # Velocities derived from the positions say nothing that those do not.
@@ -311,13 +311,13 @@ class _Finish:
         return notes + self.contradictions(found, weight)
 
     def contradictions(self, found: Estimate, weight: jax.Array) -> list[str]:
-        """Notes on runs that lead elsewhere than all of them together do."""
-        runs = self.problem.fit
-        if not (self.more and 2 <= len(runs) <= _COMPARED):
+        """Notes on recordings that lead elsewhere than all of them together do."""
+        names = list(dict.fromkeys(run.recording for run in self.problem.fit))
+        if not (self.more and 2 <= len(names) <= _COMPARED):
             return []
         notes = []
-        for i, run in enumerate(runs):
-            mine = self.whole.weight * weight * (self.owner == i)
+        for name in names:
+            mine = self.whole.weight * weight * (self.owner == name)
             if not np.any(mine > 0):
                 continue
             given = (
@@ -325,7 +325,7 @@ class _Finish:
                 *(replace(self.whole, weight=mine), found.misfit),
             )
             alone = distributed.local(self._end(*placed(given)))[0]
-            notes += _contradiction(self.search.space, run.name, alone, found)
+            notes += _contradiction(self.search.space, name, alone, found)
         return notes
 
 

@@ -76,8 +76,8 @@ def segments_from_runs(
             else trusted_velocity(run)
         )
         act = activation_guess(simulator.mj_model, run)
-        given = run.qpos, qvel, run.ctrl, horizon, every, simulator.past_steps, act
-        parts.append(cut(*given))
+        given = run.qpos, qvel, run.ctrl, horizon, every, simulator.past_steps
+        parts.append(cut(*given, act, run.before))
     whole = [p for p in parts if p is not None]
     if not whole:
         longest = max(runs, key=len)

@@ -305,7 +305,8 @@ class Analysis:
     def disagreeing(
         self, x: np.ndarray, kept: Figures, floor: float
     ) -> dict[str, float]:
-        """Runs whose windows are predicted far worse than the others', by how much.
+        """Recordings whose windows are predicted far worse than the others', by how
+        much.
 
         ``kept``: the held-out figures at ``x``; ``floor``: the gap of a perfect model.
         """
@@ -313,13 +314,15 @@ class Analysis:
         fitted = self.fit_starts.fit(x[None], moved[None])[1][0, :, self.lead + 1 :]
         fitted, _ = measure.finite(fitted, self.predictor.largest)
         square = np.concatenate([measure.squares(fitted), kept.square])
-        run = np.concatenate([self.fit_windows.run, self.held_out.windows.run])
+        names = list(dict.fromkeys(run.recording for run in self.runs))
+        of = np.array([names.index(run.recording) for run in self.runs])
+        run = of[np.concatenate([self.fit_windows.run, self.held_out.windows.run])]
         scale = self.channels.scale
         if len(np.unique(run)) == 2:
             odd = measure.odd_of_two(square, scale, run, floor)
         else:
             odd = measure.odd_runs(square, scale, run)
-        return {self.runs[r].name: ratio for r, ratio in odd.items()}
+        return {names[r]: ratio for r, ratio in odd.items()}
 
     # -- the whole -------------------------------------------------------------
 

@@ -90,9 +90,14 @@ class Conditions:
     def general(self) -> dict[str, np.ndarray]:
         """Those that hold for the whole machine."""
         w = self._windows
-        length = np.array([len(self._runs[r]) for r in w.run])
+        row = w.row + np.array([len(self._runs[r].before) for r in w.run])
+        length: dict[str, int] = {}
+        for run in self._runs:
+            known = max(length.get(run.recording, 0), len(run.before) + len(run))
+            length[run.recording] = known
+        whole = np.array([length[self._runs[r].recording] for r in w.run])
         out = {
-            "late in the recordings": w.row > length * (2 / 3),
+            "late in the recordings": row > whole * (2 / 3),
         }
         if self._m.nu:
             out["when the command jumps"] = _largest(self._jumps.max(1))

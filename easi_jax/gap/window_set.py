@@ -29,8 +29,8 @@ class WindowSet:
         start_qpos: measured positions there, ``(W, nq)``.
         start_act: activations there as far as commands tell, ``(W, na)``.
         ctrl: ``(W, H, nu)``.
-        past: commands before, oldest first, ``(W, D, nu)``; before a run's first row
-            its first command.
+        past: commands before, oldest first, ``(W, D, nu)``; before a run's first
+            known command that command.
         past_qpos: positions in those rows, ``(W, D, nq)``.
         past_qvel: fitted velocities there, ``(W, D, nv)``; at rest before a run.
         read: way from the start to the positions of the rows from ``L + 1`` before it
@@ -126,7 +126,7 @@ def _windows_of(
         start_qpos=run.qpos[w.start_row],
         start_act=activation_guess(m, run)[w.start_row],
         ctrl=w.ctrl,
-        past=run.ctrl[inside(before)],
+        past=run.sent_until[np.maximum(len(run.before) + before, 0)],
         past_qpos=run.qpos[inside(before)],
         past_qvel=moving(before),
         read=run.configuration.difference(run.qpos[start], run.qpos[inside(seen)]),

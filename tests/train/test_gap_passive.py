@@ -50,6 +50,7 @@ def test_friction_of_a_pendulum_that_nobody_drives(
     told = read(out / "gap.json")
     found = {e["effect"]: e for e in told["effects"]}
     assert set(found) <= {"coulomb_friction", "stribeck_friction"} and found
+    assert told["held_out"][0] == "log, 0.82 to 1.51 s" and len(told["held_out"]) == 3
     assert told["not_finite"] == 0 and told["where"][0]["at"] == "swing"
     assert not any("left out: " in note for note in told["notes"])
     page = (out / "report.html").read_text()

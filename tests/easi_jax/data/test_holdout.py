@@ -52,12 +52,38 @@ def test_runs_to_fit_reach_as_far_as_those_held_out():
     assert top[1] <= top[0] <= 1.1 * top[1]
 
 
-def test_a_single_run_is_split_behind_a_gap():
-    run = make_run(np.arange(100.0))
-    (fit,), (held,), name = split_held_out(SLIDE, [run], 0.2)
-    assert held.qpos[0, 0] == 70
-    assert len(held) == 30
-    assert fit.qpos[-1, 0] == 49  # 20 steps before
-    assert "30 %" in name
-    with pytest.raises(UserError, match="too few"):
-        split_held_out(SLIDE, [make_run(np.zeros(30))], 0.3)
+def first_and_last(runs):
+    return [(int(r.qpos[0, 0]), int(r.qpos[-1, 0])) for r in runs]
+
+
+def test_of_a_single_run_blocks_behind_gaps_are_held_out():
+    run = make_run(np.arange(1000.0), "arm")
+    fit, held, name = split_held_out(SLIDE, [run], 0.2)
+    assert first_and_last(held) == [(117, 216), (450, 549), (783, 882)]
+    gap = 20  # rows of one horizon before each block
+    want = [(0, 116 - gap), (217, 449 - gap), (550, 782 - gap), (883, 999)]
+    assert first_and_last(fit) == want
+    assert name == "30 % of arm: 1.17 to 2.16 s, 4.50 to 5.49 s, 7.83 to 8.82 s"
+    names = [r.name for r in (*fit, *held)]
+    assert len(set(names)) == len(names)
+    assert "arm, 2.17 to 4.29 s" in names
+    assert {r.recording for r in (*fit, *held)} == {"arm"}
+    for part in (*fit, *held):  # what was sent before a piece is known
+        first = int(part.qpos[0, 0])
+        np.testing.assert_array_equal(part.sent_until, run.ctrl[: first + len(part)])
+
+
+def test_blocks_of_a_short_run_are_fewer():
+    # A prediction of 20 steps, 5 rows before it, and 20 more for a second one.
+    fit, held, _ = split_held_out(SLIDE, [make_run(np.arange(330.0))], 0.2)
+    assert len(held) == 2
+    assert all(len(r) >= 46 for r in held)
+    assert all(len(r) > 25 for r in fit), "each has room for a window"
+    (fit,), (held,), _ = split_held_out(SLIDE, [make_run(np.arange(100.0))], 0.2)
+    assert first_and_last([fit, held]) == [(0, 49), (70, 99)]
+
+
+def test_a_run_with_no_room_for_a_prediction_is_refused():
+    split_held_out(SLIDE, [make_run(np.zeros(87))], 0.2)
+    with pytest.raises(UserError, match="needs 87: record more"):
+        split_held_out(SLIDE, [make_run(np.zeros(86))], 0.2)
