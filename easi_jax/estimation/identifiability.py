@@ -7,6 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from easi_jax.estimation.least_squares import (
+    AT_BOUND,
+    CONVERGED,
+    NOT_DETERMINED,
+    OUTCOMES,
+    flag_codes,
+    result_code,
+)
 from easi_jax.estimation.normal_equations import _NUMERIC
 from easi_jax.model.parameters import Parameter, ParameterSpace
 from easi_jax.model.results import (
@@ -165,26 +173,22 @@ def describe(direction: dict[str, float]) -> str:
     return f"moving together as {terms} changes nothing that these data show"
 
 
-def flags(
-    space: ParameterSpace, ident: Identifiability, unit_mean: np.ndarray
-) -> list[Flag]:
-    """What may be believed of each parameter by itself."""
-    low, high = (np.asarray(b) for b in space.unit_bounds)
-    at_bound = (unit_mean <= low + _AT) | (unit_mean >= high - _AT)
-    return [
-        "at bound" if b else "determined" if d else "not determined"
-        for b, d in zip(at_bound, ident.determined, strict=True)
-    ]
+def flag_words(codes: np.ndarray) -> list[Flag]:
+    """What may be believed of each parameter by itself, by `flag_codes`."""
+    words: dict[int, Flag] = {CONVERGED: "determined", AT_BOUND: "at bound"}
+    return [words.get(c, "not determined") for c in codes.tolist()]
 
 
-def ended(names: Sequence[str], flags: Sequence[Flag]) -> tuple[Outcome, str]:
-    """How a fit ended that did not diverge, and what it is about."""
-    if "determined" not in flags and "at bound" not in flags:
-        return "not determined", f"the data determine none of {', '.join(names)}"
-    at = [n for n, f in zip(names, flags, strict=True) if f == "at bound"]
-    if at:
-        return "at bound", f"{', '.join(at)}: wider bounds may fit better"
-    return "converged", ""
+def ended(names: Sequence[str], codes: np.ndarray) -> tuple[Outcome, str]:
+    """How a fit ended that did not diverge, by `flag_codes`, and what it is about."""
+    code = int(result_code(codes))
+    at = ", ".join(n for n, c in zip(names, codes, strict=True) if c == AT_BOUND)
+    reasons = {
+        CONVERGED: "",
+        AT_BOUND: f"{at}: wider bounds may fit better",
+        NOT_DETERMINED: f"the data determine none of {', '.join(names)}",
+    }
+    return OUTCOMES[code], reasons[code]
 
 
 def seed_result(
@@ -200,15 +204,16 @@ def seed_result(
     ident = identifiability(space, np.asarray(hessian))
     mean, cov = np.asarray(unit_mean), np.asarray(unit_cov, float)
     below, above = _ends(space, mean, cov)
-    believed = flags(space, ident, mean)
-    outcome, reason = ended(space.names, believed)
+    low, high = (np.asarray(b) for b in space.unit_bounds)
+    codes = flag_codes(mean, low, high, ident.determined, _AT)
+    outcome, reason = ended(space.names, codes)
     return SeedResult(
         mean=_si(space, mean).tolist(),
         std=(0.5 * (above - below)).tolist(),
         interval_68=np.stack([below, above], 1).tolist(),
         unit_mean=np.asarray(mean, float).tolist(),
         unit_covariance=cov.tolist(),
-        flags=believed,
+        flags=flag_words(codes),
         cramer_rao_std=ident.std.tolist(),
         determined_directions=ident.rank,
         undetermined=[Undetermined(d, describe(d)) for d in ident.undetermined],

@@ -29,11 +29,19 @@ from jax.sharding import Mesh
 
 from easi_jax.data.segments import Segments
 from easi_jax.estimation.identifiability import forces
+from easi_jax.estimation.least_squares import (
+    Damping,
+    bounded_step,
+    held_back,
+    is_settled,
+    moved,
+)
 from easi_jax.estimation.normal_equations import Normal, PairedFit
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.simulator import Simulator
 
-_DAMPING = 10.0 ** np.arange(-2, 4)  # tried together, relative to the last one
+_TRIED = 10.0 ** np.arange(-2, 4)  # dampings together, relative to the last one
+_DAMPING = Damping(falls=1.0, rises=100.0, least=1e-6, most=1e6)
 _SHARES = 0.0, 0.3, 1.0  # of the step of its start, of which each piece takes the best
 _TINY = 1e-24  # below what a parameter that is nearly zero has of information
 _SHORT = 0.02  # s of each piece that the first stage fits
@@ -139,7 +147,7 @@ def refine(
 
     n, count = space.size, segments.count
     shares = jnp.asarray(_SHARES if free_starts else _SHARES[:1])
-    steps = 1 + len(_DAMPING)  # trials before the jumps
+    steps = 1 + len(_TRIED)  # trials before the jumps
     plain = len(shares) * steps
     ways, farthest = jumps(space)
     fresh = jnp.zeros((2, len(ways))), jnp.tile(jnp.asarray(farthest), (2, 1))
@@ -191,9 +199,9 @@ def refine(
         entering = jnp.tile(EDGE * jnp.append(flat, False)[: len(ways)], 2)
         costs = costs.at[hopped].add(jnp.where(moving, entering, 0.0))
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
-        damped = costs[1 : 1 + len(_DAMPING)]
-        damp = damp * jnp.asarray(_DAMPING)[jnp.argmin(damped)]
-        damp = jnp.where(damped.min() < costs[0], damp, 100.0 * damp)
+        damped = costs[1 : 1 + len(_TRIED)]
+        tried = damp * jnp.asarray(_TRIED)[jnp.argmin(damped)]
+        damp = jnp.where(moving, _DAMPING.after(tried, damped.min() < costs[0]), damp)
         home = len(costs) - 1
         costs = costs.at[hopped].add(jnp.where(loose.all(), 0.0, jnp.inf))
         # Where the fit began is where it was led astray.
@@ -217,7 +225,7 @@ def refine(
         new = (
             units[best],
             shifts[best],
-            jnp.where(moving, jnp.clip(damp, 1e-6, 1e6), carry[2]),
+            damp,
             unchanged,
             raised,
             each[best],
@@ -240,14 +248,10 @@ def refine(
         grad = eq.gradient + pull * slope * away(u)
         hess = eq.hessian + jnp.diag(pull * slope**2 + _TINY)
         # There the prior alone would draw them back to the edge.
-        free = not_held_back(space, u, grad) & loose & ~on_plateau(item, eq)
-
-        def trial(damp: jax.Array) -> tuple[jax.Array, jax.Array]:
-            du = newton_step(hess, grad, free, damp)
-            new = jnp.clip(moved(space, u, du), low, high)
-            return new, jnp.einsum("mdn,n->md", eq.start_gain, new - u)
-
-        newton, followed = jax.vmap(trial)(damp * _DAMPING)
+        free = ~held_back(u, grad, low, high) & loose & ~on_plateau(item, eq)
+        du = bounded_step(hess, grad, free, damp * _TRIED)
+        newton = space.clip(moved(space, u, du))
+        followed = jnp.einsum("mdn,kn->kmd", eq.start_gain, newton - u)
         near = jnp.concatenate([u[None], newton])
         shifted = shift + jnp.concatenate([unmoved[None], followed])
         shifted = shifted + shares[:, None, None, None] * eq.start_step
@@ -343,9 +347,8 @@ def refine(
             now = trusting, again, loose
             carry, cost = step(carry, used, first, moving, *now, item)
             costs = jnp.where(jnp.arange(iterations + 2) >= done, cost, costs)
-            # By less than this the data cannot tell two results apart.
-            told_apart = _TOLD_APART + item.rough * cost
-            settled = costs[jnp.maximum(done - item.patience, 0)] - cost < told_apart
+            gain = costs[jnp.maximum(done - item.patience, 0)] - cost
+            settled = is_settled(gain, cost, _TOLD_APART, item.rough)
             settled &= done > item.least
             over = settled | (done >= iterations)
             phase = jnp.where(fitting, jnp.where(over, _LOOKING, _MOVING), _FINISHED)
@@ -546,51 +549,6 @@ def beyond_edge(unit: jax.Array, limits: jax.Array, most: jax.Array) -> jax.Arra
     """``unit (n,)`` with ``limits (n,)`` on the plateau beyond the edge of a dip."""
     middle = jnp.minimum(most, jnp.maximum(0.5, unit + _INSIDE))
     return jnp.where(limits, middle, unit)
-
-
-def not_held_back(
-    space: ParameterSpace, unit: jax.Array, gradient: jax.Array
-) -> jax.Array:
-    """Which parameters no bound holds back from a step downhill, ``(n,)``."""
-    low, high = space.unit_bounds
-    return ~((unit <= low) & (gradient > 0) | (unit >= high) & (gradient < 0))
-
-
-def balanced(hessian: jax.Array, free: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """A system ``(n, n)`` of unit diagonal, and the ``scale (n,)`` of its gradient and
-    solution; what is not ``free`` takes no part.
-
-    By powers of ten, Fisher information spans more than single precision has.
-    """
-    scale = jnp.where(free, 1.0 / jnp.sqrt(jnp.diag(hessian)), 0.0)
-    rest = jnp.diag(jnp.where(free, 0.0, 1.0))
-    return hessian * scale[:, None] * scale + rest, scale
-
-
-def newton_step(
-    hessian: jax.Array,
-    gradient: jax.Array,
-    free: jax.Array,
-    damping: float | jax.Array = 0.0,
-) -> jax.Array:
-    """Levenberg-Marquardt step of the `balanced` system, ``(n,)``; zero where not
-    ``free``."""
-    scaled, scale = balanced(hessian, free)
-    lifted = scaled + damping * jnp.eye(len(gradient))
-    return -scale * jnp.linalg.solve(lifted, scale * gradient)
-
-
-def moved(space: ParameterSpace, unit: jax.Array, du: jax.Array) -> jax.Array:
-    """``unit`` moved by ``du`` along the SI values themselves.
-
-    On a logarithmic scale a parameter near zero has no slope, and a step that
-    overshoots towards zero would never come back: it moves by a factor of ten at most.
-    From below its initial range it may return by more, for steps of all others count
-    on it: to ten times the low end.
-    """
-    most = 10.0 * jnp.exp(-space.log_width * jnp.minimum(unit, 0.0))
-    ratio = jnp.clip(1.0 + space.log_width * du, 0.1, most)
-    return unit + jnp.where(space.log, jnp.log(ratio) / space.log_width, du)
 
 
 def step_weights(

@@ -13,12 +13,16 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from easi_jax.data.segments import Segments
+from easi_jax.estimation.least_squares import (
+    Damping,
+    bounded_step,
+    held_back,
+    is_settled,
+    moved,
+)
 from easi_jax.estimation.levenberg_marquardt import (
     RefineResult,
     excess,
-    moved,
-    newton_step,
-    not_held_back,
     raised_to_range,
     step_weights,
 )
@@ -32,9 +36,8 @@ _ROUNDING = 3e-6  # of the cost, that single precision takes for progress
 _SETTLED = 0.01  # of the cost, that the next step is foretold to gain
 _STEPPING, _RAISING, _FINISHED = range(3)
 _PULL = 0.1  # information added to a unit coordinate, for what the data do not show
-_DAMPING = 1e-6  # of a step, relative to the information
-_FALLS_BY, _RISES_BY = 0.1, 10.0  # after a step that helped, and one that did not
-_RISES_TO = 1e-2  # at least
+_BEGUN = 1e-6  # damping of the first step
+_DAMPING = Damping(falls=0.1, rises=10.0, wakes=1e-2)
 _SHORTER, _LONGER = 0.3, 3.0  # share of its step that a start takes, likewise
 
 
@@ -98,9 +101,9 @@ def polish(
     def step(at: jax.Array, told: Normal, loose: Any, damping: Any) -> Any:
         """Gradient and step at ``at (n,)``."""
         gradient = told.gradient + known * at
-        free = not_held_back(space, at, gradient) | loose
+        free = ~held_back(at, gradient, low, high) | loose
         held = told.hessian + jnp.diag(jnp.maximum(known, _PULL))
-        return gradient, newton_step(held, gradient, free, damping)
+        return gradient, bounded_step(held, gradient, free, damping)
 
     def going(c: _Look) -> jax.Array:
         return c.phase < _FINISHED
@@ -117,8 +120,7 @@ def polish(
             (c.unit, c.starts, eq),
             c.best,
         )
-        risen = jnp.maximum(_RISES_BY * c.damping, _RISES_TO)
-        damping = jnp.where(better, _FALLS_BY * c.damping, risen)
+        damping = _DAMPING.after(c.damping, better)
         # A start that is thrown across a change of sign of a speed would hide what all
         # others gain.
         thrown = ~(eq.costs <= c.best[2].costs) & (c.k > 0)
@@ -131,7 +133,7 @@ def polish(
         follow = starts + share[:, None] * told.start_step
         follow = follow + told.start_gain @ (new - at)
         gain = -0.5 * gradient @ du
-        progress = c.least - cost > _SETTLED + _ROUNDING * cost
+        progress = ~is_settled(c.least - cost, cost, _SETTLED, _ROUNDING)
         progressed = jnp.where(better & progress, c.k, c.progressed)
         done = ~stepping | (better & (gain < _SETTLED)) | (c.k + 1 >= looks)
         done |= c.k - progressed >= _STALE
@@ -162,7 +164,7 @@ def polish(
         unit=unit,
         starts=unmoved,
         share=jnp.ones(segments.count),
-        damping=jnp.asarray(_DAMPING),
+        damping=jnp.asarray(_BEGUN),
         best=(unit, unmoved, nothing),
         used=jnp.ones(segments.count, bool),
         least=jnp.asarray(jnp.inf),

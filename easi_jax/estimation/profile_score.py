@@ -23,14 +23,12 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from easi_jax.data.segments import Segments
+from easi_jax.estimation.least_squares import bounded_step, held_back, moved
 from easi_jax.estimation.levenberg_marquardt import (
     DUG,
     EDGE,
     beyond_edge,
     jumps,
-    moved,
-    newton_step,
-    not_held_back,
     raised_to_range,
     step_weights,
 )
@@ -265,8 +263,8 @@ def adjust(
     def newton(u: jax.Array, s: Score, held: jax.Array) -> tuple[Any, Any]:
         """The step, and what is left."""
         a = s.gradient - s.bias
-        free = not_held_back(space, u, a) & ~held
-        step = newton_step(s.hessian + _PULL * jnp.eye(space.size), a, free)
+        free = ~held_back(u, a, low, high) & ~held
+        step = bounded_step(s.hessian + _PULL * jnp.eye(space.size), a, free)
         left = -0.5 * a @ step
         return step, jnp.where(jnp.isfinite(left), left, jnp.inf)
 

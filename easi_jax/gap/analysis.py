@@ -18,6 +18,7 @@ from easi_jax.data.noise import pooled, resolutions
 from easi_jax.data.recording import Run, physics_steps
 from easi_jax.data.windows import lead_rows
 from easi_jax.errors import UserError
+from easi_jax.estimation.least_squares import AT_BOUND
 from easi_jax.estimation.starts import DRAWS, better_noise, floor, known_noise
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.batched_least_squares import Bounds, bounds_of, window_weights
@@ -471,7 +472,9 @@ class Analysis:
 
     def _stuck(self, model: Model) -> list[int]:
         """The model's own parameters that a refit moved to a bound."""
-        return [i for i in model.own if self._at_bound(model.fit.x, i)]
+        codes = model.fit.codes(self.selector.bounds)
+        stuck = model.fit.active[codes == AT_BOUND]
+        return [i for i in model.own if i in stuck]
 
     def _undone(self, base: Model, stuck: Sequence[int]) -> Model:
         """A refit without some parameters, which are offered as effects instead."""
@@ -481,10 +484,6 @@ class Analysis:
             self._offer(self.space.parameters[i].addresses)
         self.whiten(self.selector.neutral)
         return self.refit([i for i in base.own if i not in stuck])
-
-    def _at_bound(self, x: np.ndarray, i: int) -> bool:
-        low, high = self.bounds.low[i], self.bounds.high[i]
-        return bool(x[i] <= low * 1.001 or x[i] >= high * 0.999)
 
     def _offer(self, addresses: Sequence[str]) -> None:
         for address in addresses:

@@ -10,19 +10,36 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from easi_jax.estimation.least_squares import (
+    Damping,
+    bounded_step,
+    flag_codes,
+    is_settled,
+)
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.model.parameters import ParameterSpace
 
 _ROUNDS = 12
-_DAMPING = (1.0, 30.0, 1000.0)
+_TRIED = np.array([1.0, 30.0, 1000.0])  # dampings, relative to the last one
+_DAMPING = Damping(falls=0.2, rises=1.0, least=1e-6)
 _PAYS = 0.05  # relative gain of a round that lets slopes be followed further
 _SETTLED = 5e-3  # relative gain of a round below which a fit is done
 _HUBER = 3.0
 _DIM = 1e-2  # least curvature that damping assumes, of the largest
 _UNSEEN = 1e-7  # curvature along an entry that counts as none, of the largest
+_AT = 1e-3  # of a value from a bound, that counts as at it
 
 Simulate = Callable[[np.ndarray], np.ndarray]
 Asks = Generator[np.ndarray, np.ndarray, "Fitted"]
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Of the whole vector: limits and sizes of differences, ``(n,)`` each."""
+
+    low: np.ndarray
+    high: np.ndarray
+    size: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -43,6 +60,16 @@ class Fitted:
     slope: np.ndarray
     cost: float
 
+    def codes(self, bounds: Bounds) -> np.ndarray:
+        """Of each active entry, as `easi_jax.estimation.least_squares.flag_codes`
+        tells them, ``(a,)``."""
+        x = self.x[self.active]
+        seen = np.einsum("wma,wma->a", self.slope, self.slope)
+        seen *= bounds.size[self.active] ** 2
+        low, high = bounds.low[self.active], bounds.high[self.active]
+        known = seen > _UNSEEN * seen.max(initial=0.0)
+        return flag_codes(x, low, high, known, _AT * np.abs(x))
+
     def arrays(self) -> list[tuple[str, np.ndarray]]:
         """Its parts by name, to be kept; `of` makes it again, to the last bit."""
         return [(k, np.asarray(getattr(self, k))) for k in self.__dataclass_fields__]
@@ -51,15 +78,6 @@ class Fitted:
     def of(cls, arrays: Mapping[str, np.ndarray]) -> "Fitted":
         """From `arrays`."""
         return cls(**{**arrays, "cost": float(arrays["cost"])})
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Of the whole vector: limits and sizes of differences, ``(n,)`` each."""
-
-    low: np.ndarray
-    high: np.ndarray
-    size: np.ndarray
 
 
 def bounds_of(space: ParameterSpace, layout: Layout) -> Bounds:
@@ -105,7 +123,7 @@ def least_squares(
     weight: np.ndarray,
     rounds: int = _ROUNDS,
 ) -> Asks:
-    """Levenberg-Marquardt with projection onto the bounds, as a generator.
+    """Steps of `easi_jax.estimation.least_squares` to a best fit, as a generator.
 
     It yields vectors ``(B, n)`` and is sent their whitened errors ``(B, W, m)``.
     Between two rounds of differences, slopes follow from the steps taken (Broyden,
@@ -131,65 +149,66 @@ def least_squares(
             slope = np.moveaxis((got - residual) / step[:, None, None], 0, -1)
             slope = np.where(np.isfinite(slope), slope, 0.0) * size  # per size
             measured = True
-        normal = np.einsum("w,wma,wmb->ab", weight, slope, slope, optimize=True)
-        gradient = np.einsum("w,wma,wm->a", weight, slope, residual, optimize=True)
-        low = (bounds.low[active] - x[active]) / size
-        high = (bounds.high[active] - x[active]) / size
         gain = 0.0
         # One step is enough nearly always; more damped ones are tried together.
-        for factors in (_DAMPING[:1], _DAMPING[1:]):
-            tried = [
-                _step(normal, gradient, damping * factor, low, high)
-                for factor in factors
-            ]
-            trials = np.repeat(x[None], len(tried), 0)
-            trials[:, active] += np.array(tried) * size
+        for factors in (_TRIED[:1], _TRIED[1:]):
+            moves = _steps(
+                slope, residual, weight, damping * factors, x, active, bounds
+            )
+            trials = np.repeat(x[None], len(moves), 0)
+            trials[:, active] += moves * size
             found = yield trials
             costs = _cost(found, weight)
             best = int(np.argmin(costs))
             if costs[best] < cost:
-                gain = (cost - costs[best]) / cost
-                damping = max(damping * factors[best] / 5.0, 1e-6)
-                move = tried[best]
-                length = float(move @ move)
-                if length > 0:
-                    off = found[best] - residual - slope @ move
-                    slope = slope + off[..., None] * move / length
+                gain = cost - costs[best]
+                damping = float(_DAMPING.after(damping * factors[best], True))
+                slope = _followed(slope, found[best] - residual, moves[best])
                 x, residual, cost = trials[best], found[best], costs[best]
                 break
-        if gain < _SETTLED and measured:
+        before = cost + gain
+        if measured and is_settled(gain, before, 0.0, _SETTLED):
             break
         # Slopes are measured anew where following them no longer pays.
-        fresh, measured = gain >= _PAYS, False
+        fresh, measured = not is_settled(gain, before, 0.0, _PAYS), False
     return Fitted(x, active, residual, slope / size, float(cost))
 
 
-def _step(
-    normal: np.ndarray,
-    gradient: np.ndarray,
-    damping: float,
-    low: np.ndarray,
-    high: np.ndarray,
+def _steps(
+    slope: np.ndarray,
+    residual: np.ndarray,
+    weight: np.ndarray,
+    damping: np.ndarray,
+    x: np.ndarray,
+    active: np.ndarray,
+    bounds: Bounds,
 ) -> np.ndarray:
-    """A damped step; entries that would leave the bounds stop there, one by one."""
-    n = len(gradient)
+    """Steps of the active entries in their sizes, one of each ``damping (B,)``,
+    ``(B, a)``."""
+    normal = np.einsum("w,wma,wmb->ab", weight, slope, slope, optimize=True)
+    gradient = np.einsum("w,wma,wm->a", weight, slope, residual, optimize=True)
     # What the data do not see stays where it is.
     unseen = max(_UNSEEN * np.diag(normal).max(), 1e-30)
-    # Damped as if seen a little, or differences of no slope make steps of any length.
-    diagonal = np.maximum(np.diag(normal), _DIM * np.diag(normal).max())
-    matrix = normal + damping * np.diag(diagonal) + unseen * np.eye(n)
-    out, free = np.zeros(n), np.ones(n, bool)
-    for _ in range(n):
-        if not free.any():
-            break
-        right = -gradient[free] - matrix[np.ix_(free, ~free)] @ out[~free]
-        out[free] = np.linalg.solve(matrix[np.ix_(free, free)], right)
-        over = free & ((out < low) | (out > high))
-        if not over.any():
-            break
-        out = np.clip(out, low, high)
-        free &= ~over
-    return np.clip(out, low, high)
+    low, high = (
+        (edge[active] - x[active]) / bounds.size[active]
+        for edge in (bounds.low, bounds.high)
+    )
+    return bounded_step(
+        normal + unseen * np.eye(len(active)),
+        gradient,
+        np.ones(len(active), bool),
+        damping,
+        within=(low, high),
+        dim=_DIM,
+    )
+
+
+def _followed(slope: np.ndarray, change: np.ndarray, move: np.ndarray) -> np.ndarray:
+    """Slopes ``(W, m, a)`` that say what a ``move (a,)`` did change, ``(W, m)``."""
+    length = float(move @ move)
+    if not length > 0:
+        return slope
+    return slope + (change - slope @ move)[..., None] * move / length
 
 
 def lockstep(
