@@ -93,10 +93,10 @@ def _solver(config: Config) -> Any:
     from easi_jax.devices.runtime import fast_loops
     from easi_jax.estimation.doubts import doubts_of
     from easi_jax.estimation.identifiability import identifiability
-    from easi_jax.estimation.levenberg_marquardt import step_weights
     from easi_jax.estimation.normal_equations import PairedFit
     from easi_jax.estimation.pieces import finish_pieces
     from easi_jax.estimation.posterior import RESTARTS, estimate
+    from easi_jax.estimation.weights import step_weights
     from easi_jax.model import distribution
     from easi_jax.search.config import preset
     from easi_jax.search.easi import Search, SearchData

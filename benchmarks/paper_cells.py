@@ -377,9 +377,9 @@ class _Bench:
         import numpy as np
 
         from easi_jax.estimation.identifiability import identifiability
-        from easi_jax.estimation.levenberg_marquardt import step_weights
         from easi_jax.estimation.normal_equations import PairedFit
         from easi_jax.estimation.pieces import effective_noise
+        from easi_jax.estimation.weights import step_weights
 
         simulator, space = self.env.simulator, self.env.space
 

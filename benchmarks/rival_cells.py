@@ -189,9 +189,9 @@ def fisher(task: Any, demos: Any, truth: Any) -> Any:
     import numpy as np
 
     from easi_jax.data.segments import windows
-    from easi_jax.estimation.levenberg_marquardt import step_weights
     from easi_jax.estimation.normal_equations import PairedFit
     from easi_jax.estimation.pieces import effective_noise
+    from easi_jax.estimation.weights import step_weights
 
     steps = min(_PIECE, demos.weight.shape[1])
     pieces = windows(demos, steps, steps)

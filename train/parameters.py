@@ -138,9 +138,9 @@ def _information(config: Config, m: Any, proposals: list[Any]) -> Any:
     from easi_jax.data.noise import pooled_noise
     from easi_jax.data.segments import to_device
     from easi_jax.estimation.from_runs import spread_of_starts
-    from easi_jax.estimation.levenberg_marquardt import step_weights
     from easi_jax.estimation.normal_equations import PairedFit
     from easi_jax.estimation.pieces import effective_noise, segments_from_runs
+    from easi_jax.estimation.weights import step_weights
     from easi_jax.io.logs.reader import read_logs
     from easi_jax.model.parameter_proposal import space_of
     from easi_jax.simulation.logged import Logged

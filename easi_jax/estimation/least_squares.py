@@ -161,3 +161,9 @@ def moved(space: ParameterSpace, unit: jax.Array, du: jax.Array) -> jax.Array:
     most = 10.0 * jnp.exp(-space.log_width * jnp.minimum(unit, 0.0))
     ratio = jnp.clip(1.0 + space.log_width * du, 0.1, most)
     return unit + jnp.where(space.log, jnp.log(ratio) / space.log_width, du)
+
+
+def raised_to_range(space: ParameterSpace, unit: jax.Array) -> jax.Array:
+    """``unit`` with logarithms raised to the low end of their initial range: further
+    down they have no slope, and no way back."""
+    return jnp.where(space.log, jnp.maximum(unit, 0.0), unit)

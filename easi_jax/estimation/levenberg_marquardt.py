@@ -18,7 +18,8 @@ logged together; it says nothing about unpaired data or about distributions.
 """
 
 import functools
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import flax.struct
@@ -28,13 +29,14 @@ import numpy as np
 from jax.sharding import Mesh
 
 from easi_jax.data.segments import Segments
-from easi_jax.estimation.identifiability import forces
+from easi_jax.estimation import limits, weights
 from easi_jax.estimation.least_squares import (
     Damping,
     bounded_step,
     held_back,
     is_settled,
     moved,
+    raised_to_range,
 )
 from easi_jax.estimation.normal_equations import Normal, PairedFit
 from easi_jax.model.parameters import ParameterSpace
@@ -43,24 +45,17 @@ from easi_jax.simulation.simulator import Simulator
 _TRIED = 10.0 ** np.arange(-2, 4)  # dampings together, relative to the last one
 _DAMPING = Damping(falls=1.0, rises=100.0, least=1e-6, most=1e6)
 _SHARES = 0.0, 0.3, 1.0  # of the step of its start, of which each piece takes the best
+_STEPS = 1 + len(_TRIED)  # places that a step is tried at: without one as well
 _TINY = 1e-24  # below what a parameter that is nearly zero has of information
-_SHORT = 0.02  # s of each piece that the first stage fits
+_BEGINNING = 0.02  # s of each piece that the first stage fits
 _PATIENCE = 3, 6  # rounds without progress that end each stage
 _BISECTED = 12  # rounds that a jump's reach is halved in: to a thousandth of it
-_UNSEEN = 1.0  # information of a unit coordinate: nothing
 _TOLD_APART = 0.05  # of the cost, which is minus a logarithm of likelihood
 _ROUNDING = 3e-6  # of the cost, which the best of many trials takes for progress
 _ROUGH = 1e-3  # of the cost: less progress than that is not to be had by differences
 _NEAR_ENOUGH = 1e-2  # of the cost, for the first stage
 _MOVING, _LOOKING, _FINISHED = range(3)
-_FARTHEST = 0.8, 2.5  # jump that is tried, in initial ranges, in log ratios
-EDGE = 4.0  # of the cost, that a place beyond a plateau's edge has to be better by
-_SHALLOW = 0.1  # of what its curvature foretells, that the cost rises beyond a dip
-DUG = 50 * EDGE  # of the cost, starts as they are: more than that noise does not dig
-_INSIDE = 0.4  # initial ranges beyond the edge, where a plateau is entered
-_NOISIER = 1.2  # times the noise as it is given, that it may be
-_OUTLYING = 9.0  # times the median cost: such a piece counts half
-_APART = 4.0  # standard deviations of a typical piece's cost: what fits far worse
+_SHORT, _WHOLE, _DROPPING, _RETURNING, _LOOK, _FREED, _RAISED = range(7)
 _HELD = 8  # rounds in which limits move alone
 
 
@@ -131,167 +126,446 @@ def refine(
             that comes to within a standard deviation of it is followed no further.
         start: what is known of starts, as in `PairedFit`.
     """
-    whole = PairedFit(simulator, space, segments, noise, mesh, free_starts, None, start)
-    low, high = space.unit_bounds
-    anchor = unit
-    pull = jnp.full(space.size, 1.0 / prior_std**2)
-    weight = step_weights(segments, noise, misfit)
-    short = min(segments.horizon, max(1, round(_SHORT / simulator.dt)))
-    begin = jnp.arange(segments.horizon) < short
-    unmoved = whole.unmoved
+    fit = _Fit(
+        PairedFit(simulator, space, segments, noise, mesh, free_starts, None, start),
+        weights.step_weights(segments, noise, misfit),
+        unit,
+        1.0 / prior_std**2,
+        iterations,
+    )
+    starts = unit[None] if others is None else jnp.concatenate([unit[None], others])
+    stages = _Stage.all(starts, near, robust, others is not None)
+    # As a scan, so that a stage is compiled once.
+    found, looked = jax.lax.scan(fit.stage, fit.begin, stages)
+    best = found.best
+    return RefineResult(
+        unit=best.unit,
+        hessian=best.hessian,
+        cost=best.costs,
+        delta=best.shift,
+        raised=looked.unit[-1],
+        raised_hessian=looked.hessian[-1],
+        excess=weights.excess(best.pieces, fit.weight),
+        simulated=1.0 * fit.points * segments.count * looked.steps.sum(),
+    )
 
-    away = functools.partial(_distance, space, anchor)
 
-    def prior(u: jax.Array) -> jax.Array:
-        return 0.5 * jnp.sum(pull * away(u) ** 2, axis=-1)
+@flax.struct.dataclass
+class _Stage:
+    """One stage of the fit, or a look at the result."""
 
-    n, count = space.size, segments.count
-    shares = jnp.asarray(_SHARES if free_starts else _SHARES[:1])
-    steps = 1 + len(_TRIED)  # trials before the jumps
-    plain = len(shares) * steps
-    ways, farthest = jumps(space)
-    fresh = jnp.zeros((2, len(ways))), jnp.tile(jnp.asarray(farthest), (2, 1))
-    hopped = slice(steps, steps + 2 * len(ways))
-    rounding = _ROUGH if simulator.by_differences else _ROUNDING
-    places = plain + 2 * len(ways) + 1  # that a round looks at
-    sides = jnp.array([[1.0], [-1.0]])
+    kind: jax.Array
+    begun: jax.Array  # where this fit began
+    first: jax.Array
+    wanted: jax.Array
+    near: jax.Array
+    robust: jax.Array  # rounds
 
-    def step(
-        carry: Any,
-        weight: jax.Array,
-        first: jax.Array,
-        moving: jax.Array,
-        trusting: jax.Array,
-        again: jax.Array,
-        loose: jax.Array,
-        item: _Stage,
-    ) -> Any:
-        u, shift, damp, unchanged, raised, pieces, *_ = carry
-        paired = whole
-        if short < segments.horizon:
-            simulated = jnp.where(item.short, short, segments.horizon)
-            paired = replace(whole, steps=simulated)
-        unchanged, raised = (
-            jnp.where(again, x, y)
-            for x, y in zip(fresh, (unchanged, raised), strict=True)
+    @classmethod
+    def all(cls, starts: jax.Array, near: Any, robust: Any, apart: bool) -> "_Stage":
+        """The beginnings of the pieces, then all of them, from each start ``(K, n)``;
+        with ``apart``, a fit without what fits far worse, and one of all from there;
+        then a look at the result, a fit of what may not be at a plateau's edge, and a
+        look at what is raised."""
+        kinds = [_SHORT, _WHOLE] * len(starts) + [_DROPPING, _RETURNING] * apart
+        kind = np.array([*kinds, _LOOK, _FREED, _RAISED])
+        at, freed = np.arange(len(kind)), kind == _FREED
+        alike = np.isin(kind, (_SHORT, _DROPPING, _RETURNING))
+        return cls(
+            kind=jnp.asarray(kind),
+            begun=starts[np.minimum(at // 2, len(starts) - 1)],
+            first=jnp.asarray(at == 1),
+            wanted=jnp.where(near, at == 1, True) | freed,
+            near=jnp.asarray(near | freed),
+            robust=jnp.where(alike, 0, robust),
         )
-        trust = jnp.where(trusting, 1.0, _trust(pieces, segments.weight > 0))
-        left_out = moving & item.dropping & _far_worse(pieces, weight)
-        trust = jnp.where(left_out, 0.0, trust)
-        trusted = weight * trust[:, None, None]
-        # Bisection, per parameter and side, between where a change has left the cost
-        # as it was and where it has raised it: at the edge of a plateau it may fall.
-        reach = 0.5 * (unchanged + raised)
-        hops = jnp.clip(u + (reach * sides)[..., None] * ways, low, high)
-        if simulator.by_differences:
-            at = u, shift, damp, hops, item
-            eq, units, shifts, each = swept(paired, *at, loose, weight, trusted)
-        else:
-            eq = paired.normal(u, shift, trusted)
-            units, shifts = trials(u, shift, damp, hops, item, loose, eq)
-            each = paired.costs(units, shifts, weight)
+
+    @property
+    def short(self) -> jax.Array:
+        return self.kind == _SHORT
+
+    @property
+    def dropping(self) -> jax.Array:
+        return self.kind == _DROPPING
+
+    @property
+    def freed(self) -> jax.Array:
+        return self.kind == _FREED
+
+    @property
+    def looks(self) -> jax.Array:
+        """Whether it only looks."""
+        return (self.kind == _LOOK) | (self.kind == _RAISED)
+
+    @property
+    def whole(self) -> jax.Array:
+        """Whether what it finds may be the result."""
+        return ~self.short & ~self.looks & ~self.dropping & self.wanted
+
+    @property
+    def held(self) -> jax.Array:
+        """Rounds in which limits move alone."""
+        return jnp.where(self.kind == _RETURNING, _HELD, 0)
+
+    @property
+    def patience(self) -> jax.Array:
+        """Rounds without progress that end it."""
+        return jnp.where(self.short | self.near, *_PATIENCE)
+
+    @property
+    def least(self) -> jax.Array:
+        """Rounds at least. Without what fits far worse, limits are looked for once the
+        rest has settled."""
+        bisected = jnp.where(self.short | self.near, 0, _BISECTED)
+        least = jnp.maximum(self.robust + self.patience, bisected)
+        return least + self.dropping * _BISECTED
+
+
+@flax.struct.dataclass
+class _Best:
+    """The best fit so far: parameters, starts, costs by rounds, information, and costs
+    of the pieces."""
+
+    unit: jax.Array
+    shift: jax.Array
+    costs: jax.Array
+    hessian: jax.Array
+    pieces: jax.Array
+
+
+@flax.struct.dataclass
+class _Found:
+    """What a stage hands on: where it ended, the best so far, what may not be at a
+    plateau's edge put beyond it, and which parameters met no limit."""
+
+    unit: jax.Array
+    shift: jax.Array
+    best: _Best
+    freed: jax.Array
+    unmet: jax.Array
+
+
+@flax.struct.dataclass
+class _Looked:
+    """What a stage saw last, and the control steps of each piece that it took."""
+
+    unit: jax.Array
+    hessian: jax.Array
+    steps: jax.Array
+
+
+@flax.struct.dataclass
+class _Place:
+    """Where a stage is, and what it knows."""
+
+    unit: jax.Array
+    shift: jax.Array
+    damping: jax.Array
+    reach: limits.Reach
+    pieces: jax.Array  # their costs
+    hessian: jax.Array  # of the place before
+    above: jax.Array  # that place, what is in a dip put beyond its edge
+
+
+@flax.struct.dataclass
+class _Now:
+    """What a round may do."""
+
+    item: _Stage
+    first: jax.Array  # only look, and at where the fit began as well
+    moving: jax.Array
+    trusting: jax.Array  # all pieces alike
+    anew: jax.Array  # a jump that did not help then may help now
+    loose: jax.Array  # what steps move, (n,)
+
+
+_State = tuple[jax.Array, jax.Array, jax.Array, _Place]  # phase, rounds, costs
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """What all rounds have in common.
+
+    Attributes:
+        whole: the pieces.
+        weight: of each measured number, ``(M, H, 2 nv)``.
+        anchor: where the prior draws to, ``(n,)``.
+        pull: information of the prior.
+        iterations: rounds of a stage at most.
+    """
+
+    whole: PairedFit
+    weight: jax.Array
+    anchor: jax.Array
+    pull: float
+    iterations: int
+
+    @property
+    def space(self) -> ParameterSpace:
+        return self.whole.space
+
+    @property
+    def shares(self) -> jax.Array:
+        return jnp.asarray(_SHARES if self.whole.free_starts else _SHARES[:1])
+
+    @property
+    def places(self) -> int:
+        """That a round looks at: steps, jumps, and where the fit began."""
+        jumps = 2 * len(limits.jumps(self.space)[0])
+        return len(self.shares) * _STEPS + jumps + 1
+
+    @property
+    def points(self) -> int:
+        """Simulations of each piece in a round, a derivative as one."""
+        if self.whole.simulator.by_differences:  # one for both, see `swept`
+            return 2 * max(self.whole.points, self.places)
+        return self.whole.points + self.places
+
+    @property
+    def rounding(self) -> float:
+        return _ROUGH if self.whole.simulator.by_differences else _ROUNDING
+
+    @property
+    def short(self) -> int:
+        """Control steps that a first stage fits."""
+        steps = max(1, round(_BEGINNING / self.whole.simulator.dt))
+        return min(self.whole.segments.horizon, steps)
+
+    @property
+    def begin(self) -> _Found:
+        """Before the first stage."""
+        n, unit, still = self.space.size, self.anchor, self.whole.unmoved
+        none = jnp.zeros(self.iterations + 2), jnp.zeros((n, n)), jnp.ones(len(still))
+        return _Found(unit, still, _Best(unit, still, *none), unit, jnp.zeros(n, bool))
+
+    def stage(self, found: _Found, item: _Stage) -> tuple[_Found, _Looked]:
+        """From where ``found`` ended, or ``item.begun``, to a best fit."""
+        phase, place = self.start(found, item)
+        begun = phase, jnp.asarray(0), jnp.zeros(self.iterations + 2), place
+        end = jax.lax.while_loop(
+            lambda state: state[0] < _FINISHED,
+            functools.partial(self.round, found, item),
+            begun,
+        )
+        horizon = self.whole.segments.horizon
+        steps = end[1] * jnp.where(item.short, self.short, horizon)
+        at = end[3]
+        looked = _Looked(at.unit, at.hessian, steps)
+        return self.end(found, item, phase, end), looked
+
+    def start(self, found: _Found, item: _Stage) -> tuple[jax.Array, _Place]:
+        """The phase and the place that a stage begins with."""
+        best, unmoved = found.best, self.whole.unmoved
+        u = jnp.where(item.short, item.begun, found.unit)
+        shift = jnp.where(item.short, unmoved, found.shift)
+        from_best = item.looks | item.dropping
+        u = jnp.where(from_best, best.unit, jnp.where(item.freed, found.freed, u))
+        u = jnp.where(item.kind == _RAISED, raised_to_range(self.space, u), u)
+        shift = jnp.where(from_best | item.freed, best.shift, shift)
+        still = item.freed & (found.freed == best.unit).all()
+        even = ~weights.far_worse(best.pieces, self.weight).any()
+        still |= (item.dropping | (item.held > 0)) & even
+        place = _Place(
+            unit=u,
+            shift=shift,
+            damping=jnp.asarray(1e-3),
+            reach=limits.Reach.fresh(self.space),
+            pieces=jnp.ones(len(unmoved)),
+            hessian=jnp.zeros((u.size, u.size)),
+            above=u,
+        )
+        phase = jnp.where(item.wanted & ~still, _MOVING, _FINISHED)
+        return jnp.where(item.looks, _LOOKING, phase), place
+
+    def round(self, found: _Found, item: _Stage, state: _State) -> _State:
+        """A step, and whether it was the last one."""
+        phase, k, costs, place = state
+        # The first round only looks, and the last: cost and information at the result.
+        fitting = phase == _MOVING
+        moving = fitting & (k > 0)
+        done = jnp.maximum(k - item.held, 0)
+        now = _Now(
+            item=item,
+            first=fitting & (k == 0),
+            moving=moving,
+            trusting=~moving | (k > item.robust),
+            anew=done % _BISECTED == 0,
+            loose=found.unmet | (k > item.held) | (item.held == 0),
+        )
+        new, cost = self.step(place, now)
+        costs = jnp.where(jnp.arange(self.iterations + 2) >= done, cost, costs)
+        gain = costs[jnp.maximum(done - item.patience, 0)] - cost
+        rough = jnp.where(item.short, _NEAR_ENOUGH, self.rounding)
+        over = is_settled(gain, cost, _TOLD_APART, rough) & (done > item.least)
+        over |= done >= self.iterations
+        phase = jnp.where(fitting, jnp.where(over, _LOOKING, _MOVING), _FINISHED)
+        # From here it goes to where an earlier start has led.
+        best = found.best
+        off = place.unit - best.unit
+        merged = (off @ best.hessian @ off < 1.0) & (cost < best.costs[-1] + 1.0)
+        merged &= item.whole & ~item.first & ~item.freed & fitting
+        costs = jnp.where(merged, jnp.inf, costs)
+        return jnp.where(merged, _FINISHED, phase), k + 1, costs, new
+
+    def end(
+        self, found: _Found, item: _Stage, phase: jax.Array, state: _State
+    ) -> _Found:
+        """What a stage that began with ``phase`` hands on."""
+        _, _, costs, at = state
+        best, unmet = found.best, limits.unmet(at.hessian)
+        # A plateau is wide, and likelier than a dip that noise may have dug.
+        flat = item.freed & (found.freed != best.unit) & unmet
+        least = best.costs[-1] + limits.EDGE * flat.sum()
+        better = item.whole & (item.first | (costs[-1] < least)) & (phase != _FINISHED)
+        new = _Best(at.unit, at.shift, costs, at.hessian, at.pieces)
+        # What met no limit: to where the first piece would. And starts that were bent,
+        # so that none had to be met: as measured.
+        bent = item.dropping & weights.far_worse(at.pieces, self.weight)
+        down = self.space.clip(at.unit - at.reach.raised[1, : unmet.size])
+        return _Found(
+            unit=jnp.where(item.dropping & unmet, down, at.unit),
+            shift=jnp.where(bent[:, None], self.whole.unmoved, at.shift),
+            best=jax.tree.map(lambda x, y: jnp.where(better, x, y), new, best),
+            freed=jnp.where(item.looks, at.above, found.freed),
+            unmet=jnp.where(item.dropping, unmet, found.unmet),
+        )
+
+    def step(self, at: _Place, now: _Now) -> tuple[_Place, jax.Array]:
+        """The best of the places that are tried from ``at``, and the cost there."""
+        moving, space = now.moving, self.space
+        begins = jnp.arange(self.whole.segments.horizon) < self.short
+        weight = jnp.where(now.item.short, self.weight * begins[:, None], self.weight)
+        trust = self.trust(at.pieces, weight, now)
+        fresh = limits.Reach.fresh(space)
+        reach = jax.tree.map(lambda x, y: jnp.where(now.anew, x, y), fresh, at.reach)
+        hops = reach.ends(space, at.unit)
+        eq, (units, shifts), each = self.look(at, hops, weight, trust, now)
         here = _data(each[:1], trust)
-        units, shifts, each = best_starts(units, shifts, each)
+        units, shifts, each = self.best_starts(units, shifts, each)
         data = _data(each, trust)
-        costs = data + prior(units)
-        # What was put onto a plateau does not leave it for a dip.
-        flat = on_plateau(item, eq)
-        entering = jnp.tile(EDGE * jnp.append(flat, False)[: len(ways)], 2)
-        costs = costs.at[hopped].add(jnp.where(moving, entering, 0.0))
+        costs = data + self.prior(units) + self.barred(eq, now)
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
-        damped = costs[1 : 1 + len(_TRIED)]
-        tried = damp * jnp.asarray(_TRIED)[jnp.argmin(damped)]
-        damp = jnp.where(moving, _DAMPING.after(tried, damped.min() < costs[0]), damp)
         home = len(costs) - 1
-        costs = costs.at[hopped].add(jnp.where(loose.all(), 0.0, jnp.inf))
-        # Where the fit began is where it was led astray.
-        costs = costs.at[home].add(jnp.where(item.held > 0, jnp.inf, 0.0))
-        best = jnp.where(first & (costs[home] < costs[0]), home, 0)
-        best = jnp.where(moving, jnp.argmin(costs), best)
-        level = data[hopped].reshape(2, -1)
-        same, worse = level == here, ~(level <= here)
-        chosen = (jnp.arange(level.size) == best - hopped.start).reshape(level.shape)
-        unchanged = jnp.where(
-            moving & same, reach, jnp.where(chosen.any(0), 0.0, unchanged)
+        looking = jnp.where(now.first & (costs[home] < costs[0]), home, 0)
+        best = jnp.where(moving, jnp.argmin(costs), looking)
+        damped = costs[1:_STEPS]
+        damping = at.damping * jnp.asarray(_TRIED)[jnp.argmin(damped)]
+        damping = _DAMPING.after(damping, damped.min() < costs[0])
+        level = data[_STEPS:home].reshape(2, -1)
+        taken = (jnp.arange(level.size) == best - _STEPS).reshape(level.shape)
+        told = reach.after(level, here, moving & taken)
+        up, n = jnp.diagonal(hops[0]), space.size
+        new = _Place(
+            unit=units[best],
+            shift=shifts[best],
+            damping=jnp.where(moving, damping, at.damping),
+            reach=jax.tree.map(lambda x, y: jnp.where(moving, x, y), told, reach),
+            pieces=each[best],
+            hessian=eq.hessian,
+            # Over a jump upwards the cost hardly rises, though its curvature foretells
+            # it.
+            above=limits.beyond_dips(at.unit, up, level[0, :n] - here, eq.hessian),
         )
-        raised = jnp.where(moving & (worse | chosen), reach, raised)
-        # Over a jump upwards the cost hardly rises, though its curvature foretells it.
-        up = jnp.diagonal(hops[0])
-        foretold = 0.5 * jnp.diag(eq.hessian) * (up - u) ** 2
-        rise = level[0, :n] - here
-        dip = (foretold > 2 * EDGE / _SHALLOW) & (rise < _SHALLOW * foretold)
-        dip &= rise < DUG
-        above = beyond_edge(u, dip, up)
-        new = (
-            units[best],
-            shifts[best],
-            damp,
-            unchanged,
-            raised,
-            each[best],
-            eq.hessian,
-            above,
-        )
-        told = jnp.where(first, home, 0)
-        return new, each[told].sum() + prior(units[told])
+        shown = jnp.where(now.first, home, 0)
+        return new, each[shown].sum() + self.prior(units[shown])
 
-    def on_plateau(item: _Stage, eq: Normal) -> jax.Array:
+    def trust(self, pieces: jax.Array, weight: jax.Array, now: _Now) -> jax.Array:
+        """Weight of each piece by its cost, ``(M,)``."""
+        robust = weights.robust(pieces, self.whole.segments.weight > 0)
+        left_out = now.moving & now.item.dropping & weights.far_worse(pieces, weight)
+        return jnp.where(left_out, 0.0, jnp.where(now.trusting, 1.0, robust))
+
+    def barred(self, eq: Normal, now: _Now) -> jax.Array:
+        """Cost on top, of steps, jumps, and where the fit began: infinite where these
+        are not allowed now."""
+        # What was put onto a plateau does not leave it for a dip.
+        entering = now.moving * limits.EDGE * self.on_plateau(eq, now)
+        ways = len(limits.jumps(self.space)[0])
+        jumps = jnp.zeros(ways).at[: self.space.size].set(entering)
+        jumps += jnp.where(now.loose.all(), 0.0, jnp.inf)
+        # Where the fit began is where it was led astray.
+        home = jnp.where(now.item.held > 0, jnp.inf, 0.0)
+        return jnp.concatenate([jnp.zeros(_STEPS), jnp.tile(jumps, 2), home[None]])
+
+    def on_plateau(self, eq: Normal, now: _Now) -> jax.Array:
         """Which parameters were put onto a plateau, and are there, ``(n,)``."""
-        return item.freed & (jnp.diag(eq.hessian) < _UNSEEN)
+        return now.item.freed & limits.unmet(eq.hessian)
+
+    def away(self, unit: jax.Array) -> jax.Array:
+        """How far ``unit (..., n)`` is from ``anchor``, in initial ranges.
+
+        Below its initial range a logarithmic parameter counts by its SI value: it may
+        be as good as zero there, where the data have no slope and must not lose to the
+        prior.
+        """
+        width = self.space.log_width
+
+        def scale(u: jax.Array) -> jax.Array:
+            below = jnp.expm1(width * jnp.minimum(u, 0.0)) / width
+            return jnp.where(self.space.log & (u < 0), below, u)
+
+        return scale(unit) - scale(self.anchor)
+
+    def prior(self, unit: jax.Array) -> jax.Array:
+        """Its cost, ``(...)``."""
+        return 0.5 * jnp.sum(self.pull * self.away(unit) ** 2, axis=-1)
 
     def trials(
-        u: Any, shift: Any, damp: Any, hops: Any, item: _Stage, loose: Any, eq: Normal
-    ) -> Any:
-        """Where the cost is tried: here, Newton steps of what is ``loose``, jumps of
-        single parameters, and where the fit began."""
-        slope = jax.jvp(away, (u,), (jnp.ones(n),))[1]
-        grad = eq.gradient + pull * slope * away(u)
-        hess = eq.hessian + jnp.diag(pull * slope**2 + _TINY)
+        self, at: _Place, hops: jax.Array, now: _Now, eq: Normal
+    ) -> tuple[jax.Array, jax.Array]:
+        """Where the cost is tried: here, Newton steps of what is loose, jumps, and
+        where the fit began; parameters and starts."""
+        u, shift, unmoved = at.unit, at.shift, self.whole.unmoved
+        away, slope = jax.jvp(self.away, (u,), (jnp.ones(u.size),))
+        grad = eq.gradient + self.pull * slope * away
+        hess = eq.hessian + jnp.diag(self.pull * slope**2 + _TINY)
+        free = ~held_back(u, grad, *self.space.unit_bounds) & now.loose
         # There the prior alone would draw them back to the edge.
-        free = ~held_back(u, grad, low, high) & loose & ~on_plateau(item, eq)
-        du = bounded_step(hess, grad, free, damp * _TRIED)
-        newton = space.clip(moved(space, u, du))
+        free &= ~self.on_plateau(eq, now)
+        du = bounded_step(hess, grad, free, at.damping * _TRIED)
+        newton = self.space.clip(moved(self.space, u, du))
         followed = jnp.einsum("mdn,kn->kmd", eq.start_gain, newton - u)
         near = jnp.concatenate([u[None], newton])
         shifted = shift + jnp.concatenate([unmoved[None], followed])
-        shifted = shifted + shares[:, None, None, None] * eq.start_step
-        units = [*[near] * len(shares), hops.reshape(-1, n), item.begun[None]]
-        stay = jnp.broadcast_to(shift, (2 * len(ways), *shift.shape))
+        shifted = shifted + self.shares[:, None, None, None] * eq.start_step
+        hops = hops.reshape(-1, u.size)
+        units = [*[near] * len(self.shares), hops, now.item.begun[None]]
+        stay = jnp.broadcast_to(shift, (len(hops), *shift.shape))
         shifts = [shifted.reshape(-1, *shift.shape), stay, unmoved[None]]
         return jnp.concatenate(units), jnp.concatenate(shifts)
 
-    def best_starts(units: Any, shifts: Any, each: Any) -> Any:
-        """Those trials that differ in their starts alone as one: given the parameters,
-        each piece takes the start that suits it.
-
-        A step that suits most starts throws some across a change of sign of a speed,
-        and their cost would hide what all others gain.
-        """
-        tried = each[:plain].reshape(len(shares), -1, count)
-        chosen = jnp.argmin(jnp.where(jnp.isfinite(tried), tried, jnp.inf), axis=0)
-        least = jnp.take_along_axis(tried, chosen[None], axis=0)[0]
-        starts = shifts[:plain].reshape(len(shares), -1, *unmoved.shape)
-        starts = jnp.take_along_axis(starts, chosen[None, ..., None], axis=0)[0]
-        return (
-            jnp.concatenate([units[:steps], units[plain:]]),
-            jnp.concatenate([starts, shifts[plain:]]),
-            jnp.concatenate([least, each[plain:]]),
-        )
+    def look(
+        self,
+        at: _Place,
+        hops: jax.Array,
+        weight: jax.Array,
+        trust: jax.Array,
+        now: _Now,
+    ) -> tuple[Normal, tuple[jax.Array, jax.Array], jax.Array]:
+        """Derivatives with what pieces are trusted, then trials and their costs of all
+        pieces, ``(K, M)``."""
+        paired, trusted = self.whole, weight * trust[:, None, None]
+        if self.short < paired.segments.horizon:
+            steps = jnp.where(now.item.short, self.short, paired.segments.horizon)
+            paired = replace(paired, steps=steps)
+        tries = functools.partial(self.trials, at, hops, now)
+        if paired.simulator.by_differences:
+            return self.swept(paired, at, tries, trusted, weight)
+        eq = paired.normal(at.unit, at.shift, trusted)
+        tried = tries(eq)
+        return eq, tried, paired.costs(*tried, weight)
 
     def swept(
+        self,
         paired: PairedFit,
-        u: Any,
-        shift: Any,
-        damp: Any,
-        hops: Any,
-        item: _Stage,
-        loose: Any,
-        weight: Any,
-        trusted: Any,
-    ) -> Any:
+        at: _Place,
+        tries: Callable[[Normal], tuple[jax.Array, jax.Array]],
+        trusted: jax.Array,
+        weight: jax.Array,
+    ) -> tuple[Normal, tuple[jax.Array, jax.Array], jax.Array]:
         """Derivatives, then trials, by one simulation that is compiled once."""
-        points = paired.around(u, shift)
-        most = max(places, points[0].shape[0])
+        points = paired.around(at.unit, at.shift)
+        most = max(self.places, points[0].shape[0])
 
         def padded(x: jax.Array) -> jax.Array:
             last = jnp.broadcast_to(x[:1], (most - x.shape[0], *x.shape[1:]))
@@ -299,266 +573,39 @@ def refine(
 
         def turn(points: Any, weights: jax.Array) -> Any:
             eq, each = paired.sweep(points[0], points[1], weights)
-            told = trials(u, shift, damp, hops, item, loose, eq)
-            return jax.tree.map(padded, told), (eq, told, each[:places])
+            tried = tries(eq)
+            return jax.tree.map(padded, tried), (eq, tried, each[: self.places])
 
         points = jax.tree.map(padded, points)
         out = jax.lax.scan(turn, points, jnp.stack([trusted, weight]))[1]
-        (eq, (units, shifts), _), (_, _, each) = (
+        (eq, tried, _), (_, _, each) = (
             jax.tree.map(lambda x, i=i: x[i], out) for i in range(2)
         )
-        return eq, units, shifts, each
+        return eq, tried, each
 
-    def stage(found: Any, item: Any) -> Any:
-        """From parameters and shifts ``found``, or ``item.begun``, to a best fit."""
-        (u, shift), best, freed, limits = found
-        u = jnp.where(item.restart, item.begun, u)
-        shift = jnp.where(item.restart, unmoved, shift)
-        from_best = item.look | item.dropping
-        u = jnp.where(from_best, best[0], jnp.where(item.freed, freed, u))
-        u = jnp.where(item.raised, raised_to_range(space, u), u)
-        shift = jnp.where(from_best | item.freed, best[1], shift)
-        phase = jnp.where(item.freed & (freed == best[0]).all(), _FINISHED, item.phase)
-        even = ~_far_worse(best[4], weight).any()
-        after = item.dropping | (item.held > 0)
-        phase = jnp.where(after & even, _FINISHED, phase)
-        used = jnp.where(item.short, weight * begin[:, None], weight)
-        init = (
-            *(u, shift, jnp.asarray(1e-3), *fresh),
-            *(jnp.ones(count), jnp.zeros((n, n)), u),
+    def best_starts(
+        self, units: jax.Array, shifts: jax.Array, each: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Those trials that differ in their starts alone as one: given the parameters,
+        each piece takes the start that suits it.
+
+        A step that suits most starts throws some across a change of sign of a speed,
+        and their cost would hide what all others gain.
+        """
+        plain, count = len(self.shares) * _STEPS, each.shape[1]
+        tried = each[:plain].reshape(-1, _STEPS, count)
+        chosen = jnp.argmin(jnp.where(jnp.isfinite(tried), tried, jnp.inf), axis=0)
+        least = jnp.take_along_axis(tried, chosen[None], axis=0)[0]
+        starts = shifts[:plain].reshape(-1, _STEPS, *shifts.shape[1:])
+        starts = jnp.take_along_axis(starts, chosen[None, ..., None], axis=0)[0]
+        return (
+            jnp.concatenate([units[:_STEPS], units[plain:]]),
+            jnp.concatenate([starts, shifts[plain:]]),
+            jnp.concatenate([least, each[plain:]]),
         )
-
-        def going(state: Any) -> jax.Array:
-            return state[0] < _FINISHED
-
-        def round_(state: Any) -> Any:
-            phase, k, costs, carry = state
-            at = carry[0]
-            # The first round only looks, and the last: cost and information at the
-            # result.
-            fitting = phase == _MOVING
-            moving = fitting & (k > 0)
-            trusting = ~moving | (k > item.robust)
-            first = fitting & (k == 0)
-            done = jnp.maximum(k - item.held, 0)
-            loose = limits | (k > item.held) | (item.held == 0)
-            # A jump that did not help then may help now.
-            again = done % _BISECTED == 0
-            now = trusting, again, loose
-            carry, cost = step(carry, used, first, moving, *now, item)
-            costs = jnp.where(jnp.arange(iterations + 2) >= done, cost, costs)
-            gain = costs[jnp.maximum(done - item.patience, 0)] - cost
-            settled = is_settled(gain, cost, _TOLD_APART, item.rough)
-            settled &= done > item.least
-            over = settled | (done >= iterations)
-            phase = jnp.where(fitting, jnp.where(over, _LOOKING, _MOVING), _FINISHED)
-            # From here it goes to where an earlier start has led.
-            off = at - best[0]
-            merged = (off @ best[3] @ off < 1.0) & (cost < best[2][-1] + 1.0)
-            merged &= item.whole & ~item.first & ~item.freed & fitting
-            costs = jnp.where(merged, jnp.inf, costs)
-            return jnp.where(merged, _FINISHED, phase), k + 1, costs, carry
-
-        start = (phase, jnp.asarray(0), jnp.zeros(iterations + 2), init)
-        _, rounds, costs, carry = jax.lax.while_loop(going, round_, start)
-        steps = rounds * jnp.where(item.short, short, segments.horizon)
-        u, shift, _, _, raised, each, hessian, up = carry
-        # A plateau is wide, and likelier than a dip that noise may have dug.
-        flat = item.freed & (freed != best[0]) & (jnp.diag(hessian) < _UNSEEN)
-        least = best[2][-1] + EDGE * flat.sum()
-        better = item.whole & (item.first | (costs[-1] < least))
-        better &= phase != _FINISHED
-        best = jax.tree.map(
-            lambda new, old: jnp.where(better, new, old),
-            (u, shift, costs, hessian, each),
-            best,
-        )
-        # What met no limit: to where the first piece would. And starts that were bent,
-        # so that none had to be met: as measured.
-        bent = item.dropping & _far_worse(each, weight)
-        shift = jnp.where(bent[:, None], unmoved, shift)
-        unmet = jnp.diag(hessian) < _UNSEEN
-        down = jnp.clip(u - raised[1, :n], low, high)
-        u = jnp.where(item.dropping & unmet, down, u)
-        limits = jnp.where(item.dropping, unmet, limits)
-        out = (u, shift), best, jnp.where(item.look, up, freed), limits
-        return out, (u, hessian, steps)
-
-    starts = unit[None] if others is None else jnp.concatenate([unit[None], others])
-    # As a scan, so that a stage is compiled once.
-    none = unit, unmoved, jnp.zeros(iterations + 2), jnp.zeros((n, n)), jnp.ones(count)
-    stages = _stages(starts, near, robust, rounding, others is not None)
-    begun = (unit, unmoved), none, unit, jnp.zeros(n, bool)
-    found, looked = jax.lax.scan(stage, begun, stages)
-    u, shift, costs, hessian, each = found[1]
-    points = whole.points + places
-    if simulator.by_differences:  # one simulation for both, see `swept`
-        points = 2 * max(whole.points, places)
-    simulated = 1.0 * points * count * looked[2].sum()
-    return RefineResult(
-        *(u, hessian, costs, shift, looked[0][-1], looked[1][-1]),
-        excess(each, weight),
-        simulated,
-    )
-
-
-@flax.struct.dataclass
-class _Stage:
-    """One stage of the fit, or a look at the result; see `_stages`."""
-
-    begun: jax.Array  # where this fit began
-    phase: jax.Array
-    restart: jax.Array
-    short: jax.Array
-    whole: jax.Array
-    first: jax.Array
-    dropping: jax.Array
-    held: jax.Array  # rounds in which limits move alone
-    look: jax.Array
-    freed: jax.Array
-    raised: jax.Array
-    robust: jax.Array
-    patience: jax.Array
-    least: jax.Array  # rounds
-    rough: jax.Array
-
-
-def _stages(
-    starts: jax.Array, near: Any, robust: Any, rounding: float, apart: bool
-) -> _Stage:
-    """The beginnings of the pieces, then all of them, from each start ``(K, n)``; with
-    ``apart``, a fit without what fits far worse, and one of all from there; then a look
-    at the result, a fit of what may not be at a plateau's edge, and a look at what is
-    raised."""
-    begun, fits = 2 * len(starts), 2 * (len(starts) + apart)
-    at = jnp.arange(fits + 3)
-    look, freed = (at == fits) | (at == fits + 2), at == fits + 1
-    after = (at >= begun) & (at < fits)
-    dropping = after & (at % 2 == 0)
-    held = jnp.where(after & ~dropping, _HELD, 0)
-    short = (at < begun) & (at % 2 == 0)
-    wanted = jnp.where(near, at == 1, True) | freed
-    near |= freed
-    robust = jnp.where(short | after, 0, robust)
-    patience = jnp.where(short | near, *_PATIENCE)
-    bisected = jnp.where(short | near, 0, _BISECTED)
-    return _Stage(
-        begun=starts[jnp.minimum(at // 2, len(starts) - 1)],
-        phase=jnp.where(look, _LOOKING, jnp.where(wanted, _MOVING, _FINISHED)),
-        restart=short,
-        short=short,
-        whole=~short & ~look & ~dropping & wanted,
-        first=at == 1,
-        dropping=dropping,
-        held=held,
-        look=look,
-        freed=freed,
-        raised=at == fits + 2,
-        robust=robust,
-        patience=patience,
-        # Without what fits far worse, limits are looked for once the rest has settled.
-        least=jnp.maximum(robust + patience, bisected) + dropping * _BISECTED,
-        rough=jnp.where(short, _NEAR_ENOUGH, rounding),
-    )
-
-
-def jumps(space: ParameterSpace) -> tuple[np.ndarray, np.ndarray]:
-    """Directions of jumps, ``(n + 1 or n, n)``, and how far each may go: single
-    parameters in unit coordinates, and the common scale of all masses and forces, along
-    which motion changes least, in log ratios."""
-    # A start range may be narrow, and wrong.
-    wide = np.maximum(_FARTHEST[0], _FARTHEST[1] / space.log_width)
-    single = np.eye(space.size), np.where(space.log, wide, _FARTHEST[0])
-    scaled = forces(space) * space.log
-    if scaled.sum() < 2:
-        return single
-    common = scaled / space.log_width
-    return np.vstack([single[0], common]), np.append(single[1], _FARTHEST[1])
-
-
-def excess(costs: jax.Array, weight: jax.Array) -> jax.Array:
-    """Weighted squared error beyond what the noise makes, ``()``, with room for a noise
-    that is a fifth larger than it is thought to be.
-
-    Args:
-        costs: half the weighted squared error of each piece, ``(M,)``; those that are
-            not finite count nothing.
-        weight: of each measured number, ``(M, H, 2 nv)``.
-    """
-    told = jnp.isfinite(costs)
-    numbers = jnp.where(told, weight.sum((1, 2)), 0.0).sum()
-    error = 2.0 * jnp.where(told, costs, 0.0).sum()
-    return jnp.maximum(error - _NOISIER**2 * numbers, 0.0)
 
 
 def _data(each: jax.Array, trust: jax.Array) -> jax.Array:
     """Cost of the data, of pieces ``each (T, M)``; without trust they may be infinitely
     bad."""
     return jnp.where(trust > 0, each * trust, 0.0).sum(1)
-
-
-def _trust(pieces: jax.Array, used: jax.Array) -> jax.Array:
-    """Weight of each piece by its cost ``(M,)``: what fits far worse counts less.
-
-    Cauchy's weights about the median. Few pieces that meet a limit which is still
-    wrong would otherwise bend every other parameter until they fit.
-    """
-    typical = jnp.nanmedian(jnp.where(used & jnp.isfinite(pieces), pieces, jnp.nan))
-    typical = jnp.nan_to_num(typical)  # where there is none
-    ratio = pieces / jnp.maximum(_OUTLYING * typical, 1e-30)
-    return jnp.where(jnp.isfinite(ratio), 1.0 / (1.0 + ratio), 0.0)
-
-
-def _far_worse(costs: jax.Array, weight: jax.Array) -> jax.Array:
-    """Pieces that fit far worse than typical ones, and than the noise makes them, by
-    their ``costs (M,)``, ``(M,)``.
-
-    Args:
-        weight: of each measured number, ``(M, H, 2 nv)``.
-    """
-    numbers = weight.sum((1, 2))
-    share = costs / jnp.maximum(0.5 * numbers, 1e-30)
-    typical = jnp.nanmedian(jnp.where(numbers > 0, share, jnp.nan))
-    typical = jnp.maximum(typical, 1.0)
-    spread = jnp.sqrt(2.0 / jnp.maximum(numbers, 1e-30))
-    return (numbers > 0) & ~(share <= typical * (1.0 + _APART * spread))
-
-
-def _distance(space: ParameterSpace, anchor: jax.Array, unit: jax.Array) -> jax.Array:
-    """How far ``unit`` is from ``anchor`` for the prior, in initial ranges.
-
-    Below its initial range a logarithmic parameter counts by its SI value: it may be
-    as good as zero there, where the data have no slope and must not lose to the prior.
-    """
-    width = space.log_width
-
-    def scale(u: jax.Array) -> jax.Array:
-        below = jnp.expm1(width * jnp.minimum(u, 0.0)) / width
-        return jnp.where(space.log & (u < 0), below, u)
-
-    return scale(unit) - scale(anchor)
-
-
-def raised_to_range(space: ParameterSpace, unit: jax.Array) -> jax.Array:
-    """``unit`` with logarithms raised to the low end of their initial range: further
-    down they have no slope, and no way back."""
-    return jnp.where(space.log, jnp.maximum(unit, 0.0), unit)
-
-
-def beyond_edge(unit: jax.Array, limits: jax.Array, most: jax.Array) -> jax.Array:
-    """``unit (n,)`` with ``limits (n,)`` on the plateau beyond the edge of a dip."""
-    middle = jnp.minimum(most, jnp.maximum(0.5, unit + _INSIDE))
-    return jnp.where(limits, middle, unit)
-
-
-def step_weights(
-    segments: Segments, noise: jax.Array, misfit: jax.Array | None = None
-) -> jax.Array:
-    """Weight of each measured number, ``(M, H, 2 nv)``: 1 where the model is exact, 0
-    of what is not measured."""
-    share = jnp.where(jnp.isfinite(noise), 1.0, 0.0)
-    if misfit is not None:
-        known = jnp.isfinite(noise)
-        share = share / (1.0 + jnp.where(known, misfit / noise, 0.0) ** 2)
-    shape = (segments.count, segments.horizon, noise.shape[0])
-    return jnp.broadcast_to(segments.weight[:, None, None] * share, shape)

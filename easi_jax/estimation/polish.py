@@ -5,6 +5,7 @@ tenth of a long recording shows where that is. How far along it the best place l
 matter of all the data, and near it a few steps are enough.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import flax.struct
@@ -19,14 +20,11 @@ from easi_jax.estimation.least_squares import (
     held_back,
     is_settled,
     moved,
-)
-from easi_jax.estimation.levenberg_marquardt import (
-    RefineResult,
-    excess,
     raised_to_range,
-    step_weights,
 )
+from easi_jax.estimation.levenberg_marquardt import RefineResult
 from easi_jax.estimation.normal_equations import Normal, PairedFit
+from easi_jax.estimation.weights import excess, step_weights
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.simulator import Simulator
 
@@ -89,31 +87,85 @@ def polish(
         does not get through at ``unit`` counts nothing; at a place where one of the
         others explodes the cost is infinite.
     """
-    given = simulator, space, segments, noise, mesh, free_starts
-    paired = PairedFit(*given, start=start)
+    paired = PairedFit(
+        simulator, space, segments, noise, mesh, free_starts, start=start
+    )
     weight = step_weights(segments, noise, misfit)
-    low, high = space.unit_bounds
-    unmoved = paired.unmoved
-    looks = _LOOKS[1 if doubts else 0]
     doubted = jnp.arange(space.size) >= space.size - doubts
-    known = jnp.where(doubted, 1.0, 0.0)
+    fit = _Steps(paired, weight, jnp.where(doubted, 1.0, 0.0), _LOOKS[doubts > 0])
+    end = jax.lax.while_loop(lambda c: c.phase < _FINISHED, fit.look, fit.begin(unit))
+    unit, starts, told = end.best
+    below = (raised_to_range(space, unit) != unit).any()
+    if doubts:
+        new = moved(space, unit, fit.step(unit, told, 0.0, doubted)[1])
+        unit = jnp.where(doubted, new, space.clip(new))
+    whole = paired.points * segments.count * segments.horizon
+    return RefineResult(
+        unit=unit,
+        hessian=told.hessian,
+        cost=end.cost,
+        delta=starts,
+        raised=raised_to_range(space, unit),
+        raised_hessian=jnp.where(below, end.seen, told.hessian),
+        excess=excess(jnp.where(end.used, told.costs, jnp.inf), weight),
+        simulated=1.0 * whole * end.k,
+    )
 
-    def step(at: jax.Array, told: Normal, loose: Any, damping: Any) -> Any:
-        """Gradient and step at ``at (n,)``."""
-        gradient = told.gradient + known * at
-        free = ~held_back(at, gradient, low, high) | loose
-        held = told.hessian + jnp.diag(jnp.maximum(known, _PULL))
-        return gradient, bounded_step(held, gradient, free, damping)
 
-    def going(c: _Look) -> jax.Array:
-        return c.phase < _FINISHED
+@dataclass(frozen=True)
+class _Steps:
+    """What all looks have in common.
 
-    def look(c: _Look) -> _Look:
-        eq = paired.normal(c.unit, c.starts, weight * c.used[:, None, None])
+    Attributes:
+        paired: the pieces.
+        weight: of each measured number, ``(M, H, 2 nv)``.
+        known: information before any data of a coordinate about 0, ``(n,)``.
+        looks: at most.
+    """
+
+    paired: PairedFit
+    weight: jax.Array
+    known: jax.Array
+    looks: int
+
+    def begin(self, unit: jax.Array) -> _Look:
+        """Before anything was looked at."""
+        unmoved = self.paired.unmoved
+        like = jax.eval_shape(self.paired.normal, unit, unmoved, self.weight)
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+        return _Look(
+            k=jnp.asarray(0),
+            progressed=jnp.asarray(0),
+            phase=jnp.asarray(_STEPPING),
+            unit=unit,
+            starts=unmoved,
+            share=jnp.ones(len(unmoved)),
+            damping=jnp.asarray(_BEGUN),
+            best=(unit, unmoved, nothing),
+            used=jnp.ones(len(unmoved), bool),
+            least=jnp.asarray(jnp.inf),
+            seen=nothing.hessian,
+            cost=jnp.full(self.looks, jnp.inf),
+        )
+
+    def step(
+        self, at: jax.Array, told: Normal, damping: Any, loose: Any = False
+    ) -> tuple[jax.Array, jax.Array]:
+        """Gradient and step at ``at (n,)``; no bound holds back what is ``loose``."""
+        gradient = told.gradient + self.known * at
+        free = ~held_back(at, gradient, *self.paired.space.unit_bounds) | loose
+        hessian = told.hessian + jnp.diag(jnp.maximum(self.known, _PULL))
+        return gradient, bounded_step(hessian, gradient, free, damping)
+
+    def look(self, c: _Look) -> _Look:
+        """What is seen at a place, and where to look next."""
+        space = self.paired.space
+        weight = self.weight * c.used[:, None, None]
+        eq = self.paired.normal(c.unit, c.starts, weight)
         stepping = c.phase == _STEPPING
         used = jnp.where(c.k == 0, jnp.isfinite(eq.costs), c.used)
         cost = jnp.where(used, eq.costs, 0.0).sum()
-        cost += 0.5 * jnp.sum(known * c.unit**2)
+        cost += 0.5 * jnp.sum(self.known * c.unit**2)
         better = stepping & ((c.k == 0) | (cost < c.least))
         best = jax.tree.map(
             lambda new, old: jnp.where(better, new, old),
@@ -127,19 +179,19 @@ def polish(
         longer = jnp.where(better, jnp.minimum(_LONGER * c.share, 1.0), c.share)
         share = jnp.where(thrown, _SHORTER * c.share, longer)
         at, starts, told = best
-        gradient, du = step(at, told, False, damping)
-        new = jnp.clip(moved(space, at, du), low, high)
-        here = jnp.arange(looks) == c.k
+        gradient, du = self.step(at, told, damping)
+        new = space.clip(moved(space, at, du))
         follow = starts + share[:, None] * told.start_step
         follow = follow + told.start_gain @ (new - at)
-        gain = -0.5 * gradient @ du
         progress = ~is_settled(c.least - cost, cost, _SETTLED, _ROUNDING)
         progressed = jnp.where(better & progress, c.k, c.progressed)
-        done = ~stepping | (better & (gain < _SETTLED)) | (c.k + 1 >= looks)
+        foretold = -0.5 * gradient @ du
+        done = ~stepping | (better & (foretold < _SETTLED)) | (c.k + 1 >= self.looks)
         done |= c.k - progressed >= _STALE
         raised = raised_to_range(space, at)
         below = (raised != at).any() & stepping
         over = jnp.where(below, _RAISING, _FINISHED)
+        here = jnp.arange(self.looks) == c.k
         return _Look(
             k=c.k + 1,
             progressed=progressed,
@@ -154,38 +206,3 @@ def polish(
             seen=eq.hessian,
             cost=jnp.where(here & stepping, cost, c.cost),
         )
-
-    like = jax.eval_shape(paired.normal, unit, unmoved, weight)
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-    begin = _Look(
-        k=jnp.asarray(0),
-        progressed=jnp.asarray(0),
-        phase=jnp.asarray(_STEPPING),
-        unit=unit,
-        starts=unmoved,
-        share=jnp.ones(segments.count),
-        damping=jnp.asarray(_BEGUN),
-        best=(unit, unmoved, nothing),
-        used=jnp.ones(segments.count, bool),
-        least=jnp.asarray(jnp.inf),
-        seen=nothing.hessian,
-        cost=jnp.full(looks, jnp.inf),
-    )
-    end = jax.lax.while_loop(going, look, begin)
-    unit, starts, told = end.best
-    below = (raised_to_range(space, unit) != unit).any()
-    if doubts:
-        new = moved(space, unit, step(unit, told, doubted, 0.0)[1])
-        unit = jnp.where(doubted, new, jnp.clip(new, low, high))
-    raised = raised_to_range(space, unit)
-    whole = paired.points * segments.count * segments.horizon
-    return RefineResult(
-        unit=unit,
-        hessian=told.hessian,
-        cost=end.cost,
-        delta=starts,
-        raised=raised,
-        raised_hessian=jnp.where(below, end.seen, told.hessian),
-        excess=excess(jnp.where(end.used, told.costs, jnp.inf), weight),
-        simulated=1.0 * whole * end.k,
-    )

@@ -12,16 +12,12 @@ from jax.sharding import Mesh
 
 from easi_jax.data.segments import Segments
 from easi_jax.estimation.doubts import Doubts, without
-from easi_jax.estimation.levenberg_marquardt import (
-    RefineResult,
-    excess,
-    refine,
-    step_weights,
-)
+from easi_jax.estimation.levenberg_marquardt import RefineResult, refine
 from easi_jax.estimation.normal_equations import RESOLVED, PairedFit
 from easi_jax.estimation.pieces import effective_noise, finish_pieces, finish_rest
 from easi_jax.estimation.polish import polish
 from easi_jax.estimation.profile_score import Adjusted, adjust
+from easi_jax.estimation.weights import excess, step_weights
 from easi_jax.model.distribution import Distribution, gaussian
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.simulator import FORWARD_MODE, Simulator
@@ -50,7 +46,7 @@ class Estimate:
         fit: where the data alone lead, unit coordinates, ``(n,)``; the search's mean
             where nothing was refined.
         excess: weighted squared error there beyond what the noise makes, ``()``
-            (`easi_jax.estimation.levenberg_marquardt.excess`).
+            (`easi_jax.estimation.weights.excess`).
         simulated: control steps simulated since the search, ``()``; a derivative
             counts as one more.
         pieces: M segments that all this is about, with their weights.

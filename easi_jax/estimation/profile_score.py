@@ -14,7 +14,7 @@ direction where it is not, or where scores with fitted starts scatter more than 
 information says, the result is as much less sure (Godambe, 1960).
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import flax.struct
@@ -23,16 +23,15 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from easi_jax.data.segments import Segments
-from easi_jax.estimation.least_squares import bounded_step, held_back, moved
-from easi_jax.estimation.levenberg_marquardt import (
-    DUG,
-    EDGE,
-    beyond_edge,
-    jumps,
+from easi_jax.estimation.least_squares import (
+    bounded_step,
+    held_back,
+    moved,
     raised_to_range,
-    step_weights,
 )
+from easi_jax.estimation.limits import EDGE, beyond_edge, jumps, shallow
 from easi_jax.estimation.normal_equations import RESOLVED, PairedFit
+from easi_jax.estimation.weights import step_weights
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.slopes import shift_start
@@ -45,7 +44,6 @@ _PULL = 12.0  # information of a uniform initial range, unit coordinates
 _LONGEST = 4.0  # times the Newton step: the average changes with the parameters, too
 _SHORT = 0.2  # a step which still loses what was known: it stays as it is
 _SHORTEST = 0.02
-_SHALLOW = 0.1  # of what its information foretells, that the cost rises beyond a dip
 _LOST = 0.2  # of what was known of a parameter: less must not be left by a step
 _SETTLED = 1e-2  # half the squared score that is left, in its standard deviations
 _NOISE, _FIRST, _MOVING, _RAISED, _DONE = range(5)
@@ -251,115 +249,109 @@ def adjust(
         misfit: what the model itself errs by in every step, as in
             `easi_jax.estimation.levenberg_marquardt.refine`.
     """
-    fit = ProfileFit(simulator, space, segments, noise, mesh)
     weight = step_weights(segments, noise, misfit)
     shape = (segments.count, _DRAWS, segments.horizon + 1, len(noise))
     draws = jax.random.normal(jax.random.key(0), shape)
     off = jnp.zeros_like(noise) if misfit is None else misfit
     later = jnp.where(jnp.isfinite(off), jnp.hypot(noise, off), 0.0)
-    spread = jnp.stack([noise, later])
-    low, high = space.unit_bounds
+    fit = ProfileFit(simulator, space, segments, noise, mesh)
+    root = _Root(fit, weight, draws)
+    begin = root.begin(raised_to_range(space, unit), jnp.stack([noise, later]))
+    end, rounds = jax.lax.scan(root.search, begin, jnp.array([False, True]))
+    u, found = end.here
+    points = (1 + _DRAWS) * _TURNS * fit.points * rounds.sum()
+    points += len(rounds) * space.size  # of `in_dip`
+    return Adjusted(
+        unit=u,
+        hessian=root.worth(found),
+        delta=found.delta,
+        raised=raised_to_range(space, u),
+        raised_hessian=root.worth(end.seen),
+        left=end.left,
+        simulated=1.0 * segments.count * segments.horizon * points,
+    )
 
-    def newton(u: jax.Array, s: Score, held: jax.Array) -> tuple[Any, Any]:
+
+@dataclass(frozen=True)
+class _Root:
+    """What all rounds have in common.
+
+    Attributes:
+        fit: the pieces.
+        weight, draws: as `ProfileFit.score` takes them.
+    """
+
+    fit: ProfileFit
+    weight: jax.Array
+    draws: jax.Array
+
+    @property
+    def space(self) -> ParameterSpace:
+        return self.fit.space
+
+    def score(self, unit: jax.Array, spread: jax.Array) -> Score:
+        return self.fit.score(unit, self.weight, self.draws, spread)
+
+    def begin(self, unit: jax.Array, spread: jax.Array) -> _Carry:
+        """At ``unit (n,)``, before anything was looked at."""
+        shapes = jax.eval_shape(self.score, unit, spread)
+        none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        return _Carry(
+            phase=jnp.asarray(_NOISE),
+            k=jnp.asarray(0),
+            at=unit,
+            spread=spread,
+            here=(unit, none),
+            held=jnp.zeros(unit.size, bool),
+            length=jnp.asarray(1.0),
+            left=jnp.full(2, jnp.inf),
+            seen=none,
+        )
+
+    def newton(
+        self, unit: jax.Array, s: Score, held: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         """The step, and what is left."""
         a = s.gradient - s.bias
-        free = ~held_back(u, a, low, high) & ~held
-        step = bounded_step(s.hessian + _PULL * jnp.eye(space.size), a, free)
+        free = ~held_back(unit, a, *self.space.unit_bounds) & ~held
+        step = bounded_step(s.hessian + _PULL * jnp.eye(unit.size), a, free)
         left = -0.5 * a @ step
         return step, jnp.where(jnp.isfinite(left), left, jnp.inf)
 
-    def worth(s: Score) -> jax.Array:
-        return less_scatter(s.hessian, s.scatter, segments.count)
+    def worth(self, s: Score) -> jax.Array:
+        """Information that a score is worth, ``(n, n)``."""
+        return less_scatter(s.hessian, s.scatter, self.fit.segments.count)
 
-    def told(u: jax.Array, hessian: jax.Array) -> jax.Array:
+    def told(self, unit: jax.Array, s: Score) -> jax.Array:
         """Information of each parameter, of a logarithm by its SI value, ``(n,)``."""
-        down = jnp.where(space.log, jnp.exp(-2.0 * space.log_width * u), 1.0)
-        return jnp.diag(hessian) * down
+        space = self.space
+        down = jnp.where(space.log, jnp.exp(-2.0 * space.log_width * unit), 1.0)
+        return jnp.diag(s.hessian) * down
 
-    def in_dip(u: jax.Array, found: Score) -> jax.Array:
-        """Which parameters' cost hardly rises far above ``u (n,)``."""
-        n = space.size
-        up = jnp.minimum(u + jumps(space)[1][:n], high)
-        hops = jnp.where(jnp.eye(n, dtype=bool), up, u)
+    def in_dip(self, unit: jax.Array, found: Score) -> jax.Array:
+        """Which parameters' cost hardly rises far above ``unit (n,)``."""
+        n, high = unit.size, self.space.unit_bounds[1]
+        up = jnp.minimum(unit + jumps(self.space)[1][:n], high)
+        hops = jnp.where(jnp.eye(n, dtype=bool), up, unit)
         starts = jnp.broadcast_to(found.delta, (n, *found.delta.shape))
-        rise = fit.costs(hops, starts, weight).sum(1) - found.cost
+        rise = self.fit.costs(hops, starts, self.weight).sum(1) - found.cost
         told = jnp.diag(found.hessian)
-        foretold = 0.5 * told * (up - u) ** 2
-        shallow = (rise < _SHALLOW * foretold) & (rise < DUG)
-        return (told > _PULL) & shallow
+        return (told > _PULL) & shallow(rise, 0.5 * told * (up - unit) ** 2)
 
-    def over(left: jax.Array, k: jax.Array, length: jax.Array) -> jax.Array:
-        return (left < _SETTLED) | (k > _ROUNDS) | (length < _SHORTEST)
-
-    def round_(carry: _Carry) -> _Carry:
-        c = carry
-        s = fit.score(c.at, weight, draws, c.spread)
-        share = s.cost / jnp.maximum(s.expected, 1e-30)
-        quiet = c.spread * jnp.sqrt(jnp.clip(share, 0.0, 1.0))
-        # Beyond a limit that was met there is no score, which makes nothing right.
-        u, found = c.here
-        known = told(u, found.hessian)
-        lost = told(c.at, s.hessian) < _LOST * known
-        lost &= (jnp.diag(found.hessian) > _PULL) & (c.phase == _MOVING)
-        short = c.length < _SHORT
-        held = jnp.where(short, c.held | lost, c.held)
-        before = newton(u, found, held)[1]
-        left = newton(c.at, s, held)[1]
-        better = (c.phase == _FIRST) | (c.phase == _MOVING) & (left < before)
-        better &= ~lost.any()
-        here = jax.tree.map(lambda x, y: jnp.where(better, x, y), (c.at, s), c.here)
-        u = here[0]
-        step, rest = newton(u, here[1], held)
-        # A step that gains little may have been too short.
-        longer = jnp.where(left < 0.25 * before, 1.0, 2.0)
-        length = c.length * jnp.where(better, longer, 1.0 / 3.0)
-        length = jnp.where(short & lost.any(), 1.0, length)
-        length = jnp.where(c.phase == _MOVING, jnp.minimum(length, _LONGEST), 1.0)
-        ended = (c.phase >= _FIRST) & over(rest, c.k, length)
-        phase = jnp.where(c.phase < _MOVING, c.phase + 1, c.phase)
-        phase = jnp.where(ended, _RAISED, phase)
-        phase = jnp.where(c.phase == _RAISED, _DONE, phase)
-        ahead = jnp.clip(moved(space, u, length * step), low, high)
-        return _Carry(
-            phase=phase,
-            k=c.k + 1,
-            at=jnp.where(
-                phase == _MOVING,
-                ahead,
-                jnp.where(phase == _RAISED, raised_to_range(space, u), c.at),
-            ),
-            spread=jnp.where(c.phase == _NOISE, quiet, c.spread),
-            here=here,
-            held=held,
-            length=length,
-            left=jnp.where(
-                c.phase == _RAISED,
-                c.left,
-                jnp.where(c.phase == _FIRST, rest, c.left.at[1].set(rest)),
-            ),
-            seen=s,
-        )
-
-    begin = raised_to_range(space, unit)
-    shapes = jax.eval_shape(lambda: fit.score(begin, weight, draws, spread))
-    none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-
-    def search(found: _Carry, again: jax.Array) -> tuple[_Carry, jax.Array]:
-        """From ``unit``; then from what was found, with that beyond its limit which
-        was held, or costs next to nothing there."""
-        edges = found.held | in_dip(*found.here)
-        begun = jnp.where(again, beyond_edge(found.here[0], edges, high), begin)
+    def search(self, found: _Carry, again: jax.Array) -> tuple[_Carry, jax.Array]:
+        """From where it begins; then from what was found, with that beyond its limit
+        which was held, or costs next to nothing there."""
+        edges = found.held | self.in_dip(*found.here)
+        beyond = beyond_edge(found.here[0], edges, self.space.unit_bounds[1])
+        begun = jnp.where(again, beyond, found.at)
         phase = jnp.where(edges.any(), _FIRST, _DONE)
         start = replace(
-            found,
+            self.begin(begun, found.spread),
             phase=jnp.where(again, phase, _NOISE),
-            k=jnp.asarray(0),
-            at=begun,
-            here=(begun, none),
-            held=jnp.zeros(space.size, bool),
-            length=jnp.asarray(1.0),
+            left=found.left,
+            seen=found.seen,
         )
-        end = jax.lax.while_loop(lambda c: c.phase < _DONE, round_, start)
+        end = jax.lax.while_loop(lambda c: c.phase < _DONE, self.round, start)
         # The limit stays where it says clearly more than that it may not be met.
         freed = end.here[1].surplus < found.here[1].surplus + EDGE
         freed = ~again | edges.any() & freed
@@ -367,27 +359,44 @@ def adjust(
         end = replace(end, left=end.left.at[0].set(first))
         return jax.tree.map(lambda x, y: jnp.where(freed, x, y), end, found), end.k
 
-    nothing = _Carry(
-        phase=jnp.asarray(_NOISE),
-        k=jnp.asarray(0),
-        at=begin,
-        spread=spread,
-        here=(begin, none),
-        held=jnp.zeros(space.size, bool),
-        length=jnp.asarray(1.0),
-        left=jnp.full(2, jnp.inf),
-        seen=none,
-    )
-    end, rounds = jax.lax.scan(search, nothing, jnp.array([False, True]))
-    u, found = end.here
-    points = (1 + _DRAWS) * _TURNS * fit.points * rounds.sum()
-    points += len(rounds) * space.size  # of `in_dip`
-    return Adjusted(
-        unit=u,
-        hessian=worth(found),
-        delta=found.delta,
-        raised=raised_to_range(space, u),
-        raised_hessian=worth(end.seen),
-        left=end.left,
-        simulated=1.0 * segments.count * segments.horizon * points,
-    )
+    def round(self, c: _Carry) -> _Carry:
+        """The score at a place, and where to look next."""
+        s = self.score(c.at, c.spread)
+        moving, short = c.phase == _MOVING, c.length < _SHORT
+        # Beyond a limit that was met there is no score, which makes nothing right.
+        u, found = c.here
+        lost = self.told(c.at, s) < _LOST * self.told(u, found)
+        lost &= (jnp.diag(found.hessian) > _PULL) & moving
+        held = jnp.where(short, c.held | lost, c.held)
+        before = self.newton(u, found, held)[1]
+        left = self.newton(c.at, s, held)[1]
+        better = ((c.phase == _FIRST) | moving & (left < before)) & ~lost.any()
+        here = jax.tree.map(lambda x, y: jnp.where(better, x, y), (c.at, s), c.here)
+        u, found = here
+        step, rest = self.newton(u, found, held)
+        # A step that gains little may have been too short.
+        longer = jnp.where(left < 0.25 * before, 1.0, 2.0)
+        length = c.length * jnp.where(better, longer, 1.0 / 3.0)
+        length = jnp.where(short & lost.any(), 1.0, length)
+        length = jnp.where(moving, jnp.minimum(length, _LONGEST), 1.0)
+        ended = (rest < _SETTLED) | (c.k > _ROUNDS) | (length < _SHORTEST)
+        phase = jnp.where(c.phase < _MOVING, c.phase + 1, c.phase)
+        phase = jnp.where((c.phase >= _FIRST) & ended, _RAISED, phase)
+        phase = jnp.where(c.phase == _RAISED, _DONE, phase)
+        ahead = self.space.clip(moved(self.space, u, length * step))
+        raised = jnp.where(phase == _RAISED, raised_to_range(self.space, u), c.at)
+        # Noise that was assumed too high.
+        share = jnp.clip(s.cost / jnp.maximum(s.expected, 1e-30), 0.0, 1.0)
+        quiet = jnp.where(c.phase == _NOISE, jnp.sqrt(share), 1.0)
+        told = jnp.where(c.phase == _FIRST, rest, c.left.at[1].set(rest))
+        return _Carry(
+            phase=phase,
+            k=c.k + 1,
+            at=jnp.where(phase == _MOVING, ahead, raised),
+            spread=c.spread * quiet,
+            here=here,
+            held=held,
+            length=length,
+            left=jnp.where(c.phase == _RAISED, c.left, told),
+            seen=s,
+        )

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from easi_jax.data.segments import Segments, windows
-from easi_jax.estimation.levenberg_marquardt import refine, step_weights
+from easi_jax.estimation.levenberg_marquardt import refine
 from easi_jax.estimation.normal_equations import Normal, PairedFit
+from easi_jax.estimation.weights import step_weights
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.simulator import Simulator
 from envs.cartpole import Cartpole

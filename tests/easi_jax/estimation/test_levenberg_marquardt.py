@@ -13,7 +13,8 @@ from benchmarks.rigs import RIGS
 from easi_jax.data.segments import Segments, cut, to_device, windows
 from easi_jax.devices.runtime import quick_compile
 from easi_jax.estimation.identifiability import identifiability
-from easi_jax.estimation.levenberg_marquardt import RefineResult, jumps, refine
+from easi_jax.estimation.levenberg_marquardt import RefineResult, refine
+from easi_jax.estimation.limits import jumps
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace, declare
 from easi_jax.simulation import rollout

@@ -13,9 +13,9 @@ from easi_jax.data.measured import MeasuredRuns
 from easi_jax.data.recording import Run
 from easi_jax.data.unmeasured import start_spread
 from easi_jax.estimation.from_runs import held_out_errors, search_data, spread_of_starts
-from easi_jax.estimation.levenberg_marquardt import step_weights
 from easi_jax.estimation.pieces import visible_steps
 from easi_jax.estimation.problem import Problem, problem_of
+from easi_jax.estimation.weights import step_weights
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace, declare
 from easi_jax.search.config import SearchConfig

@@ -1,0 +1,101 @@
+"""Limits that data may not meet, and jumps over what has no slope.
+
+A speed limit that no simulation reaches has no slope, yet the data may show that it is
+lower. Noise digs a dip into the edge of such a plateau: what fits hardly better there
+is put back onto the plateau, where nothing is known of it. The common scale of all
+masses and forces jumps as well.
+"""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from easi_jax.estimation.identifiability import forces
+from easi_jax.model.parameters import ParameterSpace
+
+EDGE = 4.0  # of the cost, that a place beyond a plateau's edge has to be better by
+_UNSEEN = 1.0  # information of a unit coordinate: nothing
+_FARTHEST = 0.8, 2.5  # jump that is tried, in initial ranges, in log ratios
+_SHALLOW = 0.1  # of what its curvature foretells, that the cost rises beyond a dip
+_DUG = 50 * EDGE  # of the cost, starts as they are: more than that noise does not dig
+_INSIDE = 0.4  # initial ranges beyond the edge, where a plateau is entered
+
+
+def jumps(space: ParameterSpace) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of jumps, ``(n + 1 or n, n)``, and how far each may go: single
+    parameters in unit coordinates, and the common scale of all masses and forces, along
+    which motion changes least, in log ratios."""
+    # A start range may be narrow, and wrong.
+    wide = np.maximum(_FARTHEST[0], _FARTHEST[1] / space.log_width)
+    single = np.eye(space.size), np.where(space.log, wide, _FARTHEST[0])
+    scaled = forces(space) * space.log
+    if scaled.sum() < 2:
+        return single
+    common = scaled / space.log_width
+    return np.vstack([single[0], common]), np.append(single[1], _FARTHEST[1])
+
+
+@flax.struct.dataclass
+class Reach:
+    """How far jumps go, up and down each of k directions: bisected between where a
+    change has left the cost as it was and where it has raised it, ``(2, k)`` each. At
+    the edge of a plateau it may fall."""
+
+    unchanged: jax.Array
+    raised: jax.Array
+
+    @classmethod
+    def fresh(cls, space: ParameterSpace) -> "Reach":
+        """Nothing was tried."""
+        farthest = jumps(space)[1]
+        return cls(
+            jnp.zeros((2, len(farthest))), jnp.tile(jnp.asarray(farthest), (2, 1))
+        )
+
+    @property
+    def tried(self) -> jax.Array:
+        """What is tried next."""
+        return 0.5 * (self.unchanged + self.raised)
+
+    def ends(self, space: ParameterSpace, unit: jax.Array) -> jax.Array:
+        """Where that leads from ``unit (n,)``, ``(2, k, n)``."""
+        sides = jnp.array([[1.0], [-1.0]])
+        return space.clip(unit + (self.tried * sides)[..., None] * jumps(space)[0])
+
+    def after(self, data: jax.Array, here: jax.Array, taken: jax.Array) -> "Reach":
+        """After a look: ``data (2, k)`` are costs of the jumps, ``here`` that without,
+        ``taken (2, k)`` the jump that was made."""
+        worse = ~(data <= here) | taken
+        still = jnp.where(taken.any(0), 0.0, self.unchanged)
+        return Reach(
+            jnp.where(data == here, self.tried, still),
+            jnp.where(worse, self.tried, self.raised),
+        )
+
+
+def unmet(hessian: jax.Array) -> jax.Array:
+    """Parameters on a plateau, of which the data say nothing, ``(n,)``."""
+    return jnp.diag(hessian) < _UNSEEN
+
+
+def shallow(rise: jax.Array, foretold: jax.Array) -> jax.Array:
+    """Whether the cost rises over a jump by so much less than its curvature has
+    foretold, ``(n,)``, that noise may have dug the dip below."""
+    return (rise < _SHALLOW * foretold) & (rise < _DUG)
+
+
+def beyond_dips(
+    unit: jax.Array, up: jax.Array, rise: jax.Array, hessian: jax.Array
+) -> jax.Array:
+    """``unit (n,)``, what lies in a dip put beyond its edge; costs ``rise (n,)`` over
+    jumps to ``up (n,)``."""
+    foretold = 0.5 * jnp.diag(hessian) * (up - unit) ** 2
+    dip = (foretold > 2 * EDGE / _SHALLOW) & shallow(rise, foretold)
+    return beyond_edge(unit, dip, up)
+
+
+def beyond_edge(unit: jax.Array, limits: jax.Array, most: jax.Array) -> jax.Array:
+    """``unit (n,)`` with ``limits (n,)`` on the plateau beyond the edge of a dip."""
+    middle = jnp.minimum(most, jnp.maximum(0.5, unit + _INSIDE))
+    return jnp.where(limits, middle, unit)

@@ -1,0 +1,66 @@
+"""What each measured number, and each piece, counts in a fit."""
+
+import jax
+import jax.numpy as jnp
+
+from easi_jax.data.segments import Segments
+
+_NOISIER = 1.2  # times the noise as it is given, that it may be
+_OUTLYING = 9.0  # times the median cost: such a piece counts half
+_APART = 4.0  # standard deviations of a typical piece's cost: what fits far worse
+
+
+def step_weights(
+    segments: Segments, noise: jax.Array, misfit: jax.Array | None = None
+) -> jax.Array:
+    """Weight of each measured number, ``(M, H, 2 nv)``: 1 where the model is exact, 0
+    of what is not measured."""
+    share = jnp.where(jnp.isfinite(noise), 1.0, 0.0)
+    if misfit is not None:
+        known = jnp.isfinite(noise)
+        share = share / (1.0 + jnp.where(known, misfit / noise, 0.0) ** 2)
+    shape = (segments.count, segments.horizon, noise.shape[0])
+    return jnp.broadcast_to(segments.weight[:, None, None] * share, shape)
+
+
+def excess(costs: jax.Array, weight: jax.Array) -> jax.Array:
+    """Weighted squared error beyond what the noise makes, ``()``, with room for a noise
+    that is a fifth larger than it is thought to be.
+
+    Args:
+        costs: half the weighted squared error of each piece, ``(M,)``; those that are
+            not finite count nothing.
+        weight: of each measured number, ``(M, H, 2 nv)``.
+    """
+    told = jnp.isfinite(costs)
+    numbers = jnp.where(told, weight.sum((1, 2)), 0.0).sum()
+    error = 2.0 * jnp.where(told, costs, 0.0).sum()
+    return jnp.maximum(error - _NOISIER**2 * numbers, 0.0)
+
+
+def robust(costs: jax.Array, used: jax.Array) -> jax.Array:
+    """Weight of each piece by its cost ``(M,)``: what fits far worse counts less.
+
+    Cauchy's weights about the median of those ``used (M,)``. Few pieces that meet a
+    limit which is still wrong would otherwise bend every other parameter until they
+    fit.
+    """
+    typical = jnp.nanmedian(jnp.where(used & jnp.isfinite(costs), costs, jnp.nan))
+    typical = jnp.nan_to_num(typical)  # where there is none
+    ratio = costs / jnp.maximum(_OUTLYING * typical, 1e-30)
+    return jnp.where(jnp.isfinite(ratio), 1.0 / (1.0 + ratio), 0.0)
+
+
+def far_worse(costs: jax.Array, weight: jax.Array) -> jax.Array:
+    """Pieces that fit far worse than typical ones, and than the noise makes them, by
+    their ``costs (M,)``, ``(M,)``.
+
+    Args:
+        weight: of each measured number, ``(M, H, 2 nv)``.
+    """
+    numbers = weight.sum((1, 2))
+    share = costs / jnp.maximum(0.5 * numbers, 1e-30)
+    typical = jnp.nanmedian(jnp.where(numbers > 0, share, jnp.nan))
+    typical = jnp.maximum(typical, 1.0)
+    spread = jnp.sqrt(2.0 / jnp.maximum(numbers, 1e-30))
+    return (numbers > 0) & ~(share <= typical * (1.0 + _APART * spread))
