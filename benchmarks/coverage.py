@@ -96,7 +96,6 @@ def _solver(config: Config) -> Any:
     from easi_jax.estimation.normal_equations import PairedFit
     from easi_jax.estimation.pieces import finish_pieces
     from easi_jax.estimation.posterior import RESTARTS, estimate
-    from easi_jax.estimation.weights import step_weights
     from easi_jax.model import distribution
     from easi_jax.search.config import preset
     from easi_jax.search.easi import Search, SearchData
@@ -133,19 +132,17 @@ def _solver(config: Config) -> Any:
     @jax.jit
     def judge(demos: Any, mean: jax.Array, cov: jax.Array, truth: jax.Array) -> Any:
         pieces = finish_pieces(doubts.simulator if doubts else simulator, demos)
+        fit = PairedFit(simulator, space, pieces, noise)
         found = [
             estimate(
-                *(simulator, search.space, mean, cov, pieces, noise, *how),
+                *(fit, mean, cov, *how),
                 restarts=RESTARTS,
                 adjusted=True,
                 doubts=doubts,
             ).distribution
             for how in ((False, False), (False, True), (True, True))
         ]
-        still = jnp.zeros((pieces.count, len(noise)))
-        fit = PairedFit(simulator, space, pieces, noise)
-        bound = fit.normal(truth, still, step_weights(pieces, noise)).hessian
-        return found, bound
+        return found, fit.information(truth)
 
     def solve(seed: int) -> dict[str, Any]:
         k_truth, k_rest = jax.random.split(jax.random.key(seed))

@@ -135,6 +135,7 @@ def searched(config: Config) -> dict[str, Any]:
 
     from benchmarks.recovery import NOISE, controller
     from easi_jax.data.segments import windows
+    from easi_jax.estimation.normal_equations import PairedFit
     from easi_jax.estimation.pieces import finish_pieces
     from easi_jax.estimation.posterior import estimate
     from easi_jax.model.distribution import covariance
@@ -160,7 +161,9 @@ def searched(config: Config) -> dict[str, Any]:
         state, _ = search.run(search.init(key, data), data, config.generations)
         mean, cov = state.result_mean, state.result_cov
         pieces = finish_pieces(simulator, demos)
-        fit = estimate(simulator, search.space, mean, cov, pieces, noise, True)
+        fit = estimate(
+            PairedFit(simulator, search.space, pieces, noise), mean, cov, True
+        )
         return mean, cov, fit.distribution
 
     mean, cov, found = jax.device_get(find(jax.random.key(0)))

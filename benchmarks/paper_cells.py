@@ -379,7 +379,6 @@ class _Bench:
         from easi_jax.estimation.identifiability import identifiability
         from easi_jax.estimation.normal_equations import PairedFit
         from easi_jax.estimation.pieces import effective_noise
-        from easi_jax.estimation.weights import step_weights
 
         simulator, space = self.env.simulator, self.env.space
 
@@ -389,9 +388,7 @@ class _Bench:
             zero = jnp.zeros(2 * self.env.mj_model.nv)
             noise = effective_noise(simulator, pieces, zero)
             fit = PairedFit(simulator, space, pieces, noise, free_starts=False)
-            still = jnp.zeros((pieces.count, len(noise)))
-            unit = space.to_unit(self.target)
-            return fit.normal(unit, still, step_weights(pieces, noise, None)).hessian
+            return fit.information(space.to_unit(self.target))
 
         return identifiability(space, np.asarray(hessian(self.demos)))
 

@@ -206,17 +206,13 @@ def _fitted_to_itself(simulator: Any, space: Any, pieces: Any, start: Any) -> An
     import jax.numpy as jnp
 
     from easi_jax.estimation.levenberg_marquardt import refine
+    from easi_jax.estimation.normal_equations import PairedFit
 
     scale = [*GOALS.values()]
     misfit = jnp.asarray([*scale, *(jnp.inf for _ in scale)])
     still = jnp.full(2 * len(scale), 1e-6)
-    fit = jax.jit(
-        lambda unit: (
-            refine(
-                simulator, space, unit, pieces, still, 40, misfit=misfit, robust=0
-            ).unit
-        )
-    )
+    paired = PairedFit(simulator, space, pieces, still, misfit=misfit)
+    fit = jax.jit(lambda unit: refine(paired, unit, robust=0).unit)
     return space.to_si(fit(space.clip(space.to_unit(start))))
 
 

@@ -185,13 +185,11 @@ def fisher(task: Any, demos: Any, truth: Any) -> Any:
     """Information of the recording at the true parameters, ``(n, n)``, as the model
     without any effect has it."""
     import jax
-    import jax.numpy as jnp
     import numpy as np
 
     from easi_jax.data.segments import windows
     from easi_jax.estimation.normal_equations import PairedFit
     from easi_jax.estimation.pieces import effective_noise
-    from easi_jax.estimation.weights import step_weights
 
     steps = min(_PIECE, demos.weight.shape[1])
     pieces = windows(demos, steps, steps)
@@ -199,8 +197,7 @@ def fisher(task: Any, demos: Any, truth: Any) -> Any:
     def information(truth: Any, pieces: Any) -> Any:
         noise = effective_noise(task.simulator, pieces, task.noise)
         fit = PairedFit(task.simulator, task.space, pieces, noise, task.mesh)
-        still = jnp.zeros((pieces.count, len(noise)))
-        return fit.normal(truth, still, step_weights(pieces, noise)).hessian
+        return fit.information(truth)
 
     return np.asarray(jax.jit(information)(truth, pieces))
 

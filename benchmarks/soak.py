@@ -71,6 +71,7 @@ def ready(generations: int) -> Any:
     import numpy as np
 
     from easi_jax.data.segments import windows
+    from easi_jax.estimation.normal_equations import PairedFit
     from easi_jax.estimation.posterior import estimate
     from easi_jax.search.config import preset
     from easi_jax.search.easi import Search, SearchData
@@ -98,15 +99,8 @@ def ready(generations: int) -> Any:
         demos = measured(demos, noise, sensors, env.simulator.configuration)
         data = SearchData(windows(demos, 8, 8), noise, ())
         state, info = search.run(search.init(begin, data), data, generations)
-        found = estimate(
-            env.simulator,
-            env.space,
-            state.result_mean,
-            state.result_cov,
-            data.segments,
-            noise,
-            refined=False,
-        )
+        pieces = PairedFit(env.simulator, env.space, data.segments, noise)
+        found = estimate(pieces, state.result_mean, state.result_cov, refined=False)
         return found, info
 
     def numbers(seed: int) -> bool:

@@ -140,7 +140,6 @@ def _information(config: Config, m: Any, proposals: list[Any]) -> Any:
     from easi_jax.estimation.from_runs import spread_of_starts
     from easi_jax.estimation.normal_equations import PairedFit
     from easi_jax.estimation.pieces import effective_noise, segments_from_runs
-    from easi_jax.estimation.weights import step_weights
     from easi_jax.io.logs.reader import read_logs
     from easi_jax.model.parameter_proposal import space_of
     from easi_jax.simulation.logged import Logged
@@ -166,8 +165,7 @@ def _information(config: Config, m: Any, proposals: list[Any]) -> Any:
     @jax.jit
     def information(unit: Any) -> Any:
         paired = PairedFit(simulator, space, pieces, noise, start=start)
-        weight = step_weights(pieces, noise)
-        return paired.normal(unit, paired.unmoved, weight).hessian
+        return paired.information(unit)
 
     return np.asarray(information(unit))
 

@@ -21,6 +21,7 @@ from easi_jax.devices.mesh import make_mesh, placed, replicated
 from easi_jax.devices.runtime import quick_compile
 from easi_jax.estimation.doubts import Doubts, doubts_of, told
 from easi_jax.estimation.identifiability import identifiability
+from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.pieces import effective_noise, few, segments_from_runs
 from easi_jax.estimation.posterior import (
     Estimate,
@@ -213,17 +214,22 @@ class _Finish:
             like = jnp.zeros(n), jnp.eye(n), self.whole, self.hidden
             self._end = jax.jit(self.end).lower(*placed(like)).compile(quick_compile())
 
+    def paired(self, pieces: Any, misfit: Any) -> PairedFit:
+        """What is fitted."""
+        search = self.search
+        return PairedFit(
+            *(self.problem.simulator, search.space, pieces, self.noise, search.mesh),
+            start=self.start,
+            misfit=misfit,
+        )
+
     def fit(
         self, mean: Any, cov: Any, pieces: Any, misfit: Any, robust: Any, near: Any
     ) -> tuple[Estimate, jax.Array]:
         """A fit from ``mean``, and what it leaves."""
         found = estimate(
-            *(self.problem.simulator, self.search.space, mean, cov, pieces),
-            *(self.noise, self.refined, self.search.config.informed_spread),
-            *(self.search.mesh, misfit, robust),
-            near=near,
-            restarts=self.restarts,
-            start=self.start,
+            *(self.paired(pieces, misfit), mean, cov, self.refined),
+            *(self.search.config.informed_spread, robust, near, self.restarts),
         )
         return found, self.errors(found, pieces)
 
@@ -231,12 +237,9 @@ class _Finish:
         self, center: Any, cov: Any, whole: Any, misfit: Any
     ) -> tuple[Estimate, jax.Array]:
         """The last steps, on all pieces and with all doubts."""
-        found = polished(
-            *(self.problem.simulator, self.search.space, center, cov, whole),
-            *(self.noise, self.search.config.informed_spread, self.search.mesh, misfit),
-            start=self.start,
-            doubts=self.doubts,
-        )
+        informed = self.search.config.informed_spread
+        given = self.paired(whole, misfit), center, cov, informed
+        found = polished(*given, doubts=self.doubts)
         return found, self.errors(found, whole, self.doubts)
 
     def errors(

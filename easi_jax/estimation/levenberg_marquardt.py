@@ -26,9 +26,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 
-from easi_jax.data.segments import Segments
 from easi_jax.estimation import limits, weights
 from easi_jax.estimation.least_squares import (
     Damping,
@@ -40,7 +38,6 @@ from easi_jax.estimation.least_squares import (
 )
 from easi_jax.estimation.normal_equations import Normal, PairedFit
 from easi_jax.model.parameters import ParameterSpace
-from easi_jax.simulation.simulator import Simulator
 
 _TRIED = 10.0 ** np.arange(-2, 4)  # dampings together, relative to the last one
 _DAMPING = Damping(falls=1.0, rises=100.0, least=1e-6, most=1e6)
@@ -90,49 +87,30 @@ class RefineResult:
 
 
 def refine(
-    simulator: Simulator,
-    space: ParameterSpace,
+    paired: PairedFit,
     unit: jax.Array,
-    segments: Segments,
-    noise: jax.Array,
     iterations: int = 40,
     prior_std: float = 3.0,
-    mesh: Mesh | None = None,
-    misfit: jax.Array | None = None,
     robust: int | jax.Array = 6,
-    free_starts: bool = True,
     near: bool | jax.Array = False,
     others: jax.Array | None = None,
-    start: jax.Array | None = None,
 ) -> RefineResult:
     """Levenberg-Marquardt from ``unit (n,)``; pure, for use inside jit.
 
     Args:
         iterations: rounds of a stage at most; fewer where the cost has settled.
-        noise: standard deviations of the measurement, ``(2 nv,)``, above zero;
-            infinite for what is not measured.
         prior_std: weak pull towards the start, in initial ranges, so that
             directions without any information stay where they are.
-        misfit: what the model itself errs by in every step, standard deviations
-            ``(2 nv,)`` on top of the noise; inf leaves a channel's steps out.
         robust: in so many first rounds, pieces that fit far worse than most count
             less.
-        free_starts: whether the true starts are fitted too, or those given are exact.
         near: whether ``unit`` is already about the best, so that there is only the last
             stage, and a short one. Otherwise a first stage fits the beginning of each
             piece alone; the second starts from its result, or from ``unit`` where that
             fits better.
         others: ``(K, n)`` more places to start from; what fits best is the result. One
             that comes to within a standard deviation of it is followed no further.
-        start: what is known of starts, as in `PairedFit`.
     """
-    fit = _Fit(
-        PairedFit(simulator, space, segments, noise, mesh, free_starts, None, start),
-        weights.step_weights(segments, noise, misfit),
-        unit,
-        1.0 / prior_std**2,
-        iterations,
-    )
+    fit = _Fit(paired, paired.weight, unit, 1.0 / prior_std**2, iterations)
     starts = unit[None] if others is None else jnp.concatenate([unit[None], others])
     stages = _Stage.all(starts, near, robust, others is not None)
     # As a scan, so that a stage is compiled once.
@@ -146,7 +124,7 @@ def refine(
         raised=looked.unit[-1],
         raised_hessian=looked.hessian[-1],
         excess=weights.excess(best.pieces, fit.weight),
-        simulated=1.0 * fit.points * segments.count * looked.steps.sum(),
+        simulated=1.0 * fit.points * paired.segments.count * looked.steps.sum(),
     )
 
 

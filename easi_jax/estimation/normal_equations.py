@@ -19,6 +19,7 @@ from jax.sharding import Mesh
 from easi_jax.data.segments import Segments
 from easi_jax.devices.mesh import make_mesh, replicated, sharded_map
 from easi_jax.devices.runtime import on_cpu
+from easi_jax.estimation.weights import step_weights
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import slopes
 from easi_jax.simulation.simulator import Simulator
@@ -68,6 +69,8 @@ class PairedFit:
         start: standard deviations of the true starts about those of the segments,
             ``(S,)``: positions, velocities, and activations where these are free; by
             default the noise, and activations that are known.
+        misfit: what the model itself errs by in every step, standard deviations
+            ``(2 nv,)`` on top of the noise; inf leaves a channel's steps out.
     """
 
     simulator: Simulator
@@ -78,6 +81,12 @@ class PairedFit:
     free_starts: bool = True
     steps: int | jax.Array | None = None
     start: jax.Array | None = None
+    misfit: jax.Array | None = None
+
+    @property
+    def weight(self) -> jax.Array:
+        """Of each measured number, ``(M, H, 2 nv)``."""
+        return step_weights(self.segments, self.noise, self.misfit)
 
     @property
     def spread(self) -> jax.Array:
@@ -108,6 +117,10 @@ class PairedFit:
         native = self.simulator.engine == "mujoco"
         points = self.points if native else 1
         return self._summed(self._each(one, points, delta, weight))
+
+    def information(self, unit: jax.Array) -> jax.Array:
+        """Of the data at ``unit (n,)``, starts as they were measured, ``(n, n)``."""
+        return self.normal(unit, self.unmoved, self.weight).hessian
 
     def around(self, unit: jax.Array, delta: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Points whose `sweep` holds the derivatives at ``unit (n,)`` and ``delta

@@ -11,9 +11,7 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jax.sharding import Mesh
 
-from easi_jax.data.segments import Segments
 from easi_jax.estimation.least_squares import (
     Damping,
     bounded_step,
@@ -24,9 +22,7 @@ from easi_jax.estimation.least_squares import (
 )
 from easi_jax.estimation.levenberg_marquardt import RefineResult
 from easi_jax.estimation.normal_equations import Normal, PairedFit
-from easi_jax.estimation.weights import excess, step_weights
-from easi_jax.model.parameters import ParameterSpace
-from easi_jax.simulation.simulator import Simulator
+from easi_jax.estimation.weights import excess
 
 _LOOKS = 8, 48  # at most: at the fit, then after each step; with doubts
 _STALE = 6  # looks without progress that end it
@@ -57,25 +53,11 @@ class _Look:
     cost: jax.Array
 
 
-def polish(
-    simulator: Simulator,
-    space: ParameterSpace,
-    unit: jax.Array,
-    segments: Segments,
-    noise: jax.Array,
-    mesh: Mesh | None = None,
-    misfit: jax.Array | None = None,
-    free_starts: bool = True,
-    start: jax.Array | None = None,
-    doubts: int = 0,
-) -> RefineResult:
-    """A fit ``unit (n,)`` after steps on ``segments``; pure, for use inside jit.
+def polish(paired: PairedFit, unit: jax.Array, doubts: int = 0) -> RefineResult:
+    """A fit ``unit (n,)`` after steps on all pieces of ``paired``, which may come from
+    others; pure, for use inside jit.
 
     Args:
-        segments: those that count now, all M of them; the fit may come from others.
-        noise: standard deviations of the measurement, ``(2 nv,)``, above zero.
-        misfit, free_starts, start: as in
-            `easi_jax.estimation.levenberg_marquardt.refine`.
         doubts: how many of the last parameters are effects of which something is known
             before: a unit coordinate of 0, with a standard deviation of 1. The last
             step of all takes them beyond their bounds where the data lead there.
@@ -83,14 +65,11 @@ def polish(
     Returns:
         The place of least cost among the fit's own, its starts as they were measured,
         and those after each step; information, starts and costs, ``(K,)`` and infinite
-        where it had settled, are those of ``segments``. A piece that the simulation
+        where it had settled, are those of ``paired``. A piece that the simulation
         does not get through at ``unit`` counts nothing; at a place where one of the
         others explodes the cost is infinite.
     """
-    paired = PairedFit(
-        simulator, space, segments, noise, mesh, free_starts, start=start
-    )
-    weight = step_weights(segments, noise, misfit)
+    space, segments, weight = paired.space, paired.segments, paired.weight
     doubted = jnp.arange(space.size) >= space.size - doubts
     fit = _Steps(paired, weight, jnp.where(doubted, 1.0, 0.0), _LOOKS[doubts > 0])
     end = jax.lax.while_loop(lambda c: c.phase < _FINISHED, fit.look, fit.begin(unit))

@@ -16,8 +16,8 @@ from easi_jax.estimation.levenberg_marquardt import RefineResult, refine
 from easi_jax.estimation.normal_equations import RESOLVED, PairedFit
 from easi_jax.estimation.pieces import effective_noise, finish_pieces, finish_rest
 from easi_jax.estimation.polish import polish
-from easi_jax.estimation.profile_score import Adjusted, adjust
-from easi_jax.estimation.weights import excess, step_weights
+from easi_jax.estimation.profile_score import adjust
+from easi_jax.estimation.weights import excess
 from easi_jax.model.distribution import Distribution, gaussian
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.simulator import FORWARD_MODE, Simulator
@@ -73,177 +73,145 @@ class Estimate:
 
 
 def estimate(
-    simulator: Simulator,
-    space: ParameterSpace,
+    paired: PairedFit,
     mean: jax.Array,
     cov: jax.Array,
-    pieces: Segments,
-    noise: jax.Array,
     refined: bool,
     informed: bool = True,
-    mesh: Mesh | None = None,
-    misfit: jax.Array | None = None,
     robust: int | jax.Array = 6,
-    free_starts: bool = True,
     near: bool | jax.Array = False,
     restarts: int = 0,
     adjusted: bool = False,
     rest: Segments | None = None,
-    start: jax.Array | None = None,
     doubts: Doubts | None = None,
 ) -> Estimate:
     """The result of a search at ``mean``, ``cov`` (unit coordinates); pure.
 
     The covariance joins two sources: the search's own spread, and what the data leave
-    open, ``(F + prior)^-1`` with F the Fisher information of ``pieces`` and the initial
+    open, ``(F + prior)^-1`` with F the Fisher information of the pieces and the initial
     range as prior. The mean is that of both, too: a direction that the data do not show
     keeps the initial spread about the middle of the initial range, wherever the search
     has drifted to. Where the fit leaves more than the noise
     explains, the model lacks something, and the information counts for less
-    (`_trusted`). Without ``informed`` it is the search's own covariance alone. ``misfit
-    (2 nv,)`` is what the model itself errs by in every step, on top of the noise; it,
-    ``robust``, ``free_starts`` and ``near`` go to
-    `easi_jax.estimation.levenberg_marquardt.refine`, which starts from so many draws of
-    the search's spread as well as ``restarts`` says. With ``adjusted``, what the fitted
-    starts add to the score is taken off (`easi_jax.estimation.profile_score`); not
-    where starts are exact, nor where slopes are differences
-    (`Simulator.by_differences`). ``rest`` is more of the
-    recording, ``pieces`` among it: the fit ends on that (`easi_jax.estimation.polish`).
-    ``start (S,)`` is what is known of starts, as in
-    `easi_jax.estimation.normal_equations.PairedFit`. With ``doubts`` the fit ends on
-    the same pieces with these, and nothing is adjusted.
+    (`_trusted`). Without ``informed`` it is the search's own covariance alone.
     What may be as good as zero is stated as `_near_zero` says.
+
+    Args:
+        paired: the pieces, their noise as it is measured.
+        refined: whether a fit follows.
+        robust, near: as in `easi_jax.estimation.levenberg_marquardt.refine`.
+        restarts: draws of the search's spread that it starts from as well.
+        adjusted: whether what the fitted starts add to the score is taken off
+            (`easi_jax.estimation.profile_score`); not where starts are exact, nor where
+            slopes are differences (`Simulator.by_differences`).
+        rest: more of the recording, the pieces among it: the fit ends on that
+            (`easi_jax.estimation.polish`).
+        doubts: the fit ends with these, on the same pieces.
     """
-    assumed = effective_noise(simulator, pieces, noise)
-    start = assumed if start is None else start
-    off = jnp.zeros_like(assumed) if misfit is None else misfit
-    if refined:
-        fit = refine(
-            simulator,
-            space,
-            mean,
-            pieces,
-            assumed,
-            mesh=mesh,
-            misfit=misfit,
-            robust=robust,
-            free_starts=free_starts,
-            near=near,
-            others=_draws(mean, cov, restarts) if restarts else None,
-            start=start,
-        )
-        if adjusted and free_starts and simulator.mj_model.nv <= FORWARD_MODE:
-            given = simulator, space, fit.unit, pieces, assumed, mesh, misfit
-            fit = _adjusted(fit, adjust(*given))
-        if rest is not None or doubts is not None:
-            rest = pieces if rest is None else rest
-            given = simulator, space, fit.unit, cov, rest, noise, informed, mesh, misfit
-            more = polished(*given, free_starts, False, start, doubts)
-            simulated = fit.simulated + more.simulated
-            return replace(more, search_mean=mean, simulated=simulated)
-        return _of_fit(space, fit, mean, cov, assumed, informed, pieces, off, start)
-    given = simulator, space, pieces, assumed, mesh, free_starts
-    paired = PairedFit(*given, start=start)
-    return _of_search(paired, mean, cov, informed, off)
-
-
-def _of_search(
-    paired: PairedFit, mean: jax.Array, cov: jax.Array, informed: bool, off: jax.Array
-) -> Estimate:
-    """What is stated of a search's end that nothing refines; ``off`` is its misfit."""
-    space, pieces, assumed = paired.space, paired.segments, paired.noise
-    weight = step_weights(pieces, assumed, off)
-    eq = paired.normal(mean, paired.unmoved, weight)
-    left = excess(eq.costs, weight)
-    open_cov, seen, _ = _posterior(eq.hessian * _trusted(left))
-    spread = open_cov + seen @ cov @ seen.T
-    center = _MIDDLE + seen @ (mean - _MIDDLE)
-    simulated = jnp.asarray(1.0 * paired.points * pieces.count * pieces.horizon)
-    return Estimate(
-        distribution=gaussian(
-            space,
-            center if informed else mean,
-            spread if informed else cov,
-        ),
-        search_mean=mean,
-        search_cov=cov,
-        hessian=eq.hessian,
-        noise=assumed,
-        cost=jnp.zeros(0),
-        delta=eq.start_step,
-        fit=mean,
-        excess=left,
-        simulated=simulated,
-        pieces=pieces,
-        misfit=off,
-        start=paired.spread,
-        doubts=jnp.zeros((0, 2)),
-    )
+    given, paired = paired, _floored(paired)
+    if not refined:
+        return _of_search(paired, mean, cov, informed)
+    others = _draws(mean, cov, restarts) if restarts else None
+    fit = refine(paired, mean, robust=robust, near=near, others=others)
+    if adjusted:
+        fit = _adjusted(paired, fit)
+    if rest is None and doubts is None:
+        return _of_fit(paired, fit, mean, cov, informed)
+    pieces = given.segments if rest is None else rest
+    whole = replace(given, segments=pieces, start=paired.spread)
+    more = polished(whole, fit.unit, cov, informed, doubts=doubts)
+    return replace(more, search_mean=mean, simulated=fit.simulated + more.simulated)
 
 
 def polished(
-    simulator: Simulator,
-    space: ParameterSpace,
+    paired: PairedFit,
     center: jax.Array,
     cov: jax.Array,
-    rest: Segments,
-    noise: jax.Array,
     informed: bool = True,
-    mesh: Mesh | None = None,
-    misfit: jax.Array | None = None,
-    free_starts: bool = True,
     adjusted: bool = False,
-    start: jax.Array | None = None,
     doubts: Doubts | None = None,
 ) -> Estimate:
     """The `estimate` of a fit at ``center (n,)`` after `easi_jax.estimation.polish`;
     pure.
 
     Args:
+        paired: pieces of the whole recording: cost, corrections of starts and
+            information are theirs.
         cov: of the search, ``(n, n)``.
-        rest: pieces of the whole recording, R of them: cost, corrections of starts
-            ``(R, S)`` and information are theirs.
-        noise, informed, misfit, free_starts, adjusted, start, doubts: as in
-            `estimate`.
+        informed, adjusted, doubts: as in `estimate`.
     """
-    assumed = effective_noise(simulator, rest, noise)
-    start = assumed if start is None else start
-    off = jnp.zeros_like(assumed) if misfit is None else misfit
-    how = rest, assumed, mesh, off, free_starts, start
+    paired = _floored(paired)
     if doubts is not None:
+        wider = replace(paired, simulator=doubts.simulator, space=doubts.space)
         begin = jnp.concatenate([center, jnp.zeros(doubts.count)])
-        fit = polish(doubts.simulator, doubts.space, begin, *how, doubts.count)
-        fit, told = without(fit, doubts.count)
-        found = _of_fit(space, fit, center, cov, assumed, informed, rest, off, start)
-        return replace(found, doubts=told)
-    fit = polish(simulator, space, center, *how)
-    if adjusted and free_starts and simulator.mj_model.nv <= FORWARD_MODE:
-        given = simulator, space, fit.unit, rest, assumed, mesh, off
-        fit = _adjusted(fit, adjust(*given))
-    return _of_fit(space, fit, center, cov, assumed, informed, rest, off, start)
+        fit, told = without(polish(wider, begin, doubts.count), doubts.count)
+        return replace(_of_fit(paired, fit, center, cov, informed), doubts=told)
+    fit = polish(paired, center)
+    if adjusted:
+        fit = _adjusted(paired, fit)
+    return _of_fit(paired, fit, center, cov, informed)
+
+
+def _floored(paired: PairedFit) -> PairedFit:
+    """With the noise that a fit assumes."""
+    given = paired.simulator, paired.segments, paired.noise
+    return replace(paired, noise=effective_noise(*given))
+
+
+def _of_search(
+    paired: PairedFit, mean: jax.Array, cov: jax.Array, informed: bool
+) -> Estimate:
+    """What is stated of a search's end that nothing refines."""
+    weight, pieces = paired.weight, paired.segments
+    eq = paired.normal(mean, paired.unmoved, weight)
+    left = excess(eq.costs, weight)
+    open_cov, seen, _ = _posterior(eq.hessian * _trusted(left))
+    spread = open_cov + seen @ cov @ seen.T
+    center = _MIDDLE + seen @ (mean - _MIDDLE)
+    simulated = jnp.asarray(1.0 * paired.points * pieces.count * pieces.horizon)
+    ended = RefineResult(
+        unit=mean,
+        hessian=eq.hessian,
+        cost=jnp.zeros(0),
+        delta=eq.start_step,
+        raised=mean,
+        raised_hessian=eq.hessian,
+        excess=left,
+        simulated=simulated,
+    )
+    stated = (center, spread) if informed else (mean, cov)
+    return _stated(paired, ended, mean, cov, *stated)
 
 
 def _of_fit(
-    space: ParameterSpace,
+    paired: PairedFit,
     fit: RefineResult,
     mean: jax.Array,
     cov: jax.Array,
-    noise: jax.Array,
     informed: bool,
-    pieces: Segments,
-    misfit: jax.Array,
-    start: jax.Array,
 ) -> Estimate:
     """What is stated of a fit, after a search that ended at ``mean``, ``cov``."""
 
     def said(trusted: Any) -> tuple[jax.Array, jax.Array]:
         known = _posterior(fit.raised_hessian * trusted)
-        return _near_zero(space, fit.unit, fit.raised, *known)
+        return _near_zero(paired.space, fit.unit, fit.raised, *known)
 
     center = said(1.0)[0]  # what predicts best, whatever it stands in for
     spread = said(_trusted(fit.excess))[1]
+    return _stated(paired, fit, mean, cov, center, spread if informed else cov)
+
+
+def _stated(
+    paired: PairedFit,
+    fit: RefineResult,
+    mean: jax.Array,
+    cov: jax.Array,
+    center: jax.Array,
+    spread: jax.Array,
+) -> Estimate:
+    noise, misfit = paired.noise, paired.misfit
     return Estimate(
-        distribution=gaussian(space, center, spread if informed else cov),
+        distribution=gaussian(paired.space, center, spread),
         search_mean=mean,
         search_cov=cov,
         hessian=fit.hessian,
@@ -253,9 +221,9 @@ def _of_fit(
         fit=fit.unit,
         excess=fit.excess,
         simulated=fit.simulated,
-        pieces=pieces,
-        misfit=misfit,
-        start=start,
+        pieces=paired.segments,
+        misfit=jnp.zeros_like(noise) if misfit is None else misfit,
+        start=paired.spread,
         doubts=jnp.zeros((0, 2)),
     )
 
@@ -286,25 +254,24 @@ def finish(
     """
     if restarts is None:
         restarts = RESTARTS if noisy and not simulator.wide else 0
+    pieces = finish_pieces(simulator, trajectories, steps, most)
     return estimate(
-        simulator,
-        space,
+        PairedFit(simulator, space, pieces, noise, mesh, noisy),
         mean,
         cov,
-        finish_pieces(simulator, trajectories, steps, most),
-        noise,
         refined,
         informed,
-        mesh,
-        free_starts=noisy,
         restarts=restarts,
         adjusted=True,
         rest=finish_rest(simulator, trajectories, noisy, steps, most),
     )
 
 
-def _adjusted(fit: RefineResult, new: Adjusted) -> RefineResult:
+def _adjusted(paired: PairedFit, fit: RefineResult) -> RefineResult:
     """The fit with its score adjusted, where the simulation gets that far."""
+    if not paired.free_starts or paired.simulator.mj_model.nv > FORWARD_MODE:
+        return fit
+    new = adjust(paired, fit.unit)
     found = replace(
         fit,
         unit=new.unit,

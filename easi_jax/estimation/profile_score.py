@@ -14,13 +14,12 @@ direction where it is not, or where scores with fitted starts scatter more than 
 information says, the result is as much less sure (Godambe, 1960).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jax.sharding import Mesh
 
 from easi_jax.data.segments import Segments
 from easi_jax.estimation.least_squares import (
@@ -31,9 +30,7 @@ from easi_jax.estimation.least_squares import (
 )
 from easi_jax.estimation.limits import EDGE, beyond_edge, jumps, shallow
 from easi_jax.estimation.normal_equations import RESOLVED, PairedFit
-from easi_jax.estimation.weights import step_weights
 from easi_jax.model.parameters import ParameterSpace
-from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.slopes import shift_start
 
 _DRAWS = 2  # of the noise, for every piece
@@ -231,31 +228,18 @@ def _scatter(x: jax.Array) -> jax.Array:
     return off.T @ off / (len(x) - 1)
 
 
-def adjust(
-    simulator: Simulator,
-    space: ParameterSpace,
-    unit: jax.Array,
-    segments: Segments,
-    noise: jax.Array,
-    mesh: Mesh | None = None,
-    misfit: jax.Array | None = None,
-) -> Adjusted:
+def adjust(paired: PairedFit, unit: jax.Array) -> Adjusted:
     """From a best fit ``unit (n,)`` to where its score less the average is zero; pure.
 
     Noise that was assumed too high is taken as high as the fit's cost shows.
-
-    Args:
-        noise: standard deviations of the measurement, ``(2 nv,)``, above zero.
-        misfit: what the model itself errs by in every step, as in
-            `easi_jax.estimation.levenberg_marquardt.refine`.
     """
-    weight = step_weights(segments, noise, misfit)
+    fit = ProfileFit(**{f.name: getattr(paired, f.name) for f in fields(paired)})
+    space, segments, noise = fit.space, fit.segments, fit.noise
     shape = (segments.count, _DRAWS, segments.horizon + 1, len(noise))
     draws = jax.random.normal(jax.random.key(0), shape)
-    off = jnp.zeros_like(noise) if misfit is None else misfit
+    off = jnp.zeros_like(noise) if fit.misfit is None else fit.misfit
     later = jnp.where(jnp.isfinite(off), jnp.hypot(noise, off), 0.0)
-    fit = ProfileFit(simulator, space, segments, noise, mesh)
-    root = _Root(fit, weight, draws)
+    root = _Root(fit, fit.weight, draws)
     begin = root.begin(raised_to_range(space, unit), jnp.stack([noise, later]))
     end, rounds = jax.lax.scan(root.search, begin, jnp.array([False, True]))
     u, found = end.here

@@ -26,6 +26,7 @@ from easi_jax.estimation.identifiability import (
     seed_result,
     settled,
 )
+from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.posterior import Estimate, polished
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.results import Relative, SeedResult
@@ -58,9 +59,14 @@ def seed_results(
         doubts = doubts_of(machine, rest) if doubted else None
 
         def fit(unit: Any, pieces: Any, noise: Any, misfit: Any, start: Any) -> Any:
+            paired = PairedFit(
+                *(machine, rest, pieces, noise),
+                free_starts=free_starts,
+                start=start,
+                misfit=misfit,
+            )
             nothing = jnp.eye(rest.size)
-            how = True, None, misfit, free_starts, adjusted, start, doubts
-            return polished(machine, rest, unit, nothing, pieces, noise, *how)
+            return polished(paired, unit, nothing, adjusted=adjusted, doubts=doubts)
 
         compiled: list[Any] = []
 

@@ -13,7 +13,6 @@ import pytest
 from easi_jax.data.segments import Segments, windows
 from easi_jax.estimation.levenberg_marquardt import refine
 from easi_jax.estimation.normal_equations import Normal, PairedFit
-from easi_jax.estimation.weights import step_weights
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.simulator import Simulator
 from envs.cartpole import Cartpole
@@ -53,7 +52,7 @@ def program(
     @jax.jit
     def run(pieces: Segments, unit: jax.Array, delta: jax.Array) -> Normal:
         paired = PairedFit(simulator, space, pieces, NOISE, None, free_starts)
-        return paired.normal(unit, delta, step_weights(pieces, NOISE))
+        return paired.normal(unit, delta, paired.weight)
 
     return run
 
@@ -137,9 +136,8 @@ def test_refines_to_the_truth(problem: Any, free: bool, monkeypatch: Any) -> Non
 
     @jax.jit
     def run(unit: jax.Array) -> Any:
-        return refine(
-            simulator, space, unit, pieces, noise, iterations=15, free_starts=free
-        )
+        paired = PairedFit(simulator, space, pieces, noise, free_starts=free)
+        return refine(paired, unit, iterations=15)
 
     out = run(unit)
     found = np.asarray(space.to_si(out.unit)) / space.nominal

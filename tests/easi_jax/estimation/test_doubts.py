@@ -9,6 +9,7 @@ import pytest
 from easi_jax.data.segments import Segments, cut, join, to_device
 from easi_jax.estimation.doubts import LATE, Doubts, doubts_of, told, without
 from easi_jax.estimation.levenberg_marquardt import RefineResult
+from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.posterior import Estimate, polished
 from easi_jax.model.distribution import covariance
 from easi_jax.model.parameters import ParameterSpace, declare
@@ -106,7 +107,7 @@ def test_values_hold_where_commands_come_late(doubts: Doubts) -> None:
 
     @jax.jit
     def fit(pieces: Segments) -> tuple[Estimate, Estimate]:
-        given = plain, space, truth, cov, pieces, noise
+        given = PairedFit(plain, space, pieces, noise), truth, cov
         return polished(*given), polished(*given, doubts=doubts)
 
     def off(found: Estimate, stated: Estimate) -> float:

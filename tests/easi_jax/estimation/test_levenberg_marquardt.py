@@ -15,6 +15,7 @@ from easi_jax.devices.runtime import quick_compile
 from easi_jax.estimation.identifiability import identifiability
 from easi_jax.estimation.levenberg_marquardt import RefineResult, refine
 from easi_jax.estimation.limits import jumps
+from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace, declare
 from easi_jax.simulation import rollout
@@ -36,7 +37,8 @@ def fit(cartpole: Cartpole, space: ParameterSpace) -> Any:
     simulator = Simulator(cartpole.mj_model, space, cartpole.dt)
 
     def run(unit: jax.Array, seg: Segments, noise: jax.Array, more: jax.Array) -> Any:
-        return refine(simulator, space, unit, seg, noise, iterations=15, others=more)
+        paired = PairedFit(simulator, space, seg, noise)
+        return refine(paired, unit, iterations=15, others=more)
 
     # It runs for longer than it compiles.
     compiled = jax.jit(run, compiler_options=quick_compile())
@@ -118,10 +120,8 @@ def test_what_is_as_good_as_zero_comes_back_though_little_is_known(
     i = space.index("cart_kv")
     low = space.nominal.copy()
     low[i] *= 1e-3
-    misfit = 30 * NOISE
-    run = jax.jit(
-        lambda u: refine(simulator, space, u, pieces, NOISE, misfit=misfit, robust=0)
-    )
+    paired = PairedFit(simulator, space, pieces, NOISE, misfit=30 * NOISE)
+    run = jax.jit(lambda u: refine(paired, u, robust=0))
     out = run(space.to_unit(jnp.asarray(low)))
     assert float(space.to_si(out.unit)[i]) == pytest.approx(space.nominal[i], rel=0.1)
 
@@ -170,13 +170,8 @@ def test_a_limit_that_was_not_met_is_not_known(met: bool) -> None:
     )
     pieces = windows(seen, 25, 26)
     start = space.to_unit(theta).at[i].add(-0.5)
-    run = jax.jit(
-        lambda u: refine(
-            *(rig.simulator, space, u, pieces, jnp.asarray(rig.noise)),
-            robust=0,
-            iterations=15,
-        )
-    )
+    paired = PairedFit(rig.simulator, space, pieces, jnp.asarray(rig.noise))
+    run = jax.jit(lambda u: refine(paired, u, robust=0, iterations=15))
     out = run(start)
     off = float(out.unit[i] - space.to_unit(theta)[i]) * float(space.log_width[i])
     if met:
@@ -201,7 +196,7 @@ def test_a_limit_that_nothing_meets_is_found_from_a_narrow_start(
     i = far.index("cart_speed_limit")
     wrong = far.nominal.copy()
     wrong[i] *= 3.0
-    run = jax.jit(lambda u: refine(simulator, far, u, pieces, NOISE))
+    run = jax.jit(lambda u: refine(PairedFit(simulator, far, pieces, NOISE), u))
     out = run(far.to_unit(jnp.asarray(wrong)))
     assert float(far.to_si(out.unit)[i]) == pytest.approx(far.nominal[i], rel=0.02)
 
@@ -230,9 +225,8 @@ def test_a_limit_that_few_pieces_meet_is_found(
 
     @jax.jit
     def fit(pieces: Segments, start: jax.Array, others: jax.Array) -> Any:
-        return refine(
-            *(simulator, space, start, pieces, NOISE), iterations=15, others=others
-        )
+        paired = PairedFit(simulator, space, pieces, NOISE)
+        return refine(paired, start, iterations=15, others=others)
 
     pieces = record(rest)
     best = fit(pieces, truth, truth[None])
@@ -267,7 +261,8 @@ def test_few_pieces_do_not_hold_up_the_rest(
         pieces = windows(
             rollout.measured(runs, NOISE, k_noise, simulator.configuration), 25, 26
         )
-        fit = [refine(simulator, space, u, pieces, NOISE) for u in (truth, found)]
+        paired = PairedFit(simulator, space, pieces, NOISE)
+        fit = [refine(paired, u) for u in (truth, found)]
         return fit[0].cost[-1], fit[1].cost[-1]
 
     best, cost = fits(rest)
@@ -316,11 +311,8 @@ def test_a_short_first_stage_leads_past_wrong_minima() -> None:
 
     @jax.jit
     def run(unit: jax.Array, near: bool) -> RefineResult:
-        return refine(
-            *(simulator, space, unit, pieces, noise),
-            free_starts=False,
-            near=near,
-        )
+        paired = PairedFit(simulator, space, pieces, noise, free_starts=False)
+        return refine(paired, unit, near=near)
 
     wrong = space.to_unit(jnp.asarray(space.nominal * np.exp(_WRONG)))
     errors = []

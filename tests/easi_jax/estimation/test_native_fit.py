@@ -9,6 +9,7 @@ import numpy as np
 
 from easi_jax.data.segments import Segments
 from easi_jax.estimation.levenberg_marquardt import refine
+from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.model.parameters import ParameterSpace, declare
 from easi_jax.simulation.simulator import Simulator
 from tests.tiny_robot.env import XML
@@ -59,7 +60,8 @@ def test_a_wrong_start_is_left_for_the_truth() -> None:
 
     @jax.jit
     def run(unit: jax.Array) -> Any:
-        return refine(simulator, space, unit, pieces, jnp.asarray(_NOISE), robust=0)
+        paired = PairedFit(simulator, space, pieces, jnp.asarray(_NOISE))
+        return refine(paired, unit, robust=0)
 
     out = run(wrong)
     off = np.asarray(out.unit - space.to_unit(_TRUTH), float)

@@ -10,6 +10,7 @@ import pytest
 
 from easi_jax.data.segments import Segments, windows
 from easi_jax.estimation.levenberg_marquardt import RefineResult, refine
+from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.polish import polish
 from easi_jax.simulation import slopes
 from easi_jax.simulation.rollout import measured
@@ -35,7 +36,7 @@ def run(problem: Any) -> Any:
 
     @jax.jit
     def run(fit: RefineResult, segments: Segments) -> RefineResult:
-        return polish(simulator, space, fit.unit, segments, NOISE)
+        return polish(PairedFit(simulator, space, segments, NOISE), fit.unit)
 
     return run
 
@@ -49,7 +50,8 @@ def fits(problem: Any) -> tuple[RefineResult, RefineResult]:
 
     @jax.jit
     def fitted(pieces: Segments) -> RefineResult:
-        return refine(simulator, space, start, pieces, NOISE, iterations=20)
+        paired = PairedFit(simulator, space, pieces, NOISE)
+        return refine(paired, start, iterations=20)
 
     part = jnp.arange(pieces.count) % 2 == 0
     few = replace(pieces, weight=pieces.weight * part)
@@ -137,7 +139,8 @@ def test_a_step_that_makes_pieces_explode_is_not_taken(
 
     far_right = float(np.quantile(pieces.qpos[:, 0], 0.9))
     monkeypatch.setattr(slopes, "_residuals", walled)
-    found = jax.jit(lambda u: polish(simulator, space, u, pieces, NOISE))(few.unit)
+    paired = PairedFit(simulator, space, pieces, NOISE)
+    found = jax.jit(lambda u: polish(paired, u))(few.unit)
     assert (found.unit - wall) @ gap >= 0
     assert np.isinf(found.cost[1]), "the first step leads beyond the wall"
     assert np.isfinite(found.cost[0]) and float(found.cost.min()) < float(found.cost[0])

@@ -11,6 +11,7 @@ import pytest
 from easi_jax.data.segments import Segments
 from easi_jax.devices.runtime import quick_compile
 from easi_jax.estimation.levenberg_marquardt import RefineResult, refine
+from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.profile_score import Adjusted, adjust, less_scatter
 from easi_jax.model.parameters import ParameterSpace, declare
 from easi_jax.simulation.simulator import Simulator
@@ -74,8 +75,9 @@ def fits() -> Any:
         def one(key: jax.Array) -> tuple[RefineResult, Adjusted]:
             pieces = recorded(simulator, key, jnp.asarray(spread))
             noise = assumed * _NOISE
-            fit = refine(simulator, space, truth, pieces, noise, iterations=8)
-            return fit, adjust(simulator, space, fit.unit, pieces, noise)
+            paired = PairedFit(simulator, space, pieces, noise)
+            fit = refine(paired, truth, iterations=8)
+            return fit, adjust(paired, fit.unit)
 
         return jax.lax.map(one, jax.random.split(jax.random.key(3), _SEEDS))
 
@@ -160,7 +162,7 @@ def test_a_limit_that_was_not_met_is_not_known(limit: float) -> None:
 
     def run(key: jax.Array) -> Adjusted:
         pieces = recorded(simulator, key, jnp.asarray(_SPEED))
-        return adjust(simulator, space, start, pieces, _NOISE)
+        return adjust(PairedFit(simulator, space, pieces, _NOISE), start)
 
     compiled = jax.jit(run, compiler_options=quick_compile())
     for seed in range(3):

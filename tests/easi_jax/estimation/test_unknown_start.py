@@ -14,6 +14,7 @@ from easi_jax.data.recording import Run
 from easi_jax.data.segments import Segments, to_device
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.estimation.from_runs import start_spread
+from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.pieces import segments_from_runs
 from easi_jax.estimation.posterior import estimate
 from easi_jax.estimation.problem import Problem, problem_of
@@ -139,8 +140,8 @@ def test_a_drive_is_found_from_positions_alone(native: Problem) -> None:
 
     @jax.jit
     def run(pieces: Segments) -> Any:
-        given = simulator, space, wrong, 0.1 * jnp.eye(3), pieces, noise, True
-        return estimate(*given, misfit=hidden, robust=0, start=start)
+        paired = PairedFit(simulator, space, pieces, noise, start=start, misfit=hidden)
+        return estimate(paired, wrong, 0.1 * jnp.eye(3), True, robust=0)
 
     found = run(pieces)
     std = np.sqrt(np.diag(covariance(found.distribution)))
