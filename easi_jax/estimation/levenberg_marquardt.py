@@ -113,18 +113,20 @@ def refine(
     fit = _Fit(paired, paired.weight, unit, 1.0 / prior_std**2, iterations)
     starts = unit[None] if others is None else jnp.concatenate([unit[None], others])
     stages = _Stage.all(starts, near, robust, others is not None)
+    place, costs = fit.place(unit, paired.unmoved), jnp.zeros(iterations + 2)
+    begin = _Found(place, place, costs, unit, jnp.zeros(unit.size, bool))
     # As a scan, so that a stage is compiled once.
-    found, looked = jax.lax.scan(fit.stage, fit.begin, stages)
+    found, (at, hessian, steps) = jax.lax.scan(fit.stage, begin, stages)
     best = found.best
     return RefineResult(
         unit=best.unit,
         hessian=best.hessian,
-        cost=best.costs,
+        cost=found.costs,
         delta=best.shift,
-        raised=looked.unit[-1],
-        raised_hessian=looked.hessian[-1],
+        raised=at[-1],
+        raised_hessian=hessian[-1],
         excess=weights.excess(best.pieces, fit.weight),
-        simulated=1.0 * fit.points * paired.segments.count * looked.steps.sum(),
+        simulated=1.0 * fit.points * paired.segments.count * steps.sum(),
     )
 
 
@@ -200,39 +202,6 @@ class _Stage:
 
 
 @flax.struct.dataclass
-class _Best:
-    """The best fit so far: parameters, starts, costs by rounds, information, and costs
-    of the pieces."""
-
-    unit: jax.Array
-    shift: jax.Array
-    costs: jax.Array
-    hessian: jax.Array
-    pieces: jax.Array
-
-
-@flax.struct.dataclass
-class _Found:
-    """What a stage hands on: where it ended, the best so far, what may not be at a
-    plateau's edge put beyond it, and which parameters met no limit."""
-
-    unit: jax.Array
-    shift: jax.Array
-    best: _Best
-    freed: jax.Array
-    unmet: jax.Array
-
-
-@flax.struct.dataclass
-class _Looked:
-    """What a stage saw last, and the control steps of each piece that it took."""
-
-    unit: jax.Array
-    hessian: jax.Array
-    steps: jax.Array
-
-
-@flax.struct.dataclass
 class _Place:
     """Where a stage is, and what it knows."""
 
@@ -243,6 +212,17 @@ class _Place:
     pieces: jax.Array  # their costs
     hessian: jax.Array  # of the place before
     above: jax.Array  # that place, what is in a dip put beyond its edge
+
+
+@flax.struct.dataclass
+class _Found:
+    """What a stage hands on."""
+
+    last: _Place
+    best: _Place
+    costs: jax.Array  # by rounds, of the fit that ended at the best place
+    freed: jax.Array  # what may not be at a plateau's edge put beyond it
+    unmet: jax.Array  # parameters that met no limit
 
 
 @flax.struct.dataclass
@@ -309,33 +289,31 @@ class _Fit:
         steps = max(1, round(_BEGINNING / self.whole.simulator.dt))
         return min(self.whole.segments.horizon, steps)
 
-    @property
-    def begin(self) -> _Found:
-        """Before the first stage."""
-        n, unit, still = self.space.size, self.anchor, self.whole.unmoved
-        none = jnp.zeros(self.iterations + 2), jnp.zeros((n, n)), jnp.ones(len(still))
-        return _Found(unit, still, _Best(unit, still, *none), unit, jnp.zeros(n, bool))
+    def place(self, unit: jax.Array, shift: jax.Array) -> _Place:
+        """Where a stage begins."""
+        n, fresh = self.space.size, limits.Reach.fresh(self.space)
+        none = jnp.ones(len(shift)), jnp.zeros((n, n))
+        return _Place(unit, shift, jnp.asarray(1e-3), fresh, *none, unit)
 
-    def stage(self, found: _Found, item: _Stage) -> tuple[_Found, _Looked]:
-        """From where ``found`` ended, or ``item.begun``, to a best fit."""
+    def stage(self, found: _Found, item: _Stage) -> tuple[_Found, Any]:
+        """From where ``found`` ended, or ``item.begun``, to a best fit; parameters and
+        information that it saw last, and control steps of each piece."""
         phase, place = self.start(found, item)
-        begun = phase, jnp.asarray(0), jnp.zeros(self.iterations + 2), place
         end = jax.lax.while_loop(
             lambda state: state[0] < _FINISHED,
             functools.partial(self.round, found, item),
-            begun,
+            (phase, jnp.asarray(0), jnp.zeros_like(found.costs), place),
         )
         horizon = self.whole.segments.horizon
         steps = end[1] * jnp.where(item.short, self.short, horizon)
-        at = end[3]
-        looked = _Looked(at.unit, at.hessian, steps)
+        looked = end[3].unit, end[3].hessian, steps
         return self.end(found, item, phase, end), looked
 
     def start(self, found: _Found, item: _Stage) -> tuple[jax.Array, _Place]:
         """The phase and the place that a stage begins with."""
         best, unmoved = found.best, self.whole.unmoved
-        u = jnp.where(item.short, item.begun, found.unit)
-        shift = jnp.where(item.short, unmoved, found.shift)
+        u = jnp.where(item.short, item.begun, found.last.unit)
+        shift = jnp.where(item.short, unmoved, found.last.shift)
         from_best = item.looks | item.dropping
         u = jnp.where(from_best, best.unit, jnp.where(item.freed, found.freed, u))
         u = jnp.where(item.kind == _RAISED, raised_to_range(self.space, u), u)
@@ -343,17 +321,8 @@ class _Fit:
         still = item.freed & (found.freed == best.unit).all()
         even = ~weights.far_worse(best.pieces, self.weight).any()
         still |= (item.dropping | (item.held > 0)) & even
-        place = _Place(
-            unit=u,
-            shift=shift,
-            damping=jnp.asarray(1e-3),
-            reach=limits.Reach.fresh(self.space),
-            pieces=jnp.ones(len(unmoved)),
-            hessian=jnp.zeros((u.size, u.size)),
-            above=u,
-        )
         phase = jnp.where(item.wanted & ~still, _MOVING, _FINISHED)
-        return jnp.where(item.looks, _LOOKING, phase), place
+        return jnp.where(item.looks, _LOOKING, phase), self.place(u, shift)
 
     def round(self, found: _Found, item: _Stage, state: _State) -> _State:
         """A step, and whether it was the last one."""
@@ -380,7 +349,7 @@ class _Fit:
         # From here it goes to where an earlier start has led.
         best = found.best
         off = place.unit - best.unit
-        merged = (off @ best.hessian @ off < 1.0) & (cost < best.costs[-1] + 1.0)
+        merged = (off @ best.hessian @ off < 1.0) & (cost < found.costs[-1] + 1.0)
         merged &= item.whole & ~item.first & ~item.freed & fitting
         costs = jnp.where(merged, jnp.inf, costs)
         return jnp.where(merged, _FINISHED, phase), k + 1, costs, new
@@ -393,17 +362,21 @@ class _Fit:
         best, unmet = found.best, limits.unmet(at.hessian)
         # A plateau is wide, and likelier than a dip that noise may have dug.
         flat = item.freed & (found.freed != best.unit) & unmet
-        least = best.costs[-1] + limits.EDGE * flat.sum()
+        least = found.costs[-1] + limits.EDGE * flat.sum()
         better = item.whole & (item.first | (costs[-1] < least)) & (phase != _FINISHED)
-        new = _Best(at.unit, at.shift, costs, at.hessian, at.pieces)
         # What met no limit: to where the first piece would. And starts that were bent,
         # so that none had to be met: as measured.
         bent = item.dropping & weights.far_worse(at.pieces, self.weight)
         down = self.space.clip(at.unit - at.reach.raised[1, : unmet.size])
-        return _Found(
+        last = replace(
+            at,
             unit=jnp.where(item.dropping & unmet, down, at.unit),
             shift=jnp.where(bent[:, None], self.whole.unmoved, at.shift),
-            best=jax.tree.map(lambda x, y: jnp.where(better, x, y), new, best),
+        )
+        return _Found(
+            last=last,
+            best=_where(better, at, best),
+            costs=jnp.where(better, costs, found.costs),
             freed=jnp.where(item.looks, at.above, found.freed),
             unmet=jnp.where(item.dropping, unmet, found.unmet),
         )
@@ -414,8 +387,7 @@ class _Fit:
         begins = jnp.arange(self.whole.segments.horizon) < self.short
         weight = jnp.where(now.item.short, self.weight * begins[:, None], self.weight)
         trust = self.trust(at.pieces, weight, now)
-        fresh = limits.Reach.fresh(space)
-        reach = jax.tree.map(lambda x, y: jnp.where(now.anew, x, y), fresh, at.reach)
+        reach = _where(now.anew, limits.Reach.fresh(space), at.reach)
         hops = reach.ends(space, at.unit)
         eq, (units, shifts), each = self.look(at, hops, weight, trust, now)
         here = _data(each[:1], trust)
@@ -437,7 +409,7 @@ class _Fit:
             unit=units[best],
             shift=shifts[best],
             damping=jnp.where(moving, damping, at.damping),
-            reach=jax.tree.map(lambda x, y: jnp.where(moving, x, y), told, reach),
+            reach=_where(moving, told, reach),
             pieces=each[best],
             hessian=eq.hessian,
             # Over a jump upwards the cost hardly rises, though its curvature foretells
@@ -587,3 +559,7 @@ def _data(each: jax.Array, trust: jax.Array) -> jax.Array:
     """Cost of the data, of pieces ``each (T, M)``; without trust they may be infinitely
     bad."""
     return jnp.where(trust > 0, each * trust, 0.0).sum(1)
+
+
+def _where(condition: jax.Array, new: Any, old: Any) -> Any:
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)

@@ -99,46 +99,17 @@ def problem_of(
     if start is not None:
         space = space.scaled(*start)
     seconds = checked_horizon(horizon)
-    notes = list(runs.notes)
     fit, held = (
         true_readings(mj_model, r, found.entries) for r in (runs.fit, runs.held)
     )
-    notes += [
-        f"{e.effect}@{e.at}: taken out of the logs' readings"
-        for e in found.entries
-        if e.of_readings
-    ]
-    nv = mj_model.nv
-    scatter = np.asarray(noise, float) if len(noise) else runs.noise
-    given = np.where(np.isfinite(runs.noise) | (len(noise) > 0), scatter, 0.0)
-    if scatter.shape != (2 * nv,) or not np.all(np.isfinite(given) & (given >= 0)):
-        raise UserError(
-            f"--noise is {list(noise)}: {name} needs {2 * nv} numbers, 0 or "
-            "more: positions, then velocities"
-        )
     hidden = hidden_in_any([*fit, *held])
-    scatter = np.where(np.tile(hidden, 2), np.inf, scatter)
+    scatter = np.where(np.tile(hidden, 2), np.inf, _noise_of(name, runs, noise))
     logged = Logged.of([*fit, *held])
     simulator = Simulator(mj_model, space, fit[0].dt, fixed=fixed, logged=logged)
-    notes += simulator.notes
-    measured = (
-        ~hidden
-        & np.array([run.qvel_measured for run in fit]).all()
-        & np.all([(trusted_velocity(run) == run.qvel).all(0) for run in fit], axis=0)
-    )
-    if any(run.qvel_measured for run in fit) and not (measured | hidden).all():
-        joints = [n for n, m in zip(simulator.state_names[nv:], measured, strict=True)]
-        fine = measured | hidden
-        doubted = [n for n, m in zip(joints, fine, strict=True) if not m]
-        notes.append(
-            f"{', '.join(doubted)}: not the derivative of the positions (filtered or "
-            "late?), so velocities are taken from the positions"
-        )
+    measured, doubted = _measured(simulator, fit, hidden)
     steps = max(1, round(seconds / simulator.dt))
     _check_lengths(fit, held, steps, simulator.dt)
-    piece = steps
-    if horizon is None:
-        piece = visible_steps(fit, scatter, steps, _ABOVE_NOISE)
+    short = horizon is None
     return Problem(
         name,
         simulator,
@@ -147,11 +118,54 @@ def problem_of(
         runs.held_name,
         scatter,
         measured,
-        piece,
+        visible_steps(fit, scatter, steps, _ABOVE_NOISE) if short else steps,
         steps,
         steps * simulator.dt,
-        notes,
+        [
+            *runs.notes,
+            *(
+                f"{e.effect}@{e.at}: taken out of the logs' readings"
+                for e in found.entries
+                if e.of_readings
+            ),
+            *simulator.notes,
+            *doubted,
+        ],
     )
+
+
+def _noise_of(name: str, runs: MeasuredRuns, noise: Sequence[float]) -> np.ndarray:
+    """Standard deviations, ``(2 nv,)``: as given, else those of the runs."""
+    size = len(runs.noise)
+    scatter = np.asarray(noise, float) if len(noise) else runs.noise
+    given = np.where(np.isfinite(runs.noise) | (len(noise) > 0), scatter, 0.0)
+    if scatter.shape != (size,) or not np.all(np.isfinite(given) & (given >= 0)):
+        raise UserError(
+            f"--noise is {list(noise)}: {name} needs {size} numbers, 0 or "
+            "more: positions, then velocities"
+        )
+    return scatter
+
+
+def _measured(
+    simulator: Simulator, fit: Sequence[Run], hidden: np.ndarray
+) -> tuple[np.ndarray, list[str]]:
+    """Velocities that were measured and can be trusted, ``(nv,)`` bool; and a note on
+    others that were measured."""
+    measured = (
+        ~hidden
+        & np.array([run.qvel_measured for run in fit]).all()
+        & np.all([(trusted_velocity(run) == run.qvel).all(0) for run in fit], axis=0)
+    )
+    fine = measured | hidden
+    if not any(run.qvel_measured for run in fit) or fine.all():
+        return measured, []
+    names = simulator.state_names[len(fine) :]
+    doubted = ", ".join(n for n, m in zip(names, fine, strict=True) if not m)
+    return measured, [
+        f"{doubted}: not the derivative of the positions (filtered or late?), so "
+        "velocities are taken from the positions"
+    ]
 
 
 def _check_lengths(
