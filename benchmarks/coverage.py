@@ -87,16 +87,13 @@ def _solver(config: Config) -> Any:
 
     import jax
     import jax.numpy as jnp
-    import numpy as np
 
     from easi_jax.data.segments import windows
     from easi_jax.devices.runtime import fast_loops
     from easi_jax.estimation.doubts import doubts_of
-    from easi_jax.estimation.identifiability import identifiability
     from easi_jax.estimation.normal_equations import PairedFit
     from easi_jax.estimation.pieces import finish_pieces
     from easi_jax.estimation.posterior import RESTARTS, estimate
-    from easi_jax.model import distribution
     from easi_jax.search.config import preset
     from easi_jax.search.easi import Search, SearchData
     from easi_jax.simulation.rollout import collect, measured
@@ -149,25 +146,36 @@ def _solver(config: Config) -> Any:
         truth = jax.random.uniform(k_truth, (space.size,))
         demos, mean, cov, lost = find(k_rest, truth)
         found, bound = judge(demos, mean, cov, truth)
-        known = identifiability(space, np.asarray(bound))
-        row: dict[str, Any] = {
-            "truth": np.asarray(space.to_si(truth), float).tolist(),
-            "rank": known.rank,
-            "determined": known.determined.tolist(),
-            "non_finite": int(lost),
-        }
-        for way, d in zip(WAYS, found, strict=True):
-            off = (np.asarray(d.mean, float) - np.asarray(truth, float)) * known.scale
-            spread = distribution.covariance(d)
-            cov_log = spread * np.outer(known.scale, known.scale)
-            row[way] = {
-                "off": off.tolist(),
-                "std": np.sqrt(np.diag(cov_log)).tolist(),
-                **distances(off, cov_log, known),
-            }
-        return row
+        return _row(space, truth, found, bound, int(lost))
 
     return solve
+
+
+def _row(space: Any, truth: Any, found: Any, bound: Any, lost: int) -> dict[str, Any]:
+    """What was ``found`` of a target by each of the `WAYS`, beside the ``truth (n,)``
+    and its information ``bound (n, n)``, unit coordinates."""
+    import numpy as np
+
+    from easi_jax.estimation.identifiability import identifiability
+    from easi_jax.model import distribution
+
+    known = identifiability(space, np.asarray(bound))
+    row: dict[str, Any] = {
+        "truth": np.asarray(space.to_si(truth), float).tolist(),
+        "rank": known.rank,
+        "determined": known.determined.tolist(),
+        "non_finite": lost,
+    }
+    for way, d in zip(WAYS, found, strict=True):
+        off = (np.asarray(d.mean, float) - np.asarray(truth, float)) * known.scale
+        spread = distribution.covariance(d)
+        cov_log = spread * np.outer(known.scale, known.scale)
+        row[way] = {
+            "off": off.tolist(),
+            "std": np.sqrt(np.diag(cov_log)).tolist(),
+            **distances(off, cov_log, known),
+        }
+    return row
 
 
 def distances(off: Any, cov: Any, known: Any) -> dict[str, float]:

@@ -362,6 +362,10 @@ def _options() -> Iterator[tuple[str, str]]:
         option = 'integrator="discrete"' if flag == "ipc" else ""
         on = f'{flag}="enable"'
         yield f"flag {flag} enabled", _on_floor("sphere", option=option, flags=on)
+
+
+def _elements() -> Iterator[tuple[str, str]]:
+    push = '<actuator><position joint="elbow" kp="5" kv="0.2"/></actuator>'
     yield "fluid box", _arm(option='density="200" viscosity="0.5" wind="1 0 0"')
     yield (
         "fluid box implicitfast",
@@ -422,4 +426,5 @@ def _options() -> Iterator[tuple[str, str]]:
 def feature_models() -> dict[str, str]:
     """Every feature by name, and the MJCF text of a model that has it."""
     parts = (_joints, _actuators, _transmissions, _equalities, _tendons)
-    return {n: t for part in (*parts, _contacts, _options) for n, t in part()}
+    parts = (*parts, _contacts, _options, _elements)
+    return {n: t for part in parts for n, t in part()}

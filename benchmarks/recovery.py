@@ -13,6 +13,7 @@ is done; those not run are absent.
 import dataclasses
 import functools
 import time
+from collections.abc import Callable
 from typing import Any
 
 from train._command import main, say, show_table
@@ -74,20 +75,7 @@ def _case(
     start: tuple[float, float] | None = None,
     preset: str = "default",
 ) -> None:
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-
     from benchmarks._common import write_result
-    from easi_jax.data.segments import windows
-    from easi_jax.devices.runtime import fast_loops
-    from easi_jax.estimation import posterior
-    from easi_jax.estimation.identifiability import describe, identifiability
-    from easi_jax.pipeline.held_out import errors_by_step
-    from easi_jax.search.config import preset as make_preset
-    from easi_jax.search.easi import Search, SearchData
-    from easi_jax.simulation.rollout import collect, measured
-    from easi_jax.simulation.simulator import Simulator
     from envs import make
 
     env = make("cartpole")
@@ -95,110 +83,22 @@ def _case(
     space = env.space.select(names)
     if start is not None:
         space = space.scaled(*start)
-    simulator = Simulator(env.mj_model, space, env.dt)
-    truth = np.asarray(space.nominal)
-    noisy = any(noise)
-    changes = {} if preset == "paper" else {"horizon": 8 if noisy else 1}
-    search = Search(
-        simulator,
-        make_preset(preset, generations=config.generations, **changes),
-        env=env,
-        act=lambda _, obs, key: controller(obs, key),
-    )
-    deviation = jnp.asarray(noise)
-    nominal = env.model()
-
-    def trajectories(key: jax.Array, count: int) -> Any:
-        return collect(env, nominal, controller, key, count, env.episode_length)
-
-    @jax.jit
-    def demonstrate(key: jax.Array) -> Any:
-        k_run, k_noise = jax.random.split(key)
-        return measured(
-            trajectories(k_run, config.trajectories),
-            deviation,
-            k_noise,
-            simulator.configuration,
-        )
-
-    @functools.partial(jax.jit, compiler_options=fast_loops())
-    def find(key: jax.Array, demos: Any) -> Any:
-        h = search.config.horizon if preset == "default" else 1
-        data = SearchData(windows(demos, h, max(1, h // 2)), deviation, ())
-        state, info = search.run(search.init(key, data), data, config.generations)
-        return state.result_mean, state.result_cov, info.non_finite.sum()
-
-    @jax.jit
-    def finish(mean: jax.Array, cov: jax.Array, demos: Any) -> Any:
-        given = simulator, search.space, mean, cov, demos, deviation, noisy
-        return posterior.finish(*given, refined=True)
-
-    @jax.jit
-    def errors(mean: jax.Array, key: jax.Array) -> Any:
-        fresh = trajectories(key, 20)
-        model, limit = simulator.model(search.space.to_si(mean)), nominal.speed_limit
-        return tuple(
-            errors_by_step(simulator, model, windows(fresh, h, h), limit)[-1]
-            for h in (1, 10)
-        )
-
+    solve = _solver(config, env, space, noise, preset)
     rows = []
     for seed in config.seeds:
-        key = jax.random.key(seed)
-        demos = demonstrate(jax.random.fold_in(key, 0))
-        begin = time.monotonic()
-        mean, cov, lost = jax.block_until_ready(find(jax.random.fold_in(key, 1), demos))
-        searched = time.monotonic() - begin
-        found = {preset: mean}
-        row: dict[str, Any] = {
-            "seed": seed,
-            "search_s": searched,
-            "non_finite": int(lost),
-        }
-        if preset == "default":
-            begin = time.monotonic()
-            fit = jax.block_until_ready(finish(mean, cov, demos))
-            row["refine_s"] = time.monotonic() - begin
-            found["refine"] = fit.distribution.mean
-            ident = identifiability(search.space, np.asarray(fit.hessian))
-            row["rank"] = ident.rank
-            row["cramer_rao_std"] = ident.std.tolist()
-            row["determined"] = ident.determined.tolist()
-            row["undetermined"] = [describe(d) for d in ident.undetermined]
-        for method, unit in found.items():
-            si = np.asarray(search.space.to_si(unit))
-            one, long = errors(unit, jax.random.key(10_000 + seed))
-            row[method] = {
-                "log_ratio": np.log(np.maximum(si, 1e-30) / truth).tolist(),
-                "one_step": np.asarray(one).tolist(),
-                "open_loop_0.2s": np.asarray(long).tolist(),
-            }
-        rows.append(row)
-        short = {m: np.round(np.array(row[m]["one_step"]) * 100, 2) for m in found}
-        say(f"{name} seed {seed}: {searched:.0f} s, one-step error [%] {short}")
-    methods = [m for m in ("paper", "default", "refine") if m in rows[0]]
-    summary = {
-        m: {
-            "median_one_step": np.median([r[m]["one_step"] for r in rows], 0).tolist(),
-            "median_open_loop": np.median(
-                [r[m]["open_loop_0.2s"] for r in rows], 0
-            ).tolist(),
-            "median_abs_log_ratio": np.median(
-                np.abs([r[m]["log_ratio"] for r in rows]), 0
-            ).tolist(),
-            "worst_abs_log_ratio": np.max(
-                np.abs([r[m]["log_ratio"] for r in rows]), 0
-            ).tolist(),
-        }
-        for m in methods
-    }
+        rows.append(row := solve(seed))
+        methods = [m for m in ("paper", "default", "refine") if m in row]
+        short = {m: [round(100 * x, 2) for x in row[m]["one_step"]] for m in methods}
+        said = f"{name} seed {seed}: {row['search_s']:.0f} s"
+        say(f"{said}, one-step error [%] {short}")
+    summary = {m: _summary([row[m] for row in rows]) for m in methods}
     path = write_result(
         f"recovery_{name}",
         f"python -m benchmarks.recovery --cases {name}",
         config,
         case={"free": free, "noise": noise, "start": start, "preset": preset},
         parameters=names,
-        channels=simulator.state_names,
+        channels=env.simulator.state_names,
         summary=summary,
         seeds=rows,
     )
@@ -218,6 +118,124 @@ def _case(
         ],
     )
     say(f"written: {path}")
+
+
+def _solver(
+    config: Config, env: Any, space: Any, noise: tuple[float, ...], preset: str
+) -> Callable[[int], dict[str, Any]]:
+    """From a seed to its row."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from easi_jax.data.segments import windows
+    from easi_jax.devices.runtime import fast_loops
+    from easi_jax.estimation import posterior
+    from easi_jax.search.config import preset as make_preset
+    from easi_jax.search.easi import Search, SearchData
+    from easi_jax.simulation.rollout import collect, measured
+    from easi_jax.simulation.simulator import Simulator
+
+    simulator, noisy = Simulator(env.mj_model, space, env.dt), any(noise)
+    changes = {} if preset == "paper" else {"horizon": 8 if noisy else 1}
+    search = Search(
+        simulator,
+        make_preset(preset, generations=config.generations, **changes),
+        env=env,
+        act=lambda _, obs, key: controller(obs, key),
+    )
+    deviation, nominal = jnp.asarray(noise), env.model()
+
+    def trajectories(key: jax.Array, count: int) -> Any:
+        return collect(env, nominal, controller, key, count, env.episode_length)
+
+    @jax.jit
+    def demonstrate(key: jax.Array) -> Any:
+        k_run, k_noise = jax.random.split(key)
+        runs = trajectories(k_run, config.trajectories)
+        return measured(runs, deviation, k_noise, simulator.configuration)
+
+    @functools.partial(jax.jit, compiler_options=fast_loops())
+    def find(key: jax.Array, demos: Any) -> Any:
+        h = search.config.horizon if preset == "default" else 1
+        data = SearchData(windows(demos, h, max(1, h // 2)), deviation, ())
+        state, info = search.run(search.init(key, data), data, config.generations)
+        return state.result_mean, state.result_cov, info.non_finite.sum()
+
+    @jax.jit
+    def finish(mean: jax.Array, cov: jax.Array, demos: Any) -> Any:
+        given = simulator, search.space, mean, cov, demos, deviation, noisy
+        return posterior.finish(*given, refined=True)
+
+    @jax.jit
+    def errors(mean: jax.Array, key: jax.Array) -> Any:
+        return _errors(env, simulator, search.space.to_si(mean), trajectories(key, 20))
+
+    def solve(seed: int) -> dict[str, Any]:
+        key = jax.random.key(seed)
+        demos = demonstrate(jax.random.fold_in(key, 0))
+        begin = time.monotonic()
+        mean, cov, lost = jax.block_until_ready(find(jax.random.fold_in(key, 1), demos))
+        took = time.monotonic() - begin
+        found = {preset: mean}
+        row: dict[str, Any] = {"seed": seed, "search_s": took, "non_finite": int(lost)}
+        if preset == "default":
+            begin = time.monotonic()
+            fit = jax.block_until_ready(finish(mean, cov, demos))
+            row["refine_s"] = time.monotonic() - begin
+            found["refine"] = fit.distribution.mean
+            row |= _known(search.space, fit.hessian)
+        for method, unit in found.items():
+            si = np.asarray(search.space.to_si(unit))
+            one, long = errors(unit, jax.random.key(10_000 + seed))
+            row[method] = {
+                "log_ratio": np.log(np.maximum(si, 1e-30) / space.nominal).tolist(),
+                "one_step": np.asarray(one).tolist(),
+                "open_loop_0.2s": np.asarray(long).tolist(),
+            }
+        return row
+
+    return solve
+
+
+def _errors(env: Any, simulator: Any, theta: Any, fresh: Any) -> tuple[Any, ...]:
+    """Of predictions of one step and of ten, with parameters ``theta (n,)``."""
+    from easi_jax.data.segments import windows
+    from easi_jax.pipeline.held_out import errors_by_step
+
+    model, limit = simulator.model(theta), env.model().speed_limit
+    return tuple(
+        errors_by_step(simulator, model, windows(fresh, h, h), limit)[-1]
+        for h in (1, 10)
+    )
+
+
+def _known(space: Any, hessian: Any) -> dict[str, Any]:
+    """What the data determine."""
+    import numpy as np
+
+    from easi_jax.estimation.identifiability import describe, identifiability
+
+    ident = identifiability(space, np.asarray(hessian))
+    return {
+        "rank": ident.rank,
+        "cramer_rao_std": ident.std.tolist(),
+        "determined": ident.determined.tolist(),
+        "undetermined": [describe(d) for d in ident.undetermined],
+    }
+
+
+def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Of one method, over all seeds."""
+    import numpy as np
+
+    off = np.abs([r["log_ratio"] for r in rows])
+    return {
+        "median_one_step": np.median([r["one_step"] for r in rows], 0).tolist(),
+        "median_open_loop": np.median([r["open_loop_0.2s"] for r in rows], 0).tolist(),
+        "median_abs_log_ratio": np.median(off, 0).tolist(),
+        "worst_abs_log_ratio": np.max(off, 0).tolist(),
+    }
 
 
 if __name__ == "__main__":

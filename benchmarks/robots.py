@@ -207,12 +207,50 @@ def _write_peak(config: Config, env: Any, name: str, what: str) -> None:
     say(f"{what}: peak {peak:.2f} GiB; written: {path}")
 
 
+def _row(pipe: Any, state: Any, found: Any, truth: Any, lost: int) -> dict[str, Any]:
+    """What one seed found, beside the ``truth (n,)``."""
+    import numpy as np
+
+    from easi_jax.estimation.identifiability import describe, identifiability
+
+    def error(unit: Any) -> list[float]:
+        si = np.maximum(np.asarray(pipe.space.to_si(unit)), 1e-30)
+        return np.log(si / truth).tolist()
+
+    ident = identifiability(pipe.space, np.asarray(found.hessian[0]))
+    cost = np.asarray(found.cost[0])
+    return {
+        "non_finite": lost,
+        "default": {"log_ratio": error(state.result_mean[0])},
+        "refine": {"log_ratio": error(found.distribution.mean[0])},
+        "cost": [float(cost[0]), float(cost[-1])],
+        "rank": ident.rank,
+        "cramer_rao_std": ident.std.tolist(),
+        "determined": ident.determined.tolist(),
+        "undetermined": [describe(d) for d in ident.undetermined],
+    }
+
+
+def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Over all seeds."""
+    import numpy as np
+
+    return {
+        m: {
+            f"{name}_abs_log_ratio": fun(
+                np.abs([r[m]["log_ratio"] for r in rows]), axis=0
+            ).tolist()
+            for name, fun in (("median", np.median), ("worst", np.max))
+        }
+        for m in ("default", "refine")
+    }
+
+
 def _recovery(config: Config, env: Any, saved: Any, label: str, start: str) -> None:
     import jax
     import numpy as np
 
     from benchmarks._common import command_of, write_result
-    from easi_jax.estimation.identifiability import describe, identifiability
 
     pipe = _pipe(
         config,
@@ -229,10 +267,6 @@ def _recovery(config: Config, env: Any, saved: Any, label: str, start: str) -> N
     finish_compile_s = time.monotonic() - begin
     truth = np.asarray(env.space.nominal)
 
-    def error(unit: Any) -> list[float]:
-        si = np.maximum(np.asarray(pipe.space.to_si(unit)), 1e-30)
-        return np.log(si / truth).tolist()
-
     rows = []
     for i, seed in enumerate(config.seeds):
         demo, policy = _first(demos, i), _first(policies, i)
@@ -242,38 +276,16 @@ def _recovery(config: Config, env: Any, saved: Any, label: str, start: str) -> N
         searched = time.monotonic()
         found = jax.block_until_ready(finish(state, demo))
         done = time.monotonic()
-        ident = identifiability(pipe.space, np.asarray(found.hessian[0]))
-        cost = np.asarray(found.cost[0])
-        rows.append(
-            {
-                "seed": seed,
-                "search_s": searched - begin,
-                "finish_s": done - searched,
-                "non_finite": int(info.non_finite.sum()),
-                "default": {"log_ratio": error(state.result_mean[0])},
-                "refine": {"log_ratio": error(found.distribution.mean[0])},
-                "cost": [float(cost[0]), float(cost[-1])],
-                "rank": ident.rank,
-                "cramer_rao_std": ident.std.tolist(),
-                "determined": ident.determined.tolist(),
-                "undetermined": [describe(d) for d in ident.undetermined],
-            }
-        )
+        lost = int(info.non_finite.sum())
+        took = {"search_s": searched - begin, "finish_s": done - searched}
+        rows.append({"seed": seed, **took, **_row(pipe, state, found, truth, lost)})
         worst = max(abs(x) for x in rows[-1]["refine"]["log_ratio"])
         say(
             f"{label} {start} seed {seed}: search {searched - begin:.0f} s, finish "
-            f"{done - searched:.0f} s, rank {ident.rank} of {pipe.space.size}, worst "
-            f"|log ratio| {worst:.3f}"
+            f"{done - searched:.0f} s, rank {rows[-1]['rank']} of {pipe.space.size}, "
+            f"worst |log ratio| {worst:.3f}"
         )
-    summary = {
-        m: {
-            f"{name}_abs_log_ratio": fun(
-                np.abs([r[m]["log_ratio"] for r in rows]), axis=0
-            ).tolist()
-            for name, fun in (("median", np.median), ("worst", np.max))
-        }
-        for m in ("default", "refine")
-    }
+    summary = _summary(rows)
     path = write_result(
         f"robots_{label}_{start}",
         command_of("benchmarks.robots", config),

@@ -14,6 +14,7 @@ also trains the policy. Curves by training step, as in Fig. 5, are in the report
 import dataclasses
 import time
 from pathlib import Path
+from typing import Any
 
 from benchmarks._common import RESULTS
 from train._command import main, say
@@ -48,137 +49,160 @@ class Config:
 def run(config: Config) -> None:
     """Runs the targets one after the other."""
     import jax
-    import jax.numpy as jnp
-    import numpy as np
 
-    from benchmarks._common import command_of, show_returns, write_result
-    from easi_jax.devices.runtime import fast_loops
-    from easi_jax.pipeline.stages import (
-        Pipeline,
-        PipelineConfig,
-        seed_keys,
-        stage_keys,
-        target_parameters,
-    )
-    from easi_jax.search.config import preset
+    from easi_jax.pipeline.stages import target_parameters
     from envs import open_env
-    from train._robots import training_config
 
     env = open_env(config.robot)
     changed = env.default_target[0].partition("*")[0]
-    training = training_config(env, config.env_steps)
-    training = dataclasses.replace(training, evaluate_every=0)
-    pipe = Pipeline(
-        env,
-        PipelineConfig(
-            search=preset(
-                "default",
-                policy_updates_per_generation=config.joint,
-                generations=config.generations,
-                population=config.population,
-            ),
-            training=training,
-            trajectories=config.trajectories,
-            eval_episodes=config.episodes,
-            refine=True,
-        ),
-    )
-    keys = stage_keys(seed_keys(list(config.seeds)))
-    count = len(config.seeds)
-    train = jax.jit(
-        lambda s, dist, target: pipe.train_chunk(s, dist, target, training.iterations)[
-            0
-        ]
-    )
-    shorter = jax.jit(
-        lambda s, dist, target: pipe.train_chunk(
-            s, dist, target, pipe.final_iterations()
-        )[0]
-    )
-    if not config.joint:
-        shorter = train
-    start = jax.jit(lambda k, dist: pipe.train_init(k, dist))
-    search = jax.jit(
-        lambda k, demos, policies, training: pipe.search_chunk(
-            pipe.search_init(k, demos, policies, training),
-            demos,
-            policies,
-            pipe.config.search.generations,
-        ),
-        compiler_options=fast_loops(),
-    )
-    estimate, demonstrate = jax.jit(pipe.estimate), jax.jit(pipe.demonstrate)
-    returns = jax.jit(lambda *a: pipe.play(*a)[0])
-
-    nominal = jnp.asarray(env.space.nominal, jnp.float32)
+    trial = _Trial(config, env)
     begin = time.monotonic()
-    wide = pipe.spread(pipe.udr(), count)
-    states = train(start(keys["udr"], wide), wide, nominal)
-    udr = pipe.policies(states)
-    jax.block_until_ready(udr)
+    states = jax.block_until_ready(trial.rough())
     say(f"UDR trained in {time.monotonic() - begin:.0f} s")
     for factor in config.factors:
         begin = time.monotonic()
         theta = target_parameters(env.space, (f"{changed}*{factor}",))
-        target = jnp.asarray(theta, jnp.float32)
-        demos = demonstrate(udr, target, keys["demonstrate"])
-        learner = states if config.joint else ()
-        found, _ = search(keys["search"], demos, udr, learner)
-        result = estimate(found, demos)
+        scores, found = trial.target(theta, states)
+        _write(
+            config,
+            factor,
+            scores,
+            changed=changed,
+            target=dict(zip(env.space.names, theta.tolist(), strict=True)),
+            changed_found=found[:, env.space.names.index(changed)].tolist(),
+            seconds=time.monotonic() - begin,
+        )
+
+
+class _Trial:
+    """The programs that all targets share, each compiled once."""
+
+    def __init__(self, config: Config, env: Any) -> None:
+        import jax
+
+        from easi_jax.devices.runtime import fast_loops
+        from easi_jax.pipeline.stages import (
+            Pipeline,
+            PipelineConfig,
+            seed_keys,
+            stage_keys,
+        )
+        from easi_jax.search.config import preset
+        from train._robots import training_config
+
+        search = preset(
+            "default",
+            policy_updates_per_generation=config.joint,
+            generations=config.generations,
+            population=config.population,
+        )
+        training = training_config(env, config.env_steps)
+        settings = PipelineConfig(
+            search=search,
+            training=dataclasses.replace(training, evaluate_every=0),
+            trajectories=config.trajectories,
+            eval_episodes=config.episodes,
+            refine=True,
+        )
+        self.pipe = pipe = Pipeline(env, settings)
+        self.keys = stage_keys(seed_keys(list(config.seeds)))
+        self.joint, self.count = bool(config.joint), len(config.seeds)
+
+        def trained(rounds: int) -> Any:
+            return jax.jit(lambda s, dist, at: pipe.train_chunk(s, dist, at, rounds)[0])
+
+        self.train = trained(training.iterations)
+        self.shorter = trained(pipe.final_iterations()) if self.joint else self.train
+        self.start = jax.jit(pipe.train_init)
+        self.search = jax.jit(
+            lambda k, demos, policies, training: pipe.search_chunk(
+                pipe.search_init(k, demos, policies, training),
+                demos,
+                policies,
+                search.generations,
+            ),
+            compiler_options=fast_loops(),
+        )
+        self.estimate = jax.jit(pipe.estimate)
+        self.demonstrate = jax.jit(pipe.demonstrate)
+        self.returns = jax.jit(lambda *a: pipe.play(*a)[0])
+
+    def rough(self) -> Any:
+        """Trained under UDR."""
+        import jax.numpy as jnp
+
+        nominal = jnp.asarray(self.pipe.real.space.nominal, jnp.float32)
+        wide = self.pipe.spread(self.pipe.udr(), self.count)
+        return self.train(self.start(self.keys["udr"], wide), wide, nominal)
+
+    def target(self, theta: Any, states: Any) -> tuple[dict[str, Any], Any]:
+        """Returns of each method, ``(seeds,)``, in the target ``theta (n,)``, and the
+        parameters that were found, ``(seeds, n)`` SI; ``states`` are of `rough`."""
+        import jax
+        import jax.numpy as jnp
+        import numpy as np
+
+        pipe, keys, target = self.pipe, self.keys, jnp.asarray(theta, jnp.float32)
+        udr = pipe.policies(states)
+        demos = self.demonstrate(udr, target, keys["demonstrate"])
+        learner = states if self.joint else ()
+        found, _ = self.search(keys["search"], demos, udr, learner)
+        result = self.estimate(found, demos)
         first = pipe.final_init(keys["final"], result.distribution, found)
-        easi = shorter(first, result.distribution, target)
-        truth = pipe.spread(pipe.point(target), count)
-        oracle = train(start(keys["oracle"], truth), truth, target)
+        easi = self.shorter(first, result.distribution, target)
+        truth = pipe.spread(pipe.point(target), self.count)
+        oracle = self.train(self.start(keys["oracle"], truth), truth, target)
         methods = {
             "UDR": udr,
             "EASI": pipe.policies(easi),
             "Oracle": pipe.policies(oracle),
         }
         scores = {
-            m: np.asarray(returns(p, target, keys["evaluate"])).mean(1)
+            m: np.asarray(self.returns(p, target, keys["evaluate"])).mean(1)
             for m, p in methods.items()
         }
-        by_method = {
-            m: dict(zip(map(str, config.seeds), v.tolist(), strict=True))
-            for m, v in scores.items()
-        }
-        gap = scores["Oracle"] - scores["UDR"]
-        won = scores["EASI"] - scores["UDR"]
-        error = gap.std(ddof=1) / np.sqrt(count) if count > 1 else float("nan")
-        share = float(won.mean() / gap.mean())
-        draws = np.random.default_rng(0).integers(0, count, (4000, count))
-        boot = won[draws].mean(1) / gap[draws].mean(1)
-        label = "kp" if config.robot == "cartpole" else config.robot
-        name = f"transfer_{label}_x{factor:g}" + (
-            f"_joint{config.joint}" * bool(config.joint)
-        )
-        path = write_result(
-            name,
-            command_of(
-                "benchmarks.transfer", dataclasses.replace(config, factors=(factor,))
-            ),
-            {k: v for k, v in dataclasses.asdict(config).items() if k != "folder"},
-            folder=config.folder,
-            robot=config.robot,
-            changed=changed,
-            target=dict(zip(env.space.names, theta.tolist(), strict=True)),
-            returns=by_method,
-            changed_found=np.asarray(
-                jax.vmap(pipe.space.to_si)(result.distribution.mean)
-            )[:, env.space.names.index(changed)].tolist(),
-            oracle_minus_udr={
-                "mean": float(gap.mean()),
-                "standard_error": float(error),
-            },
-            share_of_gap=share,
-            share_95=np.percentile(boot, [2.5, 97.5]).tolist(),
-            goal=0.9,
-            goal_applies=bool(gap.mean() > 2 * error),
-            seconds=time.monotonic() - begin,
-        )
-        title = f"{changed} x {factor:g}; EASI closes {share:.2f} of the gap"
-        show_returns(title, by_method)
-        say(f"written: {path}")
+        mean = result.distribution.mean
+        return scores, np.asarray(jax.vmap(pipe.space.to_si)(mean))
+
+
+def _write(config: Config, factor: float, scores: dict[str, Any], **more: Any) -> None:
+    """Writes what one target gave."""
+    import numpy as np
+
+    from benchmarks._common import command_of, show_returns, write_result
+
+    count = len(config.seeds)
+    returns = {
+        m: dict(zip(map(str, config.seeds), v.tolist(), strict=True))
+        for m, v in scores.items()
+    }
+    gap = scores["Oracle"] - scores["UDR"]
+    won = scores["EASI"] - scores["UDR"]
+    error = gap.std(ddof=1) / np.sqrt(count) if count > 1 else float("nan")
+    share = float(won.mean() / gap.mean())
+    draws = np.random.default_rng(0).integers(0, count, (4000, count))
+    boot = won[draws].mean(1) / gap[draws].mean(1)
+    label = "kp" if config.robot == "cartpole" else config.robot
+    joint = f"_joint{config.joint}" * bool(config.joint)
+    path = write_result(
+        f"transfer_{label}_x{factor:g}{joint}",
+        command_of(
+            "benchmarks.transfer", dataclasses.replace(config, factors=(factor,))
+        ),
+        {k: v for k, v in dataclasses.asdict(config).items() if k != "folder"},
+        folder=config.folder,
+        robot=config.robot,
+        returns=returns,
+        oracle_minus_udr={"mean": float(gap.mean()), "standard_error": float(error)},
+        share_of_gap=share,
+        share_95=np.percentile(boot, [2.5, 97.5]).tolist(),
+        goal=0.9,
+        goal_applies=bool(gap.mean() > 2 * error),
+        **more,
+    )
+    title = f"{more['changed']} x {factor:g}; EASI closes {share:.2f} of the gap"
+    show_returns(title, returns)
+    say(f"written: {path}")
 
 
 if __name__ == "__main__":

@@ -157,3 +157,18 @@ def test_every_test_that_waits_for_a_process_has_a_time_limit() -> None:
     ]
     assert len(waits) > 20
     assert [at for at, given in waits if "timeout" not in given] == []
+
+
+_LONGEST = 80  # lines of a function, its signature and docstring among them
+
+
+def test_no_function_is_longer_than_a_reader_can_hold() -> None:
+    long = [
+        f"{path}: {node.name}, {lines} lines"
+        for top in ("easi_jax", "train", "envs", "benchmarks")
+        for path, tree in _modules(top)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and (lines := (node.end_lineno or 0) - node.lineno + 1) > _LONGEST
+    ]
+    assert long == []

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     import mujoco
     import numpy as np
 
+    from easi_jax.excite.drives import Limits
     from easi_jax.excite.play import Bench
     from easi_jax.model.effect_catalog import Scales
     from easi_jax.model.parameters import ParameterSpace
@@ -60,8 +61,6 @@ def read_excite_problem(config: "Config") -> ExciteProblem:
     from easi_jax.errors import UserError
     from easi_jax.excite.candidates import LEAD, make_bench
     from easi_jax.excite.choose import check_names
-    from easi_jax.excite.drives import limits_of
-    from easi_jax.io.logs.columns import named_joints
     from easi_jax.io.models.parameter_file import read_parameter_file
     from easi_jax.model.joint_space import joint_name, scalar_dofs
     from easi_jax.model.parameter_proposal import own_space
@@ -91,30 +90,10 @@ def read_excite_problem(config: "Config") -> ExciteProblem:
         dt = 1.0 / config.rate
     if dt is None:
         dt = 1.0 / _RATE if model.env is None else float(model.env.dt)
-    hidden = ~np.isfinite(noise)
-    hidden[[of_joint[n] for n in named_joints(m, config.unmeasured) & {*of_joint}]] = (
-        True
-    )
-    noise = _numbers("--noise", config.noise, of_joint, noise)
-    noise = np.where(hidden, np.inf, noise)
-    speed = _numbers("--max-speed", config.max_speed, of_joint, np.full(m.nv, np.inf))
-    default = np.full(m.nv, _TRAVEL[3])
-    for j, (_, d) in scalar_dofs(m).items():
-        default[d] = _TRAVEL[int(m.jnt_type[j])]
-    travel = _numbers("--travel", config.travel, of_joint, default)
+    noise = _noise(config, m, of_joint, noise)
+    limits, more = _limits(config, m, of_joint)
+    notes += more
     most = _numbers("--amplitude", config.amplitude, of_actuator, np.full(m.nu, np.inf))
-    limits = limits_of(m, config.margin, travel, speed)
-    for joint in limits.assumed:
-        reach = travel[of_joint[joint]]
-        notes.append(
-            f'joint "{joint}" has no range in the model: kept within {reach:.3g} of '
-            "its start (--travel)"
-        )
-    if len(scalar_dofs(m)) < m.njnt:
-        notes.append(
-            "nothing checks what a free or ball joint does: hang up the base "
-            "(--held-base), or watch the predicted positions"
-        )
     rows = round(config.duration / dt) + 1
     bench, more = make_bench(m, limits, dt, rows, config.play)
     pairs, strengths = _from_gap(config, notes)
@@ -130,6 +109,55 @@ def read_excite_problem(config: "Config") -> ExciteProblem:
         strengths,
         [*notes, *more],
     )
+
+
+def _noise(
+    config: "Config",
+    m: "mujoco.MjModel",
+    of_joint: Mapping[str, int],
+    noise: "np.ndarray",
+) -> "np.ndarray":
+    """Noise ``(nv,)`` as it is given, infinite where nobody measures; ``noise`` where
+    it is not given."""
+    import numpy as np
+
+    from easi_jax.io.logs.columns import named_joints
+
+    hidden = ~np.isfinite(noise)
+    hidden[[of_joint[n] for n in named_joints(m, config.unmeasured) & {*of_joint}]] = (
+        True
+    )
+    return np.where(hidden, np.inf, _numbers("--noise", config.noise, of_joint, noise))
+
+
+def _limits(
+    config: "Config", m: "mujoco.MjModel", of_joint: Mapping[str, int]
+) -> "tuple[Limits, list[str]]":
+    """Where joints may go, and what nothing checks."""
+    import numpy as np
+
+    from easi_jax.excite.drives import limits_of
+    from easi_jax.model.joint_space import scalar_dofs
+
+    speed = _numbers("--max-speed", config.max_speed, of_joint, np.full(m.nv, np.inf))
+    default = np.full(m.nv, _TRAVEL[3])
+    for j, (_, d) in scalar_dofs(m).items():
+        default[d] = _TRAVEL[int(m.jnt_type[j])]
+    travel = _numbers("--travel", config.travel, of_joint, default)
+    limits = limits_of(m, config.margin, travel, speed)
+    notes = []
+    for joint in limits.assumed:
+        reach = travel[of_joint[joint]]
+        notes.append(
+            f'joint "{joint}" has no range in the model: kept within {reach:.3g} of '
+            "its start (--travel)"
+        )
+    if len(scalar_dofs(m)) < m.njnt:
+        notes.append(
+            "nothing checks what a free or ball joint does: hang up the base "
+            "(--held-base), or watch the predicted positions"
+        )
+    return limits, notes
 
 
 def _check_numbers(config: "Config", lead: float) -> None:

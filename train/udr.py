@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from easi_jax.io.report.html import Picture, Table
     from easi_jax.io.runs.folder import RunFolder
+    from easi_jax.pipeline.stages import Pipeline
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +57,6 @@ def run(config: Config) -> None:
         check_seeds,
         load_networks,
         save_policies,
-        training_chunk,
         training_config,
     )
 
@@ -75,10 +75,8 @@ def run(config: Config) -> None:
         stage_keys,
         target_parameters,
     )
-    from easi_jax.simulation.compile_time import expected
     from envs import open_env
     from train._results import per_seed_json
-    from train._stages import jit_chunks, run_stage, training_rows
 
     given = read_given(config)
     env, real = robots(open_env(config.robot, config.env, config.option), given)
@@ -102,24 +100,7 @@ def run(config: Config) -> None:
         overwrite=config.overwrite,
     ) as folder:
         notes = effect_notes(given)
-        physics = pipe.point(target) if config.fixed else pipe.udr()
-        wide = pipe.spread(physics, len(config.seeds))
-        step = jit_chunks(
-            lambda states, dist, target, n: pipe.train_chunk(states, dist, target, n)
-        )
-        states = run_stage(
-            folder,
-            "train",
-            training.iterations,
-            training_chunk(config.chunk, training),
-            lambda: pipe.train_init(keys["udr"], wide, old),
-            lambda s, n: step(s, wide, target, n),
-            training_rows(config.seeds, training.steps_per_iteration),
-            notes,
-            per_step=training.steps_per_iteration,
-            seconds=expected(pipe.simulator),
-        )
-        policies = pipe.policies(states)
+        policies = _trained(folder, config, pipe, target, keys["udr"], old, notes)
         returns, motion = jax.jit(pipe.play)(policies, target, keys["evaluate"])
         per_seed = np.asarray(returns).mean(1)
         save_policies(folder, method, policies)
@@ -134,6 +115,41 @@ def run(config: Config) -> None:
         table = _report(folder, config, method, env.name, per_seed, pictures, notes)
     show_table(table.title, table.columns, table.rows)
     say(f"report: {config.out / 'report.html'}")
+
+
+def _trained(
+    folder: "RunFolder",
+    config: Config,
+    pipe: "Pipeline",
+    target: Any,
+    key: Any,
+    old: Any,
+    notes: list[str],
+) -> Any:
+    """Policies of all seeds; ``old`` networks to go on from, None for new ones."""
+    from easi_jax.simulation.compile_time import expected
+    from train._robots import training_chunk
+    from train._stages import jit_chunks, run_stage, training_rows
+
+    training = pipe.config.training
+    physics = pipe.point(target) if config.fixed else pipe.udr()
+    wide = pipe.spread(physics, len(config.seeds))
+    step = jit_chunks(
+        lambda states, dist, target, n: pipe.train_chunk(states, dist, target, n)
+    )
+    states = run_stage(
+        folder,
+        "train",
+        training.iterations,
+        training_chunk(config.chunk, training),
+        lambda: pipe.train_init(key, wide, old),
+        lambda s, n: step(s, wide, target, n),
+        training_rows(config.seeds, training.steps_per_iteration),
+        notes,
+        per_step=training.steps_per_iteration,
+        seconds=expected(pipe.simulator),
+    )
+    return pipe.policies(states)
 
 
 def _settings(config: Config, method: str, robot: str, training: Any) -> dict[str, Any]:

@@ -106,22 +106,7 @@ class Garat:
         runs = math.ceil(self.transitions / env.episode_length)
         each = _ENVS * unroll + runs * env.episode_length
         rounds = min(self.grounding_steps * self.iterations, budget.rounds(each))
-        trainer = Ppo(
-            env,
-            PpoConfig(
-                env_steps=rounds * _ENVS * unroll,
-                num_envs=_ENVS,
-                unroll=unroll,
-                hidden=self.hidden,
-                minibatches=5,
-                learning_rate=self.learning_rate,
-                gae_lambda=0.95,
-                clipping=self.clipping,
-                entropy_cost=self.entropy_cost,
-            ),
-            lambda grounding: grounding,
-            lambda grounding, _: grounding,
-        )
+        trainer = self._trainer(env, rounds, unroll)
         judge = critic.CriticConfig(
             hidden=self.hidden,
             loss="gan",
@@ -130,13 +115,7 @@ class Garat:
             learning_rate=self.learning_rate,
         )
         env.judge = judge
-        real, weight = inputs(demonstrations)
-        rows = jnp.argsort(weight <= 0, stable=True)
-        real, known = real[rows], jnp.maximum((weight > 0).sum(), 1)
-        w = (weight[rows] > 0)[:, None] / known
-        mid = (w * real).sum(0)
-        std = jnp.sqrt((w * (real - mid) ** 2).sum(0))
-        std = jnp.where(std > 1e-9, std, 1.0)
+        real, known, mid, std = standard_inputs(demonstrations)
 
         def iteration(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
             state, grounding = carry
@@ -182,6 +161,36 @@ class Garat:
 
         transformer = jax.jit(run)(key, practice.theta, practice.policy)
         return transformer, rounds * each
+
+    def _trainer(self, env: "TransformerEnv", rounds: int, unroll: int) -> Ppo:
+        config = PpoConfig(
+            env_steps=rounds * _ENVS * unroll,
+            num_envs=_ENVS,
+            unroll=unroll,
+            hidden=self.hidden,
+            minibatches=5,
+            learning_rate=self.learning_rate,
+            gae_lambda=0.95,
+            clipping=self.clipping,
+            entropy_cost=self.entropy_cost,
+        )
+        return Ppo(
+            env, config, lambda grounding: grounding, lambda grounding, _: grounding
+        )
+
+
+def standard_inputs(
+    trajectories: Segments,
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """`inputs`, those that count first; how many these are, and their mean and
+    standard deviation, ``(F,)``."""
+    real, weight = inputs(trajectories)
+    rows = jnp.argsort(weight <= 0, stable=True)
+    real, known = real[rows], jnp.maximum((weight > 0).sum(), 1)
+    w = (weight[rows] > 0)[:, None] / known
+    mid = (w * real).sum(0)
+    std = jnp.sqrt((w * (real - mid) ** 2).sum(0))
+    return real, known, mid, jnp.where(std > 1e-9, std, 1.0)
 
 
 def inputs(trajectories: Segments) -> tuple[jax.Array, jax.Array]:

@@ -122,18 +122,7 @@ class Analysis:
         self.fit_blocks = np.arange(own)
         self.held_blocks = np.arange(own, self.predictor.blocks)
         simulator = self.predictor.simulator
-        self.channels = measure.channels(
-            mj_model,
-            [n.removeprefix("qpos.") for n in simulator.state_names[: mj_model.nv]],
-            fit,
-            self.noise,
-            self.predictor.steps - self.lead,
-        )
-        if not np.isfinite(self.channels.scale).any():
-            raise UserError(
-                "nothing moves by more than five times its noise over a horizon of "
-                f"{horizon:g} s: record larger or faster motion, or lengthen --horizon"
-            )
+        self.channels = self._channels(fit, horizon)
         self.step = dt / simulator.substeps
         self.dropped: set[str] = set()  # found, and then found to say nothing
         count = len(self.fit_windows)
@@ -161,6 +150,27 @@ class Analysis:
             self.lead,
             self.resolution,
         )
+
+    def _channels(self, fit: Sequence[Run], horizon: float) -> measure.Channels:
+        """What is compared.
+
+        Raises:
+            UserError: nothing moves.
+        """
+        names = self.predictor.simulator.state_names[: self.m.nv]
+        found = measure.channels(
+            self.m,
+            [n.removeprefix("qpos.") for n in names],
+            fit,
+            self.noise,
+            self.predictor.steps - self.lead,
+        )
+        if not np.isfinite(found.scale).any():
+            raise UserError(
+                "nothing moves by more than five times its noise over a horizon of "
+                f"{horizon:g} s: record larger or faster motion, or lengthen --horizon"
+            )
+        return found
 
     def _windows(
         self, fit: Sequence[Run], held: Sequence[Run], horizon: float

@@ -78,6 +78,31 @@ def recombination_weights(population_size: int, elites: int) -> jax.Array:
     return w / w.sum()
 
 
+def _algorithm(
+    name: str, population_size: int, size: int, elite_ratio: float, spread_about: str
+) -> tuple[Any, Any]:
+    """evosax's object and its parameters; arguments as in `make_strategy`."""
+    blank = jnp.zeros(size)
+    es: Any
+    if name == MU_LAMBDA:
+        es = _MuLambda(population_size, blank)
+        es.about_new_mean = spread_about == "new_mean"
+        es.elite_ratio = elite_ratio
+        weights = recombination_weights(population_size, es.num_elites)
+        base = es.default_params.replace(weights=weights, c_std=1.0)
+    elif name == "RandomSearch":
+        es = algorithms[name](
+            population_size, blank, sampling_fn=lambda k: jax.random.uniform(k, (size,))
+        )
+        base = es.default_params
+    else:
+        es = algorithms[name](population_size, blank)
+        base = es.default_params
+        if name == "LM_MA_ES":  # a rate, made for far more parameters than individuals
+            base = base.replace(c_c=jnp.minimum(base.c_c, 1.0))
+    return es, base
+
+
 def make_strategy(
     name: str,
     population_size: int,
@@ -102,25 +127,7 @@ def make_strategy(
         raise UserError(f'unknown strategy "{name}"{nearest(name, names())}')
     if spread_about not in ("old_mean", "new_mean"):
         raise UserError(f'spread_about is "{spread_about}": old_mean or new_mean')
-    blank = jnp.zeros(size)
-    es: Any
-    if name == MU_LAMBDA:
-        es = _MuLambda(population_size, blank)
-        es.about_new_mean = spread_about == "new_mean"
-        es.elite_ratio = elite_ratio
-        weights = recombination_weights(population_size, es.num_elites)
-        base = es.default_params.replace(weights=weights, c_std=1.0)
-    elif name == "RandomSearch":
-        es = algorithms[name](
-            population_size, blank, sampling_fn=lambda k: jax.random.uniform(k, (size,))
-        )
-        base = es.default_params
-    else:
-        es = algorithms[name](population_size, blank)
-        base = es.default_params
-        if name == "LM_MA_ES":  # a rate, made for far more parameters than individuals
-            base = base.replace(c_c=jnp.minimum(base.c_c, 1.0))
-
+    es, base = _algorithm(name, population_size, size, elite_ratio, spread_about)
     population_based = not isinstance(es, DistributionBasedAlgorithm)
 
     def params_of(std: jax.Array) -> Any:
