@@ -2,17 +2,15 @@
 
 Maximum likelihood under independent measurement noise: parameters and the true start of
 every segment are fitted together by Levenberg-Marquardt (derivatives:
-`easi_jax.estimation.normal_equations`). Each round tries several dampings, and jumps of
-single
-parameters: a speed limit that no simulation reaches has no slope, yet the data may show
-that it is lower. Noise digs a dip into the edge of such a plateau: what fits hardly
-better there is put back onto the plateau, where nothing is known of it. The common
-scale of all masses and forces jumps as well. In the first rounds pieces that fit far
-worse than most count less. A first stage fits only the beginning of each piece: over
-few milliseconds errors are nearly linear in the parameters, while over contacts and
-stick-slip they have many minima. A limit that few pieces meet is missed where all other
-parameters have been bent to those pieces: after several starts, what fits far worse is
-left out, and what met no limit then begins at the limit that the rest would meet.
+`easi_jax.estimation.normal_equations`; steps: `easi_jax.estimation.least_squares`).
+Each round tries several dampings, and jumps of single parameters
+(`easi_jax.estimation.limits`). In the first rounds pieces that fit far worse than most
+count less (`easi_jax.estimation.weights`). A first stage fits only the beginning of
+each piece: over few milliseconds errors are nearly linear in the parameters, while over
+contacts and stick-slip they have many minima. A limit that few pieces meet is missed
+where all other parameters have been bent to those pieces: after several starts, what
+fits far worse is left out, and what met no limit then begins at the limit that the rest
+would meet.
 Starting at the found mean, it is the natural last step where commands and states were
 logged together; it says nothing about unpaired data or about distributions.
 """
@@ -72,7 +70,7 @@ class RefineResult:
             no slope.
         raised_hessian: information there.
         excess: by how much the weighted squared error at ``unit`` exceeds what the
-            noise accounts for (`excess`), ``()``.
+            noise accounts for (`easi_jax.estimation.weights.excess`), ``()``.
         simulated: control steps simulated, ``()``; a derivative counts as one more.
     """
 
