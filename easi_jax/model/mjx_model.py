@@ -296,7 +296,9 @@ def _without_shortcuts(m: mujoco.MjModel) -> None:
     """Centers of mass are read, not taken to be where the model file has them."""
     m.body_sameframe[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
     m.geom_sameframe[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
-    m.body_simple[:] = 0
+    # Of a body that only slides (2) the center does not matter, and `mj_setConst` takes
+    # the inverse of its mass for the weight of its contacts.
+    m.body_simple[m.body_simple < 2] = 0
     m.dof_simplenum[:] = 0
 
 
