@@ -67,6 +67,13 @@ def fitted_velocity(
     return velocity
 
 
+def slope_noise(dt: float) -> float:
+    """Noise of a velocity of `fitted_velocity` inside a run [1/s], times that of a
+    position."""
+    reach = max(int(_FIT_SECONDS / dt + 1e-6), _FIT_ROWS // 2)
+    return float(np.linalg.norm(_derivative_weights(-reach, reach)) / dt)
+
+
 def lead_rows(dt: float) -> int:
     """Rows on either side of a window's start that the start is fitted to.
 

@@ -392,7 +392,7 @@ def ready_errors(
         ]
         return np.stack([jax.device_get(compiled(*both)) for both in asked])
 
-    starts = _starts_of(problem, lead, simulate)
+    starts = _starts_of(problem, simulate)
     rows = starts.noise
     resolution = np.max([resolutions(r) for r in (*problem.fit, *problem.held)], 0)
 
@@ -413,8 +413,8 @@ def ready_errors(
     return measured
 
 
-def _starts_of(problem: Problem, lead: int, simulate: Simulate) -> Starts:
-    """Of windows that begin ``lead`` rows before they are measured from."""
+def _starts_of(problem: Problem, simulate: Simulate) -> Starts:
+    """Of windows that begin `lead_rows` before they are measured from."""
     m, runs = problem.simulator.mj_model, [*problem.fit, *problem.held]
     moved = [r.configuration.difference(r.qpos[:1], r.qpos) for r in runs]
     size = np.maximum(np.concatenate(moved).std(0), 1e-9)
@@ -427,7 +427,7 @@ def _starts_of(problem: Problem, lead: int, simulate: Simulate) -> Starts:
         np.maximum(wide[m.nv : 2 * m.nv], 1e-9),
         unmeasured.start_spread(m, runs, np.isinf(problem.noise[: m.nv])),
         np.maximum(wide[2 * m.nv :], 1e-9),
-        lead,
+        runs[0].dt,
     )
 
 

@@ -13,6 +13,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from easi_jax.data.windows import lead_rows, slope_noise
+
 # Takes vectors (B, n) and offsets of starts (B, W, s); returns errors (B, W, T, c).
 Simulate = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -21,6 +23,7 @@ DRAWS = 20  # of the noise of each window, for a floor, as the log format asks
 # its window decide. A position, times its noise and its motion; speeds by their motion.
 _NOISES, _MOTION = 30.0, 0.03
 _DIFFERENCE = 3e-3, 0.03  # of positions and speeds, in units of their motion
+_CURVED = 3.0  # times the noise of a local polynomial's speed: with its own error
 _FINEST = 1e-6  # of the motion: noise of a log that has none
 _ROUNDS = 6  # looks at each start
 _SHORTER = 0.3  # times the step of a start that was not improved
@@ -42,10 +45,14 @@ class Starts:
         simulate: errors of vectors and offsets of starts.
         noise: of each channel of the errors, standard deviations ``(c,)``; infinite
             where nothing was measured.
-        spread: how far starts may be from offsets of zero, ``(s,)``.
+        spread: how far starts may be from offsets of zero, ``(s,)``, so wide that the
+            rows of the window decide.
+        known: how far they are by the noise of the rows alone, ``(s,)``.
         rows: so many first rows of a window decide on its start.
         step: sizes of differences, ``(s,)``.
         slope: of errors with the start, ``(s, W, T, c)``, of the last `linearize`.
+        bent: how far errors are from linear there, in the median window: the second
+            differences beside the first.
     """
 
     simulate: Simulate
@@ -53,7 +60,9 @@ class Starts:
     spread: np.ndarray
     rows: int
     step: np.ndarray
+    known: np.ndarray
     slope: np.ndarray = field(init=False)
+    bent: float = field(init=False, default=0.0)
 
     def part(self, some: slice) -> "Starts":
         """Of some of the windows, whose errors can no longer be asked for."""
@@ -61,17 +70,30 @@ class Starts:
         out.slope = self.slope[:, some]
         return out
 
+    @property
+    def as_read(self) -> "Starts":
+        """These starts, as far off as the noise of their rows says, and no farther."""
+        out = self.part(slice(None))
+        out.spread = self.known
+        return out
+
     def linearize(self, x: np.ndarray, begin: np.ndarray) -> None:
         """Takes slopes at a vector ``(n,)`` and offsets ``(W, s)``."""
         size, (count, _) = len(self.step), begin.shape
-        moved = np.broadcast_to(begin, (2 * size, count, size)).copy()
+        moved = np.broadcast_to(begin, (2 * size + 1, count, size)).copy()
         at = np.arange(size)
         moved[at, :, at] += self.step[:, None]
         moved[size + at, :, at] -= self.step[:, None]
-        got = self.simulate(np.repeat(x[None], 2 * size, 0), moved).astype(np.float64)
-        slope = (got[:size] - got[size:]) / (2 * self.step)[:, None, None, None]
+        got = self.simulate(np.repeat(x[None], len(moved), 0), moved).astype(np.float64)
+        more, less, here = got[:size], got[size:-1], got[-1]
+        slope = (more - less) / (2 * self.step)[:, None, None, None]
         # One prediction in thousands is not finite; it must not spoil all windows.
         self.slope = np.where(np.isfinite(slope), slope, 0.0)
+        first, second = (
+            np.sqrt(((np.nan_to_num(d) / self.noise) ** 2).sum((0, 2, 3)))
+            for d in (0.5 * (more - less), 0.5 * (more + less) - here)
+        )
+        self.bent = float(np.median(second / np.maximum(first, 1e-300)))
 
     @property
     def _weight(self) -> np.ndarray:
@@ -132,7 +154,10 @@ class Starts:
         return np.where(np.isfinite(errors).all((2, 3)), total, np.inf)
 
     def fit(
-        self, x: np.ndarray, begin: np.ndarray, readings: np.ndarray | None = None
+        self,
+        x: np.ndarray,
+        begin: np.ndarray,
+        readings: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Fitted starts of vectors ``(B, n)``, by the slopes of `linearize`.
 
@@ -224,9 +249,9 @@ def starts_about(
     speed: np.ndarray,
     free: np.ndarray,
     act: np.ndarray,
-    lead: int,
+    dt: float,
 ) -> Starts:
-    """Starts of windows that begin where a log says, ``lead`` rows early.
+    """Starts of windows that begin where a log says, `lead_rows` early.
 
     Args:
         simulate: as for `Starts`.
@@ -234,6 +259,7 @@ def starts_about(
         position, speed: motion of each degree of freedom, ``(nv,)``.
         free: how far what nobody measured may be off, ``(2 nv,)``; infinite elsewhere.
         act: how far activations may be off, ``(na,)``.
+        dt: control step [s].
     """
     known = np.where(np.isfinite(noise), noise, 0.0)
     small, part = _DIFFERENCE
@@ -243,12 +269,14 @@ def starts_about(
     near = np.maximum(small * position, 3.0 * known)
     near = np.concatenate([near, part * speed])
     step = np.where(np.isfinite(free), part * spread, near)
+    by_rows = np.concatenate([known, _CURVED * slope_noise(dt) * known])
     return Starts(
         simulate,
         noise,
         np.concatenate([spread, act]),
-        2 * lead + 1,
+        2 * lead_rows(dt) + 1,
         np.concatenate([step, part * act]),
+        np.concatenate([np.where(np.isfinite(free), free, by_rows), act]),
     )
 
 

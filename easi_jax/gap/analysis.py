@@ -66,6 +66,7 @@ _NOTHING = 1e-3  # of the largest error: a change that shows nowhere
 _STEPS_SEEN = 0.75  # of the floor: less is lost in noise
 _WHOLE = 1.15  # of the error of steps; a finer simulation leaves some of it
 _TOLD = 0.8  # of the gap without the own steps' error: worth a note
+_BENT = 0.1  # second beside first differences of errors with a start: not linear
 _LET_PASS = 0.05  # of what the model errs by, that no fit hangs on
 
 Tell = Callable[[str], None]
@@ -124,6 +125,7 @@ class Analysis:
         simulator = self.predictor.simulator
         self.channels = self._channels(fit, horizon)
         self.step = dt / simulator.substeps
+        self.sticks = False  # whether errors bend with starts: see `whiten`
         self.dropped: set[str] = set()  # found, and then found to say nothing
         count = len(self.fit_windows)
         self.group = np.arange(count) * min(_BLOCKS, count) // count
@@ -228,9 +230,16 @@ class Analysis:
     # -- pieces ----------------------------------------------------------------
 
     def whiten(self, x: np.ndarray) -> None:
-        """Renews the noise model of the fit at a vector."""
+        """Renews the noise model of the fit at a vector.
+
+        Starts are integrated out about those that are fitted at the vector. Where feet
+        stick and slip, errors are not linear in the start over more than its noise, and
+        what is fitted for one model is no start for another: there starts are as rows
+        tell.
+        """
         chosen, starts = self.selector, self.fit_starts
-        chosen.moved, _ = starts.solve(x, chosen.moved)
+        still = np.zeros_like(chosen.moved)
+        chosen.moved, _ = starts.solve(x, still if self.sticks else chosen.moved)
         errors = chosen.errors(x[None])[0]
         if not np.isfinite(errors).all():
             raise UserError(
@@ -241,6 +250,11 @@ class Analysis:
         least = known_noise(self.resolution / math.sqrt(12), self.scales.position)
         starts.noise = better_noise(starts, errors, self.noise, least)
         self.held_out.starts.noise = starts.noise
+        self.sticks |= starts.bent > _BENT
+        if self.sticks:
+            chosen.moved = still
+            starts.linearize(x, still)
+            starts, errors = starts.as_read, chosen.errors(x[None])[0]
         rms = np.sqrt(np.mean(errors.astype(float) ** 2, (0, 1)))
         chosen.residuals = make_residuals(
             starts, self.lead, _LET_PASS * rms, self.channels.scale
@@ -272,8 +286,11 @@ class Analysis:
         """Lets fits see what the model's own steps do, where that can be seen.
 
         Data of a machine have no such error and those of a simulation of the same step
-        have all of it, so its share is fitted like the model's own parameters.
+        have all of it, so its share is fitted like the model's own parameters. Where
+        feet stick and slip, the error is another from each start, and no share helps.
         """
+        if self.sticks:
+            return
         windows, count = self.predictor.windows, len(self.fit_windows)
         error = error_of_steps(self.m, windows, self.predictor.simulator.dt)
         mine = self.fit_starts.left(error[:count])[:, self.lead + 1 :]

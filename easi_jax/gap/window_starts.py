@@ -8,7 +8,6 @@ import numpy as np
 from easi_jax.data.activations import activation_guess, activation_spread
 from easi_jax.data.recording import Run
 from easi_jax.data.unmeasured import start_spread
-from easi_jax.data.windows import lead_rows
 from easi_jax.estimation.starts import Starts, starts_about
 from easi_jax.gap.predictor import Predictor
 from easi_jax.model.effect_catalog import Scales
@@ -49,5 +48,5 @@ def window_starts(
         scales.speed,
         start_spread(m, runs),
         act,
-        lead_rows(runs[0].dt),
+        runs[0].dt,
     )

@@ -110,8 +110,12 @@ def _direct_contacts(m: Any, _: int) -> None:
 
 
 def direct_contacts(m: mujoco.MjModel) -> None:
-    """Writes stiffness and damping of all contacts in their direct form."""
-    for solref in (*m.geom_solref, *m.pair_solref):
+    """Writes stiffness and damping of contacts in their direct form, which has no least
+    time constant; unless geoms differ: MuJoCo takes the smaller of two geoms' direct
+    numbers, but means of their time constants and damping ratios."""
+    touch = (m.geom_contype | m.geom_conaffinity) > 0
+    alike = len(np.unique(m.geom_solref[touch], axis=0)) <= 1
+    for solref in (*(m.geom_solref if alike else ()), *m.pair_solref):
         if solref[0] > 0:
             solref[:] = -np.asarray(direct_solref(m, solref))
 

@@ -197,7 +197,7 @@ def with_effects(
     """The model with all static effects; pure.
 
     The model must have been put with force limits on where ``limit`` varies, and, for
-    RK4, contacts in direct form where ``softness`` does.
+    RK4, with `effect_numbers.direct_contacts` where ``softness`` does.
 
     Args:
         present: fields that may differ from none; None: any of them.
@@ -267,8 +267,11 @@ def _apart(e: Effects) -> jax.Array:
 
 
 def _softened(solref: jax.Array, factors: jax.Array) -> jax.Array:
-    # Only the direct form (-stiffness, -damping) scales like this.
-    return jnp.where(solref < 0, solref * factors, solref)
+    """Solver references ``(n, 2)``: (time constant, damping ratio), the stiffness of
+    which goes with the inverse square of both, or the direct (-stiffness, -damping)."""
+    stiffer, damped = factors[..., 0], factors[..., 1]
+    standard = jnp.stack([1 / damped, damped / jnp.sqrt(stiffer)], -1)
+    return solref * jnp.where(solref[:, :1] > 0, standard, factors)
 
 
 def _direct(m: mjx.Model, solref: jax.Array) -> jax.Array:

@@ -96,9 +96,14 @@ def set_const(m: mjx.Model) -> mjx.Model:
     jac_move = moves * (move + jnp.cross(turn, arm[:, None]))
     jac = jnp.stack([jac_move, jac_turn], 1)  # (nbody, 2, nv, 3)
     body = inverse_weight(jnp.swapaxes(jac, -1, -2)).mean(-1)
+    dofs = _joint_means(m, jnp.diagonal(inverse))
+    # MuJoCo takes the mass alone for a body that slides along its own axes.
+    slides = np.asarray(m.body_simple) == 2
+    body = body.at[slides].set(jnp.stack([1 / mass, 0 * mass], 1)[slides])
+    dofs = jnp.where(slides[m.dof_bodyid], 1 / mass[m.dof_bodyid], dofs)
     changes: dict[str, Any] = {
         "body_invweight0": body,
-        "dof_invweight0": _joint_means(m, jnp.diagonal(inverse)),
+        "dof_invweight0": dofs,
         "dof_M0": jnp.diagonal(full),
         "stat.meaninertia": jnp.diagonal(full).mean(),
     }

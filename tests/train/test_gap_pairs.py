@@ -62,7 +62,6 @@ def only(monkeypatch: pytest.MonkeyPatch, *effects: str) -> None:
     monkeypatch.setattr(analysis, "ripples", lambda *a: [])
 
 
-# Found at 67eb159 and no longer at 87eadd9, where it says "unexplained": not mended.
 @pytest.mark.slow
 def test_friction_under_one_foot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from easi_jax.data.recording import Run, physics_steps
-from easi_jax.data.windows import fitted_velocity, make_windows
+from easi_jax.data.windows import fitted_velocity, make_windows, slope_noise
 from easi_jax.io.logs.reader import read_logs
 from easi_jax.model.joint_space import Configuration
 
@@ -61,6 +61,13 @@ def test_velocity_is_the_quadratic_fit_of_the_log_format(dt, rows):
     span = max(half + 1, 5)
     fit = np.polynomial.Polynomial.fit(dt * np.arange(span), values[:span], 2)
     assert velocity[0] == pytest.approx(fit.deriv()(0.0), rel=1e-9)
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.02])
+def test_noise_of_velocities(dt):
+    white = np.random.default_rng(0).normal(size=(20_000, 1))
+    spread = fitted_velocity(white, dt, FLAT)[50:-50].std()
+    assert spread == pytest.approx(slope_noise(dt), rel=0.03)
 
 
 def test_velocity_of_short_runs():

@@ -29,7 +29,8 @@ def made(seed: int, pull: float = 0.0, step: float = 0.0) -> tuple[Starts, np.nd
         return path(guess + moved) - read
 
     spread = np.array([0.1, 3.0])
-    return Starts(simulate, NOISE, spread, ROWS, 1e-3 * spread), true - guess
+    starts = Starts(simulate, NOISE, spread, ROWS, 1e-3 * spread, 0.1 * spread)
+    return starts, true - guess
 
 
 def fitted(starts: Starts) -> tuple[np.ndarray, np.ndarray]:
@@ -103,11 +104,28 @@ def test_a_channel_without_readings_has_no_say() -> None:
         starts.spread,
         ROWS,
         starts.step,
+        starts.known,
     )
     alone, _ = fitted(starts)
     beside, errors = fitted(both)
     np.testing.assert_allclose(beside, alone, atol=1e-9)
     assert np.isinf(both.measured_noise(errors)[1])
+
+
+def test_what_is_not_linear_is_told() -> None:
+    """Errors that jump with the start, as where a foot sticks or slips."""
+    starts, _ = made(7)
+    x, still, smooth = np.zeros(1), np.zeros((W, 2)), starts.simulate
+    starts.linearize(x, still)
+    assert starts.bent < 1e-3
+
+    def sticking(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        return smooth(x, moved * (moved > 0))
+
+    starts.simulate = sticking
+    starts.linearize(x, still)
+    assert starts.bent == pytest.approx(1.0, abs=0.01)
+    assert (starts.as_read.spread < starts.spread).all()
 
 
 def test_what_is_not_finite_keeps_its_start() -> None:

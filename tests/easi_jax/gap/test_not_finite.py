@@ -50,7 +50,7 @@ def held_out(errors: Any) -> HeldOut:
     """Held-out windows without a compiled program; the first row is the start."""
     spread = np.ones(2 * NV)
     noise = np.full(NV, 1e-3)
-    starts = Starts(lambda x, moved: errors(x), noise, spread, 2, 1e-3 * spread)
+    starts = Starts(lambda x, moved: errors(x), noise, spread, 2, 1e-3 * spread, spread)
     channels = Channels(NAMES, NAMES, ("rad", "m"), np.ones(NV), {})
     given = None, [], predictor(errors), [None] * W, channels, starts
     return HeldOut(*given, lead=0, resolution=np.zeros(NV))  # type: ignore[arg-type]
@@ -104,7 +104,7 @@ def test_fits_go_on_with_the_windows_that_are_left() -> None:
 def test_a_model_that_blows_up_is_told_in_one_line() -> None:
     made = object.__new__(Analysis)
     lost = repeated(*range(8))
-    made.fit_starts = held_out(lost).starts
+    made.fit_starts, made.sticks = held_out(lost).starts, False
     made.selector = SimpleNamespace(  # type: ignore[assignment]
         moved=np.zeros((W, 2 * NV)), errors=lost
     )

@@ -55,6 +55,8 @@ BALL = """<mujoco><worldbody>
     </body>
   </body>
   <body pos="2 0 0"><freejoint/><geom type="box" size="0.1 0.2 0.3"/></body>
+  <body pos="4 0 0"><joint type="slide" axis="1 0 0" armature="0.5"/>
+    <joint type="slide" axis="0 0 1"/><geom type="box" size="0.1 0.2 0.3"/></body>
   </worldbody></mujoco>"""
 
 FIELDS = (

@@ -17,6 +17,7 @@ from easi_jax.io.runs.folder import RunFolder, engine_of
 from easi_jax.model.addresses import describe, split
 from easi_jax.model.effect_catalog import CATALOG
 from easi_jax.model.effect_numbers import EFFECT_TABLE
+from easi_jax.model.mjx_model import for_every_effect
 from easi_jax.model.parameters import ParameterSpace, declare
 from easi_jax.simulation import engine, native, open_loop
 from easi_jax.simulation.simulator import Simulator
@@ -118,6 +119,28 @@ def _predicted(simulator: Simulator, seg: Segments, theta: np.ndarray) -> Any:
 
     found = jax.jit(jax.vmap(one))(jnp.asarray(theta, jnp.float32))
     return tuple(np.asarray(x) for x in found)
+
+
+def test_a_foot_that_slides_stands_as_firmly_as_in_mujoco() -> None:
+    """MuJoCo weighs contacts of a body that only slides by its mass, also where any
+    effect may change it."""
+    m = mujoco.MjModel.from_xml_string("""<mujoco>
+      <option timestep="0.01" integrator="implicitfast"/><worldbody>
+      <geom type="plane" size="1 1 1"/><body name="foot" pos="0 0 0.05">
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <joint name="z" type="slide" axis="0 0 1"/>
+      <geom size="0.05" mass="1" solref="0.1 1"/></body></worldbody></mujoco>""")
+    fixed = {"body.foot.mass": 1.0}
+    sim = Simulator(m, ParameterSpace(()), 0.01, fixed=fixed, engine="mujoco")
+    model = sim.model(jnp.zeros(0))
+    model = model.replace(mjx=for_every_effect(model.mjx))
+    state = sim.start(jnp.array([0.0, -0.007]), jnp.array([0.04, 0.01]), model)
+    d = mujoco.MjData(m)
+    d.qpos[:], d.qvel[:] = state.qpos, state.qvel
+    for _ in range(5):
+        state = sim.step(model, state, jnp.zeros(0))
+        mujoco.mj_step(m, d)
+    np.testing.assert_allclose(state.qvel, d.qvel, rtol=1e-5)
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
