@@ -41,6 +41,7 @@ class Part:
     path: str
     tier: str
     commit: str
+    optimized: bool
 
     @property
     def key(self) -> str:
@@ -54,6 +55,8 @@ class Config(Share):
 
     tier: str = "all"
     """Which tests: slow, default or all."""
+    optimized: bool = True
+    """Whether programs are compiled as users get them, or as quickly as possible."""
     workers: int = 2
     """Processes of pytest at a time."""
     out: Path = _FOLDER / "parts.jsonl"
@@ -77,7 +80,7 @@ def run(config: Config) -> None:
     tiers = [t for t in TIERS if config.tier in (t, "all")]
     folder = config.out.parent.resolve()
     took = {(r["path"], r["tier"]): r["seconds"] for r in read_rows(config.out)}
-    every = [Part(p, t, commit) for t in tiers for p in _paths(t)]
+    every = [Part(p, t, commit, config.optimized) for t in tiers for p in _paths(t)]
     # What took longest at an earlier commit goes first.
     every.sort(key=lambda p: -took.get((p.path, p.tier), 0.0))
     solve = functools.partial(_solve, folder=folder)
@@ -164,7 +167,7 @@ def _solve(part: Part, folder: Path) -> dict[str, Any]:
         *paths,
     ]
     told = {
-        "EASI_JAX_TESTS": "optimized",
+        "EASI_JAX_TESTS": "optimized" if part.optimized else "",
         "COVERAGE_FILE": str(data),
         "JAX_COMPILATION_CACHE_DIR": str(folder / "cache"),
     }
@@ -255,11 +258,12 @@ def paragraphs(found: dict[str, Any]) -> list[str]:
                 k: sum(r[k] for r in some) for k in ("passed", "failed", "skipped")
             }
             commits = sorted({short(r["commit"]) for r in some})
+            how = "" if some[0].get("optimized", True) else ", compiled quickly"
             said.append(
                 f"{tier.capitalize()} tests: {total['passed']} passed, "
                 f"{total['failed']} failed, {total['skipped']} skipped, "
                 f"{sum(r['seconds'] for r in some):.0f} s of "
-                f"{found['config']['workers']} processes, at {', '.join(commits)}."
+                f"{found['config']['workers']} processes, at {', '.join(commits)}{how}."
             )
     failed = [f"`{name}`" for r in parts for name in r["failures"]]
     said += [f"Failed: {', '.join(failed)}."] if failed else []
@@ -282,16 +286,12 @@ def paragraphs(found: dict[str, Any]) -> list[str]:
     return said
 
 
-def _section(found: dict[str, Any]) -> list[str]:
-    return [text for one in found.values() for text in paragraphs(one)]
-
-
 SECTIONS = (
     Section(
         "### Slow tests, and coverage of lines",
-        {"all": "slow_tests.json"},
+        "slow_tests.json",
         "slow_tests",
-        _section,
+        paragraphs,
     ),
 )
 

@@ -26,6 +26,7 @@ from benchmarks import (
     parity,
     rivals_summary,
     scaling_summary,
+    slow_tests,
     strangers,
     where_tests_spend,
 )
@@ -417,6 +418,7 @@ SECTIONS = (
     *rivals_summary.SECTIONS,
     *scaling_summary.SECTIONS,
     *where_tests_spend.SECTIONS,
+    *slow_tests.SECTIONS,
     Section("## Lines by package", "lines.json", "lines", lines.paragraphs),
 )
 
