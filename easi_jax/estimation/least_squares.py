@@ -23,7 +23,8 @@ OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 CONVERGED, AT_BOUND, NOT_DETERMINED, DIVERGED = range(len(OUTCOMES))
 
 
-def _module(x: Any) -> Any:
+def array_module(x: Any) -> Any:
+    """jax's or NumPy's functions, by an array."""
     return jnp if isinstance(x, jax.Array) else np
 
 
@@ -58,7 +59,7 @@ def bounded_step(
         dim: least diagonal that damping assumes, relative to the largest: differences
             of no slope would make steps of any length.
     """
-    xp = _module(hessian)
+    xp = array_module(hessian)
     seen = xp.diagonal(hessian, axis1=-2, axis2=-1)
     scale = xp.where(free, 1.0 / xp.sqrt(seen), 0.0)
     lift = xp.asarray(damping)[..., None]
@@ -119,7 +120,7 @@ class Damping:
 
     def after(self, damping: Any, helped: Any) -> Any:
         """The next damping, ``(...)``, after a step with this one."""
-        xp = _module(damping)
+        xp = array_module(damping)
         risen = xp.maximum(self.rises * damping, self.wakes)
         new = xp.where(helped, self.falls * damping, risen)
         return xp.clip(new, self.least, self.most)
@@ -135,7 +136,7 @@ def is_settled(gain: Any, cost: Any, least: float, share: Any) -> Any:
 def flag_codes(x: A, low: A, high: A, determined: A, near: Any = 0.0) -> A:
     """Code of each entry ``(..., n)``: at a bound, to within ``near``; else whether the
     data determine it."""
-    xp = _module(x)
+    xp = array_module(x)
     at_bound = (x <= low + near) | (x >= high - near)
     known = xp.where(determined, CONVERGED, NOT_DETERMINED)
     return xp.where(at_bound, AT_BOUND, known)
@@ -144,7 +145,7 @@ def flag_codes(x: A, low: A, high: A, determined: A, near: Any = 0.0) -> A:
 def result_code(flags: A, finite: Any = True) -> A:
     """Code of a result ``(...)``, of which every number is ``finite``, by the codes of
     its entries ``(..., n)``: not determined where all are, at a bound where one is."""
-    xp = _module(flags)
+    xp = array_module(flags)
     lost = (flags == NOT_DETERMINED).all(-1)
     bound = xp.where((flags == AT_BOUND).any(-1), AT_BOUND, CONVERGED)
     return xp.where(finite, xp.where(lost, NOT_DETERMINED, bound), DIVERGED)

@@ -132,12 +132,19 @@ def refine(
 class _Stage:
     """One stage of the fit, or a look at the result."""
 
-    kind: jax.Array
     begun: jax.Array  # where this fit began
     first: jax.Array
     wanted: jax.Array
-    near: jax.Array
+    short: jax.Array  # from there, the beginnings of the pieces alone
+    dropping: jax.Array  # without what fits far worse
+    freed: jax.Array
+    raised: jax.Array
+    looks: jax.Array  # only
+    whole: jax.Array  # what it finds may be the result
     robust: jax.Array  # rounds
+    patience: jax.Array
+    least: jax.Array  # rounds at least
+    held: jax.Array  # rounds in which limits move alone
 
     @classmethod
     def all(cls, starts: jax.Array, near: Any, robust: Any, apart: bool) -> "_Stage":
@@ -146,57 +153,32 @@ class _Stage:
         then a look at the result, a fit of what may not be at a plateau's edge, and a
         look at what is raised."""
         kinds = [_SHORT, _WHOLE] * len(starts) + [_DROPPING, _RETURNING] * apart
+        at = np.arange(len(kinds) + 3)
         kind = np.array([*kinds, _LOOK, _FREED, _RAISED])
-        at, freed = np.arange(len(kind)), kind == _FREED
-        alike = np.isin(kind, (_SHORT, _DROPPING, _RETURNING))
+        short, whole, dropping, returning, look, freed, raised = (
+            jnp.asarray(kind == k) for k in range(7)
+        )
+        wanted = jnp.where(near, at == 1, True) | freed
+        quick = short | near | freed
+        robust = jnp.where(short | dropping | returning, 0, robust)
+        patience = jnp.where(quick, *_PATIENCE)
+        # Without what fits far worse, limits are looked for once the rest has settled.
+        least = jnp.maximum(robust + patience, jnp.where(quick, 0, _BISECTED))
         return cls(
-            kind=jnp.asarray(kind),
             begun=starts[np.minimum(at // 2, len(starts) - 1)],
             first=jnp.asarray(at == 1),
-            wanted=jnp.where(near, at == 1, True) | freed,
-            near=jnp.asarray(near | freed),
-            robust=jnp.where(alike, 0, robust),
+            wanted=wanted,
+            short=short,
+            dropping=dropping,
+            freed=freed,
+            raised=raised,
+            looks=look | raised,
+            whole=wanted & (whole | returning | freed),
+            robust=robust,
+            patience=patience,
+            least=least + dropping * _BISECTED,
+            held=jnp.where(returning, _HELD, 0),
         )
-
-    @property
-    def short(self) -> jax.Array:
-        return self.kind == _SHORT
-
-    @property
-    def dropping(self) -> jax.Array:
-        return self.kind == _DROPPING
-
-    @property
-    def freed(self) -> jax.Array:
-        return self.kind == _FREED
-
-    @property
-    def looks(self) -> jax.Array:
-        """Whether it only looks."""
-        return (self.kind == _LOOK) | (self.kind == _RAISED)
-
-    @property
-    def whole(self) -> jax.Array:
-        """Whether what it finds may be the result."""
-        return ~self.short & ~self.looks & ~self.dropping & self.wanted
-
-    @property
-    def held(self) -> jax.Array:
-        """Rounds in which limits move alone."""
-        return jnp.where(self.kind == _RETURNING, _HELD, 0)
-
-    @property
-    def patience(self) -> jax.Array:
-        """Rounds without progress that end it."""
-        return jnp.where(self.short | self.near, *_PATIENCE)
-
-    @property
-    def least(self) -> jax.Array:
-        """Rounds at least. Without what fits far worse, limits are looked for once the
-        rest has settled."""
-        bisected = jnp.where(self.short | self.near, 0, _BISECTED)
-        least = jnp.maximum(self.robust + self.patience, bisected)
-        return least + self.dropping * _BISECTED
 
 
 @flax.struct.dataclass
@@ -314,7 +296,7 @@ class _Fit:
         shift = jnp.where(item.short, unmoved, found.last.shift)
         from_best = item.looks | item.dropping
         u = jnp.where(from_best, best.unit, jnp.where(item.freed, found.freed, u))
-        u = jnp.where(item.kind == _RAISED, raised_to_range(self.space, u), u)
+        u = jnp.where(item.raised, raised_to_range(self.space, u), u)
         shift = jnp.where(from_best | item.freed, best.shift, shift)
         still = item.freed & (found.freed == best.unit).all()
         even = ~weights.far_worse(best.pieces, self.weight).any()

@@ -4,6 +4,8 @@ them."""
 import jax
 import jax.numpy as jnp
 
+from easi_jax.estimation.weights import huber
+
 
 def rms_of_steps(error: jax.Array, instead: jax.Array) -> jax.Array:
     """RMS ``(n,)`` of errors ``(M, H, n)``; a piece that is not finite counts as an
@@ -38,5 +40,4 @@ def outlier_weights(
     Huber's weight on the RMS over a segment of the error in units of its expectation.
     """
     expected = noise**2 + misfit**2
-    size = jnp.sqrt((error**2 / expected).mean((1, 2)))
-    return jnp.minimum(1.0, limit * jnp.median(size) / jnp.maximum(size, 1e-30))
+    return huber(jnp.sqrt((error**2 / expected).mean((1, 2))), limit)

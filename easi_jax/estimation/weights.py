@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from easi_jax.data.segments import Segments
+from easi_jax.estimation.least_squares import A, array_module
 
 _NOISIER = 1.2  # times the noise as it is given, that it may be
 _OUTLYING = 9.0  # times the median cost: such a piece counts half
@@ -36,6 +37,13 @@ def excess(costs: jax.Array, weight: jax.Array) -> jax.Array:
     numbers = jnp.where(told, weight.sum((1, 2)), 0.0).sum()
     error = 2.0 * jnp.where(told, costs, 0.0).sum()
     return jnp.maximum(error - _NOISIER**2 * numbers, 0.0)
+
+
+def huber(size: A, limit: float) -> A:
+    """Huber's weight of each error by its ``size (M,)``: less than 1 beyond ``limit``
+    median sizes."""
+    xp = array_module(size)
+    return xp.minimum(1.0, limit * xp.median(size) / xp.maximum(size, 1e-30))
 
 
 def robust(costs: jax.Array, used: jax.Array) -> jax.Array:

@@ -16,6 +16,7 @@ from easi_jax.estimation.least_squares import (
     flag_codes,
     is_settled,
 )
+from easi_jax.estimation.weights import huber
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.model.parameters import ParameterSpace
 
@@ -95,8 +96,7 @@ def bounds_of(space: ParameterSpace, layout: Layout) -> Bounds:
 
 def window_weights(residual: np.ndarray) -> np.ndarray:
     """Huber's weight of each window ``(W,)``: less than 1 beyond 3 median errors."""
-    size = np.sqrt(np.mean(residual**2, axis=1))
-    return np.minimum(1.0, _HUBER * np.median(size) / np.maximum(size, 1e-30))
+    return huber(np.sqrt(np.mean(residual**2, axis=1)), _HUBER)
 
 
 def _cost(residual: np.ndarray, weight: np.ndarray) -> np.ndarray:
