@@ -32,7 +32,7 @@ from easi_jax.export.mjcf import written_machine
 from easi_jax.export.policy import Interface, interface_of, policy_files
 from easi_jax.gap.analysis import Analysis
 from easi_jax.gap.excitation_coverage import coverage_notes
-from easi_jax.gap.sensor_faults import reading_faults
+from easi_jax.gap.sensor_faults import reading_faults, without_faults
 from easi_jax.gap.summary import gap_result
 from easi_jax.io.files import atomic_write
 from easi_jax.io.logs.reader import read_logs
@@ -363,13 +363,15 @@ def find_effects(
     """
     runs = measured_runs(model, log, held_out, checked_horizon(horizon))
     space = own_space(model) if parameters is None else parameters
-    given = model, space, runs.fit, runs.held, runs.noise, horizon
+    faults = reading_faults(model, runs.recorded)
+    fit, held = (without_faults(part, faults) for part in (runs.fit, runs.held))
+    given = model, space, fit, held, runs.noise, horizon
     with engines.chosen(engine, tell) as said:
         found = Analysis(*given, tell=tell).run()
     return gap_result(
         found,
         model=_name(model),
-        readings=reading_faults(model, runs.recorded),
+        readings=faults,
         held_out=[run.name for run in runs.held],
         held_name=runs.held_name,
         notes=[*said, *runs.notes, *coverage_notes(model, runs.fit, runs.held)],

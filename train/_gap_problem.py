@@ -86,7 +86,7 @@ def read_gap_problem(config: "Config") -> GapProblem:
     """
     from easi_jax.errors import UserError
     from easi_jax.gap.excitation_coverage import coverage_notes
-    from easi_jax.gap.sensor_faults import reading_faults
+    from easi_jax.gap.sensor_faults import reading_faults, without_faults
     from easi_jax.io.models.parameter_file import read_parameter_file
     from easi_jax.model.parameter_proposal import own_space
     from train._log_problem import held_of, read_runs
@@ -101,15 +101,16 @@ def read_gap_problem(config: "Config") -> GapProblem:
         else read_parameter_file(config.parameters, mj_model)
     )
     runs = read_runs(config, mj_model, config.horizon)
+    faults = reading_faults(mj_model, runs.recorded)
     return GapProblem(
         model,
         space,
-        runs.fit,
-        runs.held,
+        without_faults(runs.fit, faults),
+        without_faults(runs.held, faults),
         runs.held_name,
         [run.name for run in runs.held],
         runs.noise,
-        reading_faults(mj_model, runs.recorded),
+        faults,
         [*runs.notes, *coverage_notes(mj_model, runs.fit, runs.held)],
     )
 

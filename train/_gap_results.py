@@ -187,7 +187,7 @@ def _record_next(
             f.place,
             [known[key] for key in f.indistinguishable[:_ASKED]],
             problem.fit,
-            analysis.noise,
+            analysis.noise[: problem.model.mj_model.nv],
             horizon,
             plan,
         )

@@ -33,6 +33,9 @@ _TRIMMED = 1 - _TRIM * math.sqrt(2 / math.pi) * math.exp(-(_TRIM**2) / 2) / math
     _TRIM / math.sqrt(2.0)
 )
 _JERKS = 0.15  # share of differences with a jerk in them, from which others have some
+_JUMPS = 4  # differences in which commands that jump stand out of motion
+_FOLLOWS = 0.5  # share of these in the readings, that commands make
+_ROWS_PER_COMMAND = 20
 _SCALAR = Configuration(1, 1, (0,), (0,), ())
 
 
@@ -65,10 +68,10 @@ def noise_of(run: Run) -> Noise:
     c, kept = run.configuration, _kept_noise(run)
     steps = c.difference(run.qpos[:-1], run.qpos[1:])
     resolution = np.zeros(c.nv)
-    resolution[list(c.scalar_qvel)] = _resolution(run.qpos[:, list(c.scalar_qpos)])
+    resolution[list(c.scalar_qvel)] = resolution_of(run.qpos[:, list(c.scalar_qpos)])
     sigma, bound = _estimate(steps, 1, resolution, kept)
     if run.qvel_measured:
-        resolution = _resolution(run.qvel)
+        resolution = resolution_of(run.qvel)
         speed, wide = _estimate(run.qvel, 0, resolution, kept)
         agrees = _positions_agree(run, steps, sigma, speed)
         wide |= ~agrees & (speed > resolution / math.sqrt(12.0))
@@ -104,18 +107,37 @@ def sensor_noise(runs: Sequence[Run]) -> dict[str, Noise]:
     units.
 
     As for positions, of the rows that have a reading. A sensor that is slower than the
-    rows and held between its readings counts where it changes. Sensors that commands
-    reach at once (accelerometers, torques) look noisy where commands jump from row to
-    row: there they are an upper bound that is not told.
+    rows and held between its readings counts where it changes. Commands that jump from
+    row to row show at once in some sensors (torques, accelerometers): what is
+    proportional to them there is no noise. What else they do at once is not told from
+    it.
     """
     found: dict[str, list[Noise]] = {}
     for run in runs:
         for name, given in run.sensors.items():
-            readings, kept = _fresh(np.asarray(given, float)), _kept_noise(run)
+            given, kept = np.asarray(given, float), _kept_noise(run)
+            readings = _fresh(given)
             if len(readings) > min(_ORDERS):
-                own = _estimate(readings, 0, _resolution(readings), kept)
+                step = resolution_of(readings)
+                if len(readings) == len(given):
+                    readings = _without_commands(readings, run)
+                own = _estimate(readings, 0, step, kept)
                 found.setdefault(name, []).append(Noise(*own))
     return {name: _pooled(each) for name, each in found.items()}
+
+
+def _without_commands(readings: np.ndarray, run: Run) -> np.ndarray:
+    """``readings (T, dim)`` less what is proportional to the commands of their row and
+    of the one before, where commands make most of their jumps."""
+    sent = np.concatenate([run.ctrl, np.vstack([run.ctrl[:1], run.ctrl[:-1]])], 1)
+    if len(readings) < _ROWS_PER_COMMAND * max(1, sent.shape[1]):
+        return readings
+    jumps, cause = (np.diff(x, _JUMPS, axis=0) for x in (readings, sent))
+    gain = np.linalg.lstsq(cause, jumps, rcond=None)[0]
+    made = 1.0 - ((jumps - cause @ gain) ** 2).sum(0) / np.maximum(
+        (jumps**2).sum(0), 1e-300
+    )
+    return readings - sent @ np.where(made > _FOLLOWS, gain, 0.0)
 
 
 def _pooled(each: Sequence[Noise]) -> Noise:
@@ -142,7 +164,7 @@ def _fresh(readings: np.ndarray) -> np.ndarray:
     if 2 * new.sum() > len(x) or not len(step):
         return x
     # Coarse readings repeat, too, but go on by single steps of their resolution.
-    held = np.median(step.max(1)) > _HELD_STEPS * _resolution(x).max()
+    held = np.median(step.max(1)) > _HELD_STEPS * resolution_of(x).max()
     return x[new] if held else x
 
 
@@ -287,11 +309,11 @@ def resolutions(run: Run) -> np.ndarray:
     orientations."""
     c = run.configuration
     out = np.zeros(c.nv)
-    out[list(c.scalar_qvel)] = _resolution(run.qpos[:, list(c.scalar_qpos)])
+    out[list(c.scalar_qvel)] = resolution_of(run.qpos[:, list(c.scalar_qpos)])
     return out
 
 
-def _resolution(x: np.ndarray) -> np.ndarray:
+def resolution_of(x: np.ndarray) -> np.ndarray:
     """Smallest step between two readings of each column of ``x (T, n)``."""
     out = np.zeros(x.shape[1])
     for i, column in enumerate(x.T):

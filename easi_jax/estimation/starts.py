@@ -238,7 +238,8 @@ class Starts:
 
 
 def known_noise(noise: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Noise of positions ``(nv,)``, above zero; ``position`` is their motion."""
+    """Noise of positions ``(nv,)``, or of all channels, above zero; ``position`` is
+    their motion."""
     return np.maximum(noise[: len(position)], _FINEST * position)
 
 
@@ -255,13 +256,14 @@ def starts_about(
 
     Args:
         simulate: as for `Starts`.
-        noise: of positions, `known_noise`; infinite where nobody measured.
+        noise: of channels, `known_noise`, positions first; infinite where nobody
+            measured.
         position, speed: motion of each degree of freedom, ``(nv,)``.
         free: how far what nobody measured may be off, ``(2 nv,)``; infinite elsewhere.
         act: how far activations may be off, ``(na,)``.
         dt: control step [s].
     """
-    known = np.where(np.isfinite(noise), noise, 0.0)
+    known = np.where(np.isfinite(noise), noise, 0.0)[: len(position)]
     small, part = _DIFFERENCE
     wide = np.maximum(_NOISES * known, _MOTION * position)
     # Nothing but the model speaks of what nobody measured.

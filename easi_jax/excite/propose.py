@@ -111,7 +111,7 @@ def propose(
         horizon: of the predictor's windows [s].
         plan: `quick_tests`.
     """
-    scales = scales_of(m, runs)
+    scales, predictor = scales_of(m, runs), predictor.of_positions()
     mine = predictor.layout.where(place) + predictor.own
     base = np.array(x, np.float64)
     base[mine] = predictor.layout.neutral[mine - predictor.own]

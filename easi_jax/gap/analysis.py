@@ -39,6 +39,7 @@ from easi_jax.gap.model_comparison import (
 from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.result import Figures, Found, Numbers, Outcome, Part
 from easi_jax.gap.scales import scales_of
+from easi_jax.gap.sensor_channels import Sensors, measured_sensors
 from easi_jax.gap.table import Place, covered, does
 from easi_jax.gap.verdict import openness, surely_better, verdict_of
 from easi_jax.gap.whitening import make_residuals
@@ -67,6 +68,8 @@ _STEPS_SEEN = 0.75  # of the floor: less is lost in noise
 _WHOLE = 1.15  # of the error of steps; a finer simulation leaves some of it
 _TOLD = 0.8  # of the gap without the own steps' error: worth a note
 _BENT = 0.1  # second beside first differences of errors with a start: not linear
+_EARLY = 0.8  # of the squared error otherwise: readings of before their row's command
+_EXPLAINED = 2.0  # times the squared noise: predicted but for that
 _LET_PASS = 0.05  # of what the model errs by, that no fit hangs on
 
 Tell = Callable[[str], None]
@@ -98,7 +101,7 @@ class Analysis:
         dt = fit[0].dt
         self.lead = lead_rows(dt)
         self.scales = scales_of(mj_model, fit)
-        self.noise = known_noise(np.asarray(noise), self.scales.position)
+        sensors, ignored = measured_sensors(mj_model, self.runs)
         self.everywhere = places(mj_model, self.scales)
         self.places = [p for p in self.everywhere if not covered(p, space, mj_model)]
         self.ripples = [
@@ -108,7 +111,7 @@ class Analysis:
         ]
         layout = Layout(mj_model, [*self.everywhere, *self.ripples])
         self.bounds = bounds_of(space, layout)
-        self.fit_windows, filled, kept = self._windows(fit, held, horizon)
+        self.fit_windows, filled, kept = self._windows(fit, held, horizon, sensors)
         self.predictor = Predictor(
             mj_model,
             space,
@@ -118,12 +121,15 @@ class Analysis:
             fixed,
             Logged.of(self.runs),
             wait,
+            sensors,
         )
+        self.sensors = self.predictor.sensors
+        self._of_all_channels(fit, np.asarray(noise)[: mj_model.nv])
         own = len(filled) // BLOCK
         self.fit_blocks = np.arange(own)
         self.held_blocks = np.arange(own, self.predictor.blocks)
         simulator = self.predictor.simulator
-        self.channels = self._channels(fit, horizon)
+        self.channels = self._channels(fit, horizon, ignored)
         self.step = dt / simulator.substeps
         self.sticks = False  # whether errors bend with starts: see `whiten`
         self.dropped: set[str] = set()  # found, and then found to say nothing
@@ -138,9 +144,7 @@ class Analysis:
             range(space.size),
             progress,
         )
-        self.resolution = np.max([resolutions(run) for run in self.runs], axis=0)
         given = mj_model, self.predictor, fit, self.scales, self.noise
-        self.noise_is_bound = pooled(fit).is_bound[: mj_model.nv]
         self.fit_starts = window_starts(*given, self.fit_blocks, count)
         self.held_out = HeldOut(
             mj_model,
@@ -153,8 +157,22 @@ class Analysis:
             self.resolution,
         )
 
-    def _channels(self, fit: Sequence[Run], horizon: float) -> measure.Channels:
-        """What is compared.
+    def _of_all_channels(self, fit: Sequence[Run], noise: np.ndarray) -> None:
+        """Motion, noise and resolution of positions ``noise (nv,)`` and sensors."""
+        sensors = self.predictor.sensors
+        read = np.concatenate([sensors.readings(run) for run in fit]).std(0)
+        self.motion = np.concatenate([self.scales.position, np.maximum(read, 1e-9)])
+        told, is_bound = sensors.noise(fit)
+        self.noise = known_noise(np.concatenate([noise, told]), self.motion)
+        positions = pooled(fit).is_bound[: self.m.nv]
+        self.noise_is_bound = np.concatenate([positions, is_bound])
+        steps = np.max([resolutions(run) for run in self.runs], axis=0)
+        self.resolution = np.concatenate([steps, sensors.resolution(self.runs)])
+
+    def _channels(
+        self, fit: Sequence[Run], horizon: float, ignored: Mapping[str, str]
+    ) -> measure.Channels:
+        """What is compared; ``ignored`` says what can not be.
 
         Raises:
             UserError: nothing moves.
@@ -166,7 +184,9 @@ class Analysis:
             fit,
             self.noise,
             self.predictor.steps - self.lead,
+            self.sensors,
         )
+        found.ignored.update({**ignored, **self.predictor.unpredicted})
         if not np.isfinite(found.scale).any():
             raise UserError(
                 "nothing moves by more than five times its noise over a horizon of "
@@ -175,7 +195,11 @@ class Analysis:
         return found
 
     def _windows(
-        self, fit: Sequence[Run], held: Sequence[Run], horizon: float
+        self,
+        fit: Sequence[Run],
+        held: Sequence[Run],
+        horizon: float,
+        sensors: Sensors,
     ) -> tuple[WindowSet, WindowSet, WindowSet]:
         """Windows that fits see, the same filled to whole blocks, and those held out.
 
@@ -183,8 +207,8 @@ class Analysis:
             UserError: runs too short.
         """
         m, longest = self.m, self.scales.longest
-        fitted = window_set(m, fit, horizon, longest)
-        kept = window_set(m, held, horizon, longest, len(fit))
+        fitted = window_set(m, fit, horizon, longest, 0, sensors)
+        kept = window_set(m, held, horizon, longest, len(fit), sensors)
         if fitted is None or kept is None:
             what = "to fit" if fitted is None else "held out"
             raise UserError(
@@ -211,7 +235,10 @@ class Analysis:
     @property
     def key(self) -> str:
         """A digest of all that the results depend on, for a `Journal`."""
-        logs = [(run.qpos, run.ctrl, run.time) for run in self.runs]
+        logs = [
+            (run.qpos, run.ctrl, run.time, self.sensors.readings(run))
+            for run in self.runs
+        ]
         windows = self.fit_windows, self.held_out.windows
         model = np.zeros(mujoco.mj_sizeModel(self.m), np.uint8)
         mujoco.mj_saveModel(self.m, None, model)
@@ -247,7 +274,7 @@ class Analysis:
                 "up from the measured states; check its timestep, masses and contacts, "
                 "or shorten --horizon"
             )
-        least = known_noise(self.resolution / math.sqrt(12), self.scales.position)
+        least = known_noise(self.resolution / math.sqrt(12), self.motion)
         starts.noise = better_noise(starts, errors, self.noise, least)
         self.held_out.starts.noise = starts.noise
         self.sticks |= starts.bent > _BENT
@@ -273,11 +300,47 @@ class Analysis:
         low = openness(square, due, self.channels.scale).low
         return bool(np.nanmax(low) <= _CLOSED)
 
+    def _read_early(self) -> list[str]:
+        """Tells which sensors were read before the command of their row was sent, by
+        what the model as given predicts: nearly all, or where readings jump; a note on
+        them."""
+        p, starts, nv = self.predictor, self.fit_starts, self.m.nv
+        if not p.sensors:
+            return []
+        whole, jumps = np.zeros((2, 2, len(p.sensors)))
+        for k, early in enumerate((False, True)):
+            p.early[:] = early
+            _, errors = starts.solve(p.neutral, self.selector.moved)
+            errors = errors[:, self.lead + 1 :, nv:] / self.noise[nv:]
+            whole[k] = np.nanmedian(measure.squares(errors), 0)
+            # What a wrong model errs by is smooth.
+            jumps[k] = np.nanmedian(measure.squares(np.diff(errors, 3, axis=1)), 0)
+        p.early[:] = False
+        of = np.array([n.sensor for n in p.sensors])
+        names = []
+        for name in dict.fromkeys(of.tolist()):
+            mine = of == name
+            after, before = whole[:, mine].mean(1)
+            rough, smooth = jumps[:, mine].mean(1)
+            told = before < min(_EARLY * after, _EXPLAINED)
+            if told or smooth < _EARLY * rough:
+                p.early[mine] = True
+                names.append(name)
+        if not names:
+            return []
+        return [
+            f"sensors read before the command of their row was sent: "
+            f"{', '.join(names)}; compared as such"
+        ]
+
     def _moves_in_the_model(self) -> bool:
-        """Takes channels in that stand still in the log, but not in the model."""
+        """Takes channels in that stand still in the log, but not in the model, and
+        sensors whose noise turns out to be small enough for what they read."""
+        noise = self.noise.copy()
+        noise[self.m.nv :] = self.fit_starts.noise[self.m.nv :]
         errors = self.selector.errors(self.predictor.neutral[None])[0].astype(float)
         moved = errors[:, -1] - errors[:, self.lead]
-        changed = measure.with_moving(self.channels, moved, self.noise)
+        changed = measure.with_moving(self.channels, moved, noise)
         more = changed is not self.channels
         self.channels = self.held_out.channels = changed
         return more
@@ -293,6 +356,8 @@ class Analysis:
             return
         windows, count = self.predictor.windows, len(self.fit_windows)
         error = error_of_steps(self.m, windows, self.predictor.simulator.dt)
+        # What sensors read of it is not told apart.
+        error = np.pad(error, [(0, 0), (0, 0), (0, len(self.sensors))])
         mine = self.fit_starts.left(error[:count])[:, self.lead + 1 :]
         mine = measure.squares(mine).mean(0)
         size = float(measure.gap(mine, self.channels.scale))
@@ -359,6 +424,7 @@ class Analysis:
         began = time.perf_counter()
         own = list(range(self.space.size))
         self.tell("compiling the predictions ...")
+        notes = self._read_early()
         self.whiten(self.predictor.neutral)
         if self._moves_in_the_model():
             self.whiten(self.predictor.neutral)
@@ -381,7 +447,6 @@ class Analysis:
             x[stuck] = self.selector.neutral[stuck]
             model = self.select(self.selector.fit(model.places, x))
         model, rivals = self.exchanged(model)
-        notes: list[str] = []
         for _ in range(_MOST):
             needless = self._needless(model)
             if not needless:
@@ -453,7 +518,7 @@ class Analysis:
         return tuple(map(Part, seen, [*gaps, whole.gap]))
 
     def _squares(self, vectors: Sequence[np.ndarray]) -> np.ndarray:
-        """Mean squares of each held-out window, ``(B, W, nv)``."""
+        """Mean squares of each held-out window, ``(B, W, c)``."""
         return self.held_out.squares(np.array([self._plain(x) for x in vectors]))
 
     def _needless(self, model: Model) -> list[tuple[Place, str]]:
@@ -747,7 +812,7 @@ class Analysis:
 
     def _as_good(self, mine: np.ndarray, theirs: np.ndarray) -> bool:
         """Whether the difference of two held-out gaps may be none, or is in favor;
-        from mean squares of each window, ``(W, nv)``."""
+        from mean squares of each window, ``(W, c)``."""
         scale = self.channels.scale
         weights = measure.resampled(len(mine), 1)
         d = measure.gap(weights @ theirs, scale) - measure.gap(weights @ mine, scale)

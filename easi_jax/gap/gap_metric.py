@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.data.recording import Run
+from easi_jax.gap.sensor_channels import NO_SENSORS, Sensors
 from easi_jax.model.joint_space import (
     FREE_WIDTH,
     dofs,
@@ -25,15 +26,16 @@ _DRAWS = 2000
 
 @dataclass(frozen=True)
 class Channels:
-    """Positions that are compared.
+    """Positions and readings of sensors that are compared, c of them.
 
     Attributes:
-        names: of each degree of freedom, ``(nv,)``.
-        joints: the joint that each belongs to.
-        units: m or rad.
-        scale: errors are divided by it; infinite where left out, ``(nv,)``.
+        names: of each degree of freedom, then of each number of a sensor.
+        joints: the joint that each belongs to, or ``sensor.NAME``.
+        units: SI.
+        scale: errors are divided by it; infinite where left out, ``(c,)``.
         ignored: reason for each that is left out.
-        still: what the scale of a channel that moves too little would be, ``(nv,)``.
+        still: what the scale of a channel that moves too little would be, ``(c,)``.
+        change: RMS of what is measured over a horizon, ``(c,)``.
     """
 
     names: tuple[str, ...]
@@ -42,6 +44,7 @@ class Channels:
     scale: np.ndarray
     ignored: dict[str, str]
     still: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    change: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 def channels(
@@ -50,9 +53,11 @@ def channels(
     runs: Sequence[Run],
     noise: np.ndarray,
     steps: int,
+    sensors: Sensors = NO_SENSORS,
 ) -> Channels:
     """What the gap of these runs is made of.
 
+    ``names`` are those of degrees of freedom, ``noise (c,)`` is of all channels.
     A channel's scale is its standard deviation over all rows, or for one without bounds
     (a free base's x and y, a hinge that turns on) the RMS of its change over ``steps``
     control steps.
@@ -60,17 +65,19 @@ def channels(
     parts, changes = [], []
     for run in runs:
         origin = np.broadcast_to(runs[0].qpos[0], run.qpos.shape)
-        parts.append(run.configuration.difference(origin, run.qpos))
+        difference, read = run.configuration.difference, sensors.readings(run)
+        parts.append(np.c_[difference(origin, run.qpos), read])
         if len(run) > steps:
-            changes.append(
-                run.configuration.difference(run.qpos[:-steps], run.qpos[steps:])
-            )
+            moved = difference(run.qpos[:-steps], run.qpos[steps:])
+            changes.append(np.c_[moved, read[steps:] - read[:-steps]])
     everything = np.concatenate(parts)
     change = np.sqrt(np.mean(np.concatenate(changes) ** 2, 0))
     spread = everything.std(0)
+    names = [*names, *(n.channel for n in sensors)]
     joints = [joint_name(m, j) for j in m.dof_jntid]
-    units = tangent_units(m)
-    unbounded = np.zeros(m.nv, bool)
+    joints += [f"sensor.{n.sensor}" for n in sensors]
+    units = [*tangent_units(m), *(n.unit for n in sensors)]
+    unbounded = np.zeros(len(names), bool)
     for j in range(m.njnt):
         if is_hinge(m, j) and not m.jnt_limited[j]:
             d = int(m.jnt_dofadr[j])
@@ -83,25 +90,30 @@ def channels(
         names[d]: UNMEASURED
         if np.isinf(noise[d])
         else (
-            f"moves by {change[d]:.2g} {units[d]} over a horizon, less than "
-            f"{_VISIBLE:g} times its noise of {noise[d]:.2g} {units[d]}"
+            f"moves by {_size(change[d], units[d])} over a horizon, less than "
+            f"{_VISIBLE:g} times its noise of {_size(noise[d], units[d])}"
         )
         for d in np.flatnonzero(quiet).tolist()
     }
     still = np.maximum(scale, noise)
     scale = np.where(quiet | (scale <= 0), np.inf, scale)
-    return Channels(tuple(names), tuple(joints), tuple(units), scale, ignored, still)
+    known = tuple(names), tuple(joints), tuple(units), scale, ignored
+    return Channels(*known, still, change)
+
+
+def _size(x: float, unit: str) -> str:
+    return f"{x:.2g} {unit}".rstrip()
 
 
 def with_moving(found: Channels, moved: np.ndarray, noise: np.ndarray) -> Channels:
     """The channels with those of no motion in the log that move in the model: a stuck
-    joint is not left out.
+    joint is not left out; nor is one that was left out for a noise that is less.
 
     Args:
-        moved: predicted changes over a horizon, ``(W, nv)``.
-        noise: of measured positions, ``(nv,)``; infinite where not measured.
+        moved: predicted changes over a horizon, ``(W, c)``.
+        noise: of readings, ``(c,)``; infinite where not measured.
     """
-    size = np.sqrt(np.nanmedian(moved**2, 0))
+    size = np.maximum(np.sqrt(np.nanmedian(moved**2, 0)), found.change)
     stuck = ~np.isfinite(found.scale) & np.isfinite(noise) & (size > _VISIBLE * noise)
     if not stuck.any():
         return found
@@ -112,13 +124,13 @@ def with_moving(found: Channels, moved: np.ndarray, noise: np.ndarray) -> Channe
 
 
 def gap(square: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """The gap from mean squares ``(..., nv)`` of each channel."""
+    """The gap from mean squares ``(..., c)`` of each channel."""
     used = np.isfinite(scale)
     return np.sqrt(np.mean(square[..., used] / scale[used] ** 2, -1))
 
 
 def squares(errors: np.ndarray) -> np.ndarray:
-    """Mean squares of each window and channel, ``(W, nv)``, of ``(W, H, nv)``."""
+    """Mean squares of each window and channel, ``(W, c)``, of ``(W, H, c)``."""
     return np.mean(errors.astype(np.float64) ** 2, 1)
 
 
@@ -127,8 +139,8 @@ def finite(errors: np.ndarray, largest: np.ndarray) -> tuple[np.ndarray, np.ndar
     motion, and which windows those are.
 
     Args:
-        errors: ``(..., W, H, nv)``.
-        largest: motion seen in a window, ``(nv,)``.
+        errors: ``(..., W, H, c)``.
+        largest: motion seen in a window, ``(c,)``.
 
     Returns:
         Errors of the same shape, and ``(..., W)`` bool.
@@ -146,7 +158,7 @@ def odd_runs(
     """Runs whose windows are predicted far worse than those of the other runs.
 
     Args:
-        square: mean squares of each window, ``(W, nv)``.
+        square: mean squares of each window, ``(W, c)``.
         run: which run each window is of, ``(W,)``.
 
     Returns:
@@ -196,7 +208,7 @@ def resampled(count: int, seed: int) -> np.ndarray:
 def interval(
     square: np.ndarray, scale: np.ndarray, seed: int = 0
 ) -> tuple[float, float]:
-    """95 % interval of the gap of windows with mean squares ``(W, nv)``."""
+    """95 % interval of the gap of windows with mean squares ``(W, c)``."""
     drawn = gap(resampled(len(square), seed) @ square, scale)
     low, high = np.quantile(drawn, (0.025, 0.975))
     return float(low), float(high)

@@ -28,8 +28,8 @@ class HeldOut:
         channels: that are compared.
         starts: their start states.
         lead: rows before the start that the gap is measured from.
-        resolution: step between two readings, ``(nv,)``.
-        steps: error of the model's own steps, ``(W, T, nv)``; None where it does not
+        resolution: step between two readings of each channel, ``(c,)``.
+        steps: error of the model's own steps, ``(W, T, c)``; None where it does not
             matter.
     """
 
@@ -60,15 +60,15 @@ class HeldOut:
         return self._figures(x, self._fitted(x[None])[1][0], share)
 
     def squares(self, x: np.ndarray, share: float = 0.0) -> np.ndarray:
-        """Mean squares of each window for vectors ``(B, n)``, ``(B, W, nv)``."""
-        out = [np.zeros((0, len(self.windows), self.m.nv))]
+        """Mean squares of each window for vectors ``(B, n)``, ``(B, W, c)``."""
+        out = [np.zeros((0, len(self.windows), self.predictor.channels))]
         for one in x:
             errors = self._fitted(one[None])[1]
             out.append(measure.squares(self._counted(errors, share)[0][0])[None])
         return np.concatenate(out)
 
     def floor(self, x: np.ndarray) -> np.ndarray:
-        """Mean squares of a perfect model, ``(nv,)``, at a vector that was looked at:
+        """Mean squares of a perfect model, ``(c,)``, at a vector that was looked at:
         `easi_jax.estimation.starts.floor`."""
         rng = np.random.default_rng(0)
         got = floor(self.starts, x, self._moved, DRAWS, self.resolution, rng)
@@ -81,7 +81,7 @@ class HeldOut:
     def _counted(
         self, errors: np.ndarray, share: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Errors ``(B, W, H, nv)`` after the start, all finite, and which windows were
+        """Errors ``(B, W, H, c)`` after the start, all finite, and which windows were
         not, ``(B, W)``."""
         if share and self.steps is not None:
             errors = errors - share * self.starts.left(self.steps)

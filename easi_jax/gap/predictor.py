@@ -23,6 +23,7 @@ from easi_jax.devices.distributed import started
 from easi_jax.devices.mesh import make_mesh, sharded_map
 from easi_jax.devices.runtime import fast_loops, on_cpu, quick_compile
 from easi_jax.gap.effect_vector import Layout
+from easi_jax.gap.sensor_channels import NO_SENSORS, SensorReading, Sensors
 from easi_jax.gap.window_set import Rows, WindowSet
 from easi_jax.model import backlash, effects
 from easi_jax.model.backlash import MotorState
@@ -98,7 +99,12 @@ class Predictor:
         neutral: the vector of the model as given.
         wrapped: hinges in whose range a full turn fits, whose errors are wrapped,
             ``(nv,)`` bool.
-        largest: motion that was measured in a window, ``(nv,)``.
+        sensors: whose readings are predicted as well, N numbers; ``unpredicted`` says
+            of others why not, by channel.
+        early: which of them were read before the command of their row was sent,
+            ``(N,)`` bool; the first row of a window is then not compared.
+        channels: numbers that are compared, ``nv + N``.
+        largest: motion that was measured in a window, ``(channels,)``.
         steps: control steps of a window, those before its start counted.
         size: of a start state: positions, velocities, activations, ``2 nv + na``.
     """
@@ -113,13 +119,20 @@ class Predictor:
         fixed: Mapping[str, float] | None = None,
         logged: Logged | None = None,
         wait: Wait = at_once,
+        sensors: Sensors = NO_SENSORS,
     ) -> None:
         """``fixed``: what the machine has and MJCF cannot say, by address; ``logged``:
-        states of the log that the windows are from; ``wait`` shows what compiles."""
+        states of the log that the windows are from; ``wait`` shows what compiles;
+        ``sensors``: that ``windows.sensed`` are of."""
         self._wait = wait
         self.simulator = Simulator(
             opened(mj_model), space, dt, fixed=fixed, logged=logged
         )
+        self.sensors, self.unpredicted = sensors.simulated_by(self.simulator.engine)
+        if self.sensors:
+            self.simulator = self._sensing(mj_model)
+        self.early = np.zeros(len(self.sensors), bool)
+        self._sensed = np.array([n in self.sensors.numbers for n in sensors], bool)
         # Centers of mass move.
         base = self.simulator.base
         self.simulator.base = base.replace(mjx=for_every_effect(base.mjx))
@@ -132,8 +145,11 @@ class Predictor:
         self.wrapped = np.zeros(nv, bool)
         for j in range(m.njnt):
             self.wrapped[dofs(m, j)] = turns_fully(m, j)
+        self.channels = nv + len(self.sensors)
         moved = np.abs(self._unwrapped(windows.read)).max((0, 1))
-        self.largest = np.where(self.wrapped, np.minimum(moved, np.pi), moved)
+        moved = np.where(self.wrapped, np.minimum(moved, np.pi), moved)
+        span = np.ptp(windows.sensed[..., self._sensed], axis=(0, 1))
+        self.largest = np.concatenate([moved, span])
         self._scalar = scalar_places(m).T
         self._mesh = make_mesh()
         engine = self.simulator.engine
@@ -163,11 +179,43 @@ class Predictor:
         self._without = dict(reversed(self._without.items()))
         self._compiled: dict[tuple[str, ...], Callable[[], Any]] = {}
 
+    def _sensing(self, m: mujoco.MjModel) -> Simulator:
+        """The simulator with sensors; of what is not compared MJX knows nothing."""
+        bare, columns = self.simulator, self.sensors.columns
+        out = opened(m)
+        named = {n.sensor for n in self.sensors}
+        for i in range(m.nsensor):
+            if bare.engine == "mjx" and m.sensor(i).name not in named:
+                out.sensor_type[i] = mujoco.mjtSensor.mjSENS_CLOCK
+                out.sensor_needstage[i] = mujoco.mjtStage.mjSTAGE_POS
+        return Simulator(
+            *(out, bare.space, bare.dt, SensorReading(columns), len(columns)),
+            fixed=bare.fixed,
+            engine=bare.engine,
+            logged=bare.logged,
+        )
+
+    @property
+    def _compared(self) -> np.ndarray:
+        """Places of `channels` in what a program returns."""
+        count = len(self.sensors)
+        sensed = self.nv + np.arange(count) + count * self.early
+        return np.concatenate([np.arange(self.nv), sensed])[: self.channels]
+
+    def of_positions(self) -> "Predictor":
+        """The same predictions, of positions alone."""
+        other = copy.copy(self)  # the compiled programs are of both
+        other.channels, other.largest = self.nv, self.largest[: self.nv]
+        return other
+
     def _placed(self, windows: WindowSet) -> tuple[jax.Array, ...]:
         """The windows in blocks, on all devices; the last is repeated to fill them."""
         fill = np.minimum(np.arange(self._room * BLOCK), len(windows) - 1)
         padded = windows.take(fill)
         read = self._unwrapped(padded.read)
+        sensed = np.zeros((*read.shape[:2], len(self.sensors)))
+        if padded.sensed.shape[-1]:  # planned motion has no readings
+            sensed[:] = padded.sensed[..., self._sensed]
         whole = NamedSharding(self._mesh, PartitionSpec())
 
         def blocks(x: np.ndarray) -> jax.Array:
@@ -186,6 +234,8 @@ class Predictor:
                 read,
                 padded.speed,
                 padded.led,
+                sensed,
+                padded.last,
             )
         )
 
@@ -299,14 +349,16 @@ class Predictor:
         )
 
     def _window(self, model: Model, window: tuple, moved: jax.Array) -> jax.Array:
-        """Readings less measurements at each row, ``(H + 1, nv)``.
+        """Readings less measurements at each row, ``(H + 1, nv + 2 N)``: those of
+        sensors where a row's step begins, then where the step before it ends.
 
         Where readings are late, the simulation begins by the longest delay earlier, so
         that it starts from what was read until the window's start. Each joint is
         compared with the readings of the times that are simulated: as far from its
         start as without delays. Where a run only begins, all is later by that delay.
         """
-        start_q, start_act, ctrl, past, past_q, past_v, seen, speed, led = window
+        start_q, start_act, ctrl, past, past_q, past_v, seen, speed, led, *more = window
+        sensed, last = more
         simulator, e, nv = self.simulator, model.effects, self.nv
         assert e is not None
         early = led * jnp.max(e.late)
@@ -317,9 +369,11 @@ class Predictor:
         q = simulator.move(start_q, read[0] - e.bias + moved[:nv])
         physics = simulator.start(q, v + moved[nv : 2 * nv], model)
         physics = physics.replace(memory=(), act=start_act + moved[2 * nv :])
+        # Sensors are read where a step begins, the last of them after the last step.
+        sent = [past, ctrl, last[None]] if self.sensors else [past, ctrl]
         arrived = effects.command_sequence(
             e.replace(delay=e.delay + early),
-            jnp.concatenate([past, ctrl]),
+            jnp.concatenate(sent),
             self._delay_steps,
             simulator.dt,
             simulator.substeps,
@@ -328,23 +382,46 @@ class Predictor:
             before = (past_q, past_v)
             physics = self._turned(model, physics, arrived[: len(past)], *before)
 
-        def step(state: Physics, u: jax.Array) -> tuple:
-            state = arrived_step(model, state, u)
-            return state, state.qpos
+        def physics_step(state: Physics, u: jax.Array) -> tuple:
+            state = arrived_step(model, state, u[None])
+            return state, state.sensed
 
-        sent, at_once = arrived[len(past) :], None
+        def step(state: Physics, u: jax.Array) -> tuple:
+            if not self.sensors:
+                state = arrived_step(model, state, u)
+                return state, (state.qpos, ())
+            state, each = jax.lax.scan(physics_step, state, u)
+            return state, (state.qpos, jnp.stack([each[0], each[-1]]))
+
+        arrived, at_once = arrived[len(past) :], None
         if simulator.engine == "mujoco":
-            at_once = native_step.replay(model, physics, sent)
-        qs = at_once[0] if at_once else jax.lax.scan(step, physics, sent)[1]
+            at_once = native_step.replay(model, physics, arrived)
+        if at_once:
+            qs, _, readings = at_once
+        else:
+            qs, readings = jax.lax.scan(step, physics, arrived)[1]
         # From the start, so that readings are plain numbers also where q is not.
         zero = jnp.zeros(nv)
         difference = jax.vmap(simulator.difference, (None, None, 0, None))
-        qs = jnp.concatenate([q[None], qs])
+        qs = jnp.concatenate([q[None], qs[: len(ctrl)]])
         path = difference(start_q, zero, qs, zero)[:, :nv]
         error = path + e.bias - read
         turn = 2 * jnp.pi
         near = error - turn * jnp.round(error / turn)
-        return jnp.where(self.wrapped, near, error)
+        error = jnp.where(self.wrapped, near, error)
+        if not self.sensors:
+            return error
+        row = start - early / simulator.dt + jnp.arange(self.steps + 1)
+        read = jnp.broadcast_to(row[:, None], (len(row), len(self.sensors)))
+        read = _between(sensed, read)
+        for part in self.sensors.orientations:
+            mine = readings[..., part]
+            mine *= jnp.where(jnp.sum(mine * read[:, None, part], 2) < 0, -1, 1)[
+                ..., None
+            ]
+            readings = readings.at[..., part].set(mine)
+        begins, ends = readings[:, 0] - read, readings[:-1, 1] - read[1:]
+        return jnp.concatenate([error, begins, jnp.pad(ends, [(1, 0), (0, 0)])], 1)
 
     def _turned(
         self, model: Model, first: Physics, arrived: Any, qpos: Any, qvel: Any
@@ -394,8 +471,8 @@ class Predictor:
         windows: np.ndarray | None = None,
         moved: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Predicted readings less measured ones, ``(B, W, H + 1, nv)``: at the start,
-        and after each step.
+        """Predicted readings less measured ones, ``(B, W, H + 1, channels)``: at the
+        start, and after each step.
 
         Args:
             x: vectors, ``(B, n)``.
@@ -415,7 +492,8 @@ class Predictor:
             whole = np.zeros((count, nb * BLOCK, self.size), np.float32)
             whole[:, : moved.shape[1]] = moved
             offsets = whole.reshape(shape)
-        out = np.empty((items, BLOCK, self.steps + 1, self.nv), np.float32)
+        shape = items, BLOCK, self.steps + 1, self.channels
+        out = np.empty(shape, np.float32)
         neutral, left = self.neutral.astype(np.float32), np.ones(items, bool)
         for left_out, columns in self._without.items():
             fits = left & (vectors[:, columns] == neutral[columns]).all(1)
@@ -425,9 +503,9 @@ class Predictor:
             program = self._program(left_out)
             for part in self._batches(np.flatnonzero(fits)):
                 args = vectors[part], which[part], offsets[part]
-                got = program(*args, *self._data)
-                out[part] = np.asarray(got)
-        out = out.reshape(count, nb * BLOCK, self.steps + 1, self.nv)
+                got = np.asarray(program(*args, *self._data))
+                out[part] = got[..., self._compared]
+        out = out.reshape(count, nb * BLOCK, *shape[2:])
         return out[:, : self.count(windows)]
 
     def _batches(self, chosen: np.ndarray) -> list[np.ndarray]:

@@ -17,6 +17,12 @@ from easi_jax.data.cleaning import rows_of
 from easi_jax.data.recording import Run
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.model.joint_space import joint_name
+from easi_jax.model.sensors import (
+    reads_joints,
+    sensor_columns,
+    sensor_kind,
+    sensor_unit,
+)
 
 _LONGEST = 0.1  # s
 _LATE = 0.003  # s; less is the velocity fit's own doing
@@ -76,12 +82,12 @@ def reading_faults(m: mujoco.MjModel, runs: Sequence[Run]) -> list[ReadingFault]
     ]
     asked = [i for i in range(m.nsensor) if m.sensor(i).name and _follows(m, i)]
     unknown = _of_hidden(m, runs[0])
-    asked = [i for i in asked if not unknown[_columns(m, i)].any()]
+    asked = [i for i in asked if not unknown[sensor_columns(m, i)].any()]
     named = {m.sensor(i).name for i in asked}
     used = [r for r in runs if abs(r.dt / runs[0].dt - 1) < _SAME_STEP]
     right = [_expected(m, r) if named & set(r.sensors) else np.empty(0) for r in used]
     for i in asked:
-        name, part = m.sensor(i).name, _columns(m, i)
+        name, part = m.sensor(i).name, sensor_columns(m, i)
         both = [
             (np.asarray(run.sensors[name], float), all_right[:, part])
             for run, all_right in zip(used, right, strict=True)
@@ -92,8 +98,26 @@ def reading_faults(m: mujoco.MjModel, runs: Sequence[Run]) -> list[ReadingFault]
     return out
 
 
-def _columns(m: mujoco.MjModel, i: int) -> slice:
-    return slice(m.sensor_adr[i], m.sensor_adr[i] + m.sensor_dim[i])
+def without_faults(runs: Sequence[Run], faults: Sequence[ReadingFault]) -> list[Run]:
+    """Runs whose named sensors read what they would without ``faults``.
+
+    What is late is read as much later, by linear interpolation; of the last rows, the
+    last reading.
+    """
+    out = []
+    for run in runs:
+        sensors = {k: np.array(v, float) for k, v in run.sensors.items()}
+        for fault in faults:
+            read = sensors.get(fault.at)
+            if read is None:
+                continue
+            bias = [x for k, x in fault.columns.items() if k.startswith("bias")]
+            row = np.arange(len(run))
+            at = row + fault.columns.get("late", 0.0) / run.dt
+            moved = np.stack([np.interp(at, row, x) for x in read.T], 1)
+            sensors[fault.at] = moved - (np.array(bias) if bias else 0.0)
+        out.append(replace(run, sensors=sensors))
+    return out
 
 
 def _late(at: str, seconds: float, std: float, confidence: float) -> ReadingFault:
@@ -107,7 +131,7 @@ def _follows(m: mujoco.MjModel, i: int) -> bool:
     return (
         mujoco.mjtStage(int(m.sensor_needstage[i])) in _STAGES
         and mujoco.mjtDataType(int(m.sensor_datatype[i])) in _KINDS
-        and _kind(m, i) not in _NO_NUMBER
+        and sensor_kind(m, i) not in _NO_NUMBER
     )
 
 
@@ -143,9 +167,9 @@ def _faults(
         sure = (int((shown & (means * bias > 0))[:, large].all(1).sum()) + 1) / (
             PIECES + 2
         )
-        if _kind(m, i) not in _OF_JOINTS:
+        if not reads_joints(m, i):
             sure *= _GEOMETRY
-        unit = _unit(m, i)
+        unit = sensor_unit(m, i)
         many = len(bias) > 1
         words = [f"bias.{k}" if many else "bias" for k in range(len(bias))]
         value = {w: float(b) for w, b in zip(words, bias, strict=True)}
@@ -207,27 +231,6 @@ def _expected(
         mujoco.mj_sensorVel(m, data)
         out[row] = data.sensordata
     return out
-
-
-_LENGTHS = {"FRAMEPOS", "SUBTREECOM", "RANGEFINDER", "TENDONPOS", "TENDONLIMITPOS"}
-_ANGULAR = {"GYRO", "FRAMEANGVEL", "BALLANGVEL"}
-_SPEEDS = {"VELOCIMETER", "FRAMELINVEL", "SUBTREELINVEL", "TENDONVEL"}
-_OF_JOINTS = {"JOINTPOS", "JOINTVEL", "JOINTLIMITPOS", "JOINTLIMITVEL"}
-
-
-def _kind(m: mujoco.MjModel, i: int) -> str:
-    return mujoco.mjtSensor(int(m.sensor_type[i])).name.removeprefix("mjSENS_")
-
-
-def _unit(m: mujoco.MjModel, i: int) -> str:
-    kind = _kind(m, i)
-    if kind in _OF_JOINTS:
-        slide = m.jnt_type[m.sensor_objid[i]] == mujoco.mjtJoint.mjJNT_SLIDE
-        return ("m" if slide else "rad") + ("/s" if kind.endswith("VEL") else "")
-    for kinds, unit in ((_LENGTHS, "m"), (_ANGULAR, "rad/s"), (_SPEEDS, "m/s")):
-        if kind in kinds:
-            return unit
-    return ""
 
 
 @dataclass(frozen=True)

@@ -180,6 +180,7 @@ def telling_traces(o: Outcome, m: mujoco.MjModel, run: Run) -> Traces:
         run: one of the held-out runs, for its control step and joints.
     """
     used = np.isfinite(o.channels.scale)
+    nv = m.nv
     size = (o.before.square[:, used] / o.channels.scale[used] ** 2).mean(1)
     order = np.argsort(size)
     w = order[[int(0.95 * (len(order) - 1)), len(order) // 2, len(order) // 10]]
@@ -189,11 +190,11 @@ def telling_traces(o: Outcome, m: mujoco.MjModel, run: Run) -> Traces:
         origin = np.broadcast_to(m.qpos0, positions.shape)
         seen = run.configuration.difference(origin, positions)
         error = np.concatenate([figures.first[w, None], figures.errors[w]], 1)
-        found.append((seen, seen + error))
+        found.append((seen, seen + error[..., :nv]))
     (measured, before), (_, after) = found
     begin = o.before.conditions.rows.readings[w, 0, 0]
     after = _on_rows(after, last.conditions.rows.readings[w], begin)
-    some = np.flatnonzero(used)[:_SHOWN]
+    some = np.flatnonzero(used[:nv])[:_SHOWN]
     return Traces(
         np.arange(measured.shape[1]) * run.dt,
         measured[..., some],

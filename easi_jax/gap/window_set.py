@@ -11,6 +11,7 @@ from easi_jax.data.activations import activation_guess
 from easi_jax.data.drive_forces import exertion
 from easi_jax.data.recording import Run
 from easi_jax.data.windows import fitted_velocity, lead_rows, make_windows
+from easi_jax.gap.sensor_channels import NO_SENSORS, Sensors
 
 _BEFORE = 0.6  # s before a window in which a drive with play finds its side
 _EXTREME = 4  # for so many, one more that has large forces or speeds
@@ -39,6 +40,10 @@ class WindowSet:
         speed: fitted velocities from ``L + 1`` rows before the start to L after,
             ``(W, 2 L + 2, nv)``; at rest before a run.
         led: whether the run has as many rows before the window as readings can be late.
+        sensed: readings of N numbers of sensors in the rows of ``read``,
+            ``(W, 2 L + 2 + H, N)``.
+        last: command of the row after the last step, which sensors of forces may read
+            there, ``(W, nu)``.
     """
 
     run: np.ndarray
@@ -52,6 +57,8 @@ class WindowSet:
     read: np.ndarray
     speed: np.ndarray
     led: np.ndarray
+    sensed: np.ndarray
+    last: np.ndarray
 
     def __len__(self) -> int:
         return len(self.run)
@@ -87,6 +94,7 @@ def window_set(
     horizon_s: float,
     longest: float,
     first_run: int = 0,
+    sensors: Sensors = NO_SENSORS,
 ) -> WindowSet | None:
     """Windows every half horizon, each inside one run; None where there are none.
 
@@ -94,9 +102,10 @@ def window_set(
         m: the model that was recorded.
         longest: delay of commands and readings that predictions allow for [s].
         first_run: index of the first of ``runs``.
+        sensors: whose readings all of ``runs`` have.
     """
     sets = [
-        _windows_of(m, run, first_run + i, horizon_s, longest)
+        _windows_of(m, run, first_run + i, horizon_s, longest, sensors)
         for i, run in enumerate(runs)
     ]
     sets = [s for s in sets if len(s)]
@@ -104,7 +113,12 @@ def window_set(
 
 
 def _windows_of(
-    m: mujoco.MjModel, run: Run, number: int, horizon_s: float, longest: float
+    m: mujoco.MjModel,
+    run: Run,
+    number: int,
+    horizon_s: float,
+    longest: float,
+    sensors: Sensors,
 ) -> WindowSet:
     late = math.ceil(longest / run.dt - 1e-9)
     past = math.ceil(max(2 * longest, _BEFORE) / run.dt) + 2
@@ -132,6 +146,8 @@ def _windows_of(
         read=run.configuration.difference(run.qpos[start], run.qpos[inside(seen)]),
         speed=moving(start + np.arange(-late - 1, late + 1)),
         led=w.start_row >= late,
+        sensed=sensors.readings(run)[inside(seen)],
+        last=run.ctrl[w.start_row + steps],
     )
 
 

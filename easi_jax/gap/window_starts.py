@@ -28,8 +28,8 @@ def window_starts(
         m: the model that was recorded.
         runs: that say how far activations may be off.
         scales: of the motion in them.
-        noise: of measured positions, ``(nv,)``, above zero; infinite for those that
-            nobody measured.
+        noise: of what is compared, positions first, ``(c,)``, above zero; infinite
+            for those that nobody measured.
         blocks: of the predictor's windows; all where None.
         count: of them that are no fillers; all where None.
     """

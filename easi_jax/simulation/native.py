@@ -8,7 +8,7 @@ each other and of the number of threads.
 
 import threading
 import weakref
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
@@ -165,10 +165,12 @@ class _Host:
         qfrc: np.ndarray | None,
         xfrc: np.ndarray | None,
         every: int,
-        edge: np.ndarray | None = None,
+        edge: np.ndarray | None,
+        ends: Mapping[str, np.ndarray],
     ) -> tuple["_State", np.ndarray, np.ndarray]:
         """Physics steps with commands ``ctrl (N, T, nu)``, other forces held; no joint
-        is faster than ``edge (N, nv)``.
+        is faster than ``edge (N, nv)``. Fields in ``ends (N, T / every, 2, ...)`` are
+        filled with what the first and the last step of each ``every`` compute.
 
         Returns:
             The state after the last, and positions and velocities after each
@@ -184,18 +186,22 @@ class _Host:
         wrong = b.failed.copy()
         try:
             if edge is not None:
-                self._clipped(b, ctrl, every, edge, wrong, qpos, qvel)
-            elif seen == 1 and (steps == 1 or not np.ptp(ctrl, axis=1).any()):
+                self._clipped(b, ctrl, every, edge, wrong, qpos, qvel, ends)
+            elif (
+                seen == 1
+                and not ends
+                and (steps == 1 or not np.ptp(ctrl, axis=1).any())
+            ):
                 batch.bind("ctrl")[:] = ctrl[:, 0]
                 batch.step(nstep=steps)
                 qpos[:, 0], qvel[:, 0] = batch.bind("qpos"), batch.bind("qvel")
             else:
-                self._roll(b, ctrl, every, qpos, qvel)
+                self._roll(b, ctrl, every, qpos, qvel, ends)
         except mujoco_batch.SimulationError as error:
             wrong[error.ids] = True
         wrong |= (batch.warning[:, _BAD] != warned[:, _BAD]).any((1, 2))
         after = self._read(b, state)
-        _lost(wrong, *after[:4], qpos, qvel)
+        _lost(wrong, *after[:4], qpos, qvel, *ends.values())
         return after, qpos, qvel
 
     def seen(
@@ -215,8 +221,10 @@ class _Host:
         xfrc: np.ndarray | None,
         pairs: np.ndarray,
         edge: np.ndarray | None = None,
+        read: Sequence[str] = (),
     ) -> tuple["_State", np.ndarray, np.ndarray]:
-        """One physics step whose contacts are changed where they are made."""
+        """One physics step whose contacts are changed where they are made; fields
+        ``read`` are as it computes them."""
         self._load(b, state, qfrc, xfrc)
         b.batch.bind("ctrl")[:] = ctrl
         d = mujoco.MjData(self.mj)
@@ -232,6 +240,9 @@ class _Host:
             mujoco.mj_step2(m, d)
             mujoco.mj_getState(m, d, row, _ALL)
             b.batch.state[i] = row
+            for name in read:
+                now = b.batch.bind(name)[i]
+                now[...] = np.reshape(getattr(d, name), now.shape)
             wrong[i] = not np.isfinite(d.qacc).all()
         if edge is not None:
             speeds = b.batch.bind("qvel")
@@ -247,16 +258,22 @@ class _Host:
         every: int,
         qpos: np.ndarray,
         qvel: np.ndarray,
+        ends: Mapping[str, np.ndarray],
     ) -> None:
         """In parts, so that what is recorded of all simulations fits in memory."""
-        width = max(1, b.size * (self.mj.nq + self.mj.nv) * every)
+        more = sum(int(np.prod(x.shape[3:], dtype=int)) for x in ends.values())
+        width = max(1, b.size * (self.mj.nq + self.mj.nv + more) * every)
+        record = ("qpos", "qvel", *ends)
         part = every * max(1, _RECORDED // width)
         for at in range(0, ctrl.shape[1], part):
             some = ctrl[:, at : at + part]
-            got = b.batch.rollout(some.shape[1], some, _CTRL, record=("qpos", "qvel"))
+            got = b.batch.rollout(some.shape[1], some, _CTRL, record=record)
             rows = slice(at // every, at // every + some.shape[1] // every)
             qpos[:, rows] = got["qpos"][:, every - 1 :: every]
             qvel[:, rows] = got["qvel"][:, every - 1 :: every]
+            for name, x in ends.items():
+                x[:, rows, 0] = got[name][:, ::every]
+                x[:, rows, 1] = got[name][:, every - 1 :: every]
 
     def _clipped(
         self,
@@ -267,6 +284,7 @@ class _Host:
         wrong: np.ndarray,
         qpos: np.ndarray,
         qvel: np.ndarray,
+        ends: Mapping[str, np.ndarray],
     ) -> None:
         """Step by step: MuJoCo has no limit of a joint's speed."""
         speeds, step = b.batch.bind("qvel"), b.batch.bind("ctrl")
@@ -277,6 +295,10 @@ class _Host:
             except mujoco_batch.SimulationError as error:
                 wrong[error.ids] = True
             np.clip(speeds, -edge, edge, out=speeds)
+            for name, x in ends.items():
+                if t % every == 0:
+                    x[:, t // every, 0] = b.batch.bind(name)
+                x[:, t // every, 1] = b.batch.bind(name)
             if (t + 1) % every == 0:
                 qpos[:, t // every], qvel[:, t // every] = b.batch.bind("qpos"), speeds
 
@@ -448,7 +470,7 @@ class _Call:
         template: of the model.
         words: names of arguments that come as `_words`.
         out: shapes and types of the results, of one simulation; doubles go as words.
-        every, read, stage: as for `run`.
+        every, read, each, stage: as for `run`.
     """
 
     template: Template
@@ -456,6 +478,7 @@ class _Call:
     out: tuple[jax.ShapeDtypeStruct, ...]
     every: int
     read: Any
+    each: bool
     stage: str
 
     @property
@@ -496,8 +519,22 @@ class _Call:
         b = host.ready(tuple(values), models, which)
         bound = [b.batch.bind(name) for name in self.read.fields] if self.read else []
         rows = {name: _rows(x, _OWN[name], lead) for name, x in given.items()}
-        after, qpos, qvel = self._simulated(host, b, rows)
+        seen = rows["ctrl"].shape[1] // self.every
+        shape = (b.size, seen, 2) if self.each else (b.size,)
+        ends = (
+            {
+                name: np.zeros((*shape, *x.shape[1:]))
+                for name, x in zip(self.read.fields, bound, strict=True)
+                if self.each
+            }
+            if self.read
+            else {}
+        )
+        after, qpos, qvel = self._simulated(host, b, rows, ends)
+        if self.each:
+            bound = [x.reshape(-1, *x.shape[3:]) for x in ends.values()]
         sensed = self.read(*bound) if self.read else np.zeros((b.size, 0))
+        sensed = sensed.reshape(*shape, self.read.size if self.read else 0)
         host._back(b)
         results = zip((*after, qpos, qvel, sensed), self.out, strict=True)
         return tuple(_crossing(x.reshape(*lead, *x.shape[1:]), to) for x, to in results)
@@ -511,7 +548,11 @@ class _Call:
         return out
 
     def _simulated(
-        self, host: _Host, b: _Batch, rows: dict[str, np.ndarray]
+        self,
+        host: _Host,
+        b: _Batch,
+        rows: dict[str, np.ndarray],
+        ends: dict[str, np.ndarray],
     ) -> tuple[_State, np.ndarray, np.ndarray]:
         state = _State(*(rows[name] for name in _State._fields))
         if self.stage == "velocity":
@@ -520,8 +561,9 @@ class _Call:
         forces = rows.get("qfrc"), rows.get("xfrc")
         if "pairs" in rows:
             given = (*forces, rows["pairs"], rows.get("edge"))
-            return host.one_by_one(b, state, ctrl[:, 0], *given)
-        more = (*forces, self.every, rows.get("edge"))
+            read = self.read.fields if self.read else ()
+            return host.one_by_one(b, state, ctrl[:, 0], *given, read)
+        more = (*forces, self.every, rows.get("edge"), ends)
         if "count" not in rows:
             return host.steps(b, state, ctrl, *more)
         count = int(rows["count"][0])
@@ -578,6 +620,7 @@ def run(
     stage: str = "step",
     count: jax.Array | None = None,
     edge: jax.Array | None = None,
+    each: bool = False,
 ) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, jax.Array], jax.Array]:
     """Physics steps of MuJoCo C; may be traced, and mapped over any argument.
 
@@ -596,10 +639,13 @@ def run(
         count: physics steps that are taken, ``()``, the same for all that are mapped
             over; T where None. Of later ones the motion is that of the start.
         edge: speeds that joints are clipped to after each physics step, ``(nv,)``.
+        each: ``read`` sees the first and the last step of each ``every``, in place of
+            the last of all.
 
     Returns:
         qpos, qvel, act, warm start and rest after the last step; qpos and qvel after
-        each ``every``, ``(T / every, ...)``; what ``read`` made of the last step.
+        each ``every``, ``(T / every, ...)``; what ``read`` made of the last step, or
+        of two of each ``every``, ``(T / every, 2, size)``.
         Not a number where a simulation failed.
     """
     m = model.template.mj
@@ -608,7 +654,7 @@ def run(
     more = {"qfrc": qfrc, "xfrc": xfrc, "pairs": pairs, "count": count, "edge": edge}
     given |= {name: x for name, x in more.items() if x is not None}
     seen, size = ctrl.shape[0] // every, read.size if read is not None else 0
-    shapes = (seen, m.nq), (seen, m.nv), (size,)
+    shapes = (seen, m.nq), (seen, m.nv), (seen, 2, size) if each else (size,)
     out = [jax.ShapeDtypeStruct(given[x].shape, given[x].dtype) for x in _State._fields]
     out += [jax.ShapeDtypeStruct(shape, state.qpos.dtype) for shape in shapes]
     args = model.changed | given
@@ -618,6 +664,7 @@ def run(
         tuple(out),
         every,
         read,
+        each,
         stage,
     )
     crossed = _calling(call, *jax.tree.map(_words, (model.changed, given)))

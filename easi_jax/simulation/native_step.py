@@ -96,10 +96,12 @@ def steps(model: Any, state: Any, arrived: jax.Array) -> Any:
 
 def replay(
     model: Any, state: Any, arrived: jax.Array, steps: Any = None
-) -> tuple[jax.Array, jax.Array] | None:
+) -> tuple[jax.Array, jax.Array, jax.Array] | None:
     """Positions and velocities ``(H, ...)`` after each of H control steps in which
-    ``arrived (H, substeps, nu)`` reaches the actuators, by one call of MuJoCo; None
-    where it takes more. ``steps``: as for `easi_jax.simulation.open_loop.predict`."""
+    ``arrived (H, substeps, nu)`` reaches the actuators, and what ``model.sense`` reads
+    in the first and the last physics step of each, ``(H, 2, size)``, by one call of
+    MuJoCo; None where it takes more. ``steps``: as for
+    `easi_jax.simulation.open_loop.predict`."""
     if _varies(model):
         return None
     h, substeps, nu = arrived.shape
@@ -107,7 +109,9 @@ def replay(
     ctrl = arrived.reshape(h * substeps, nu)
     count = None if steps is None else jnp.asarray(steps * substeps)
     given = changed, state, ctrl, qfrc, xfrc
-    return native.run(*given, every=substeps, count=count, edge=_edge(model))[1]
+    more = {"read": _reading(model), "edge": _edge(model)}
+    _, path, sensed = native.run(*given, every=substeps, count=count, each=True, **more)
+    return (*path, sensed)
 
 
 def _after(model: Any, state: Any, out: tuple[jax.Array, ...], sensed: Any) -> Any:

@@ -231,7 +231,8 @@ class Simulator:
                 return memory, arrived
 
             arrived = jax.lax.scan(sent, state.memory, ctrl)[1]
-        return native_step.replay(model, state, arrived, steps)
+        found = native_step.replay(model, state, arrived, steps)
+        return found[:2] if found else None
 
     @cached_property
     def state_names(self) -> tuple[str, ...]:

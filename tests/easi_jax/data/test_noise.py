@@ -117,3 +117,15 @@ def test_noise_of_sensors() -> None:
     np.testing.assert_allclose(found["turn"].std, 1e-4, rtol=0.1)
     nothing = np.full((_ROWS, 1), np.nan)
     assert sensor_noise([run, _with(run, dead=nothing)]) == {}
+
+
+def test_jumps_of_commands_are_no_noise_of_torques() -> None:
+    run, rng = _run(100, "smooth", 1e-3, 0.1), np.random.default_rng(2)
+    ctrl = np.repeat(rng.normal(size=(len(run), 1)), 1, 1)
+    run = replace(run, ctrl=ctrl)
+    white = 0.01 * rng.normal(size=(len(run), 2))
+    slow = np.sin(3.0 * run.time)
+    before = np.vstack([ctrl[:1], ctrl[:-1]])[:, 0]
+    torque = np.stack([5.0 * ctrl[:, 0] + slow, -2.0 * before + slow], 1) + white
+    found = sensor_noise([_with(run, torque=torque)])["torque"]
+    np.testing.assert_allclose(found.std, 0.01, rtol=0.1)

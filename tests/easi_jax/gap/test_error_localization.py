@@ -59,6 +59,8 @@ def simulator() -> tuple[WindowSet, list[Run]]:
         read=np.zeros((len(rows), H + 2, 2)),
         speed=run.qvel[rows][:, None],
         led=rows >= 0,
+        sensed=np.zeros((len(rows), H + 2, 0)),
+        last=run.ctrl[rows + H],
     )
     return windows, [run]
 

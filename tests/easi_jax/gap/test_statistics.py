@@ -321,12 +321,16 @@ def test_a_stuck_joint_is_not_left_out() -> None:
     scale = np.array([np.inf, np.inf, np.inf])
     still = np.array([2e-3, 1e-3, np.inf])
     told: dict[str, str] = dict.fromkeys(names, "still")
-    found = measure.Channels(names, names, ("rad",) * 3, scale, told, still)
+    given = names, names, ("rad",) * 3, scale, told, still
+    found = measure.Channels(*given, np.array([4e-3, 2e-3, 0.0]))
     moved = np.array([[0.1, 1e-3, 0.1]] * 20)
     some = measure.with_moving(found, moved, noise)
     assert some.scale.tolist() == [2e-3, np.inf, np.inf]
     assert list(some.ignored) == ["b", "c"]
     assert measure.with_moving(found, 0 * moved, noise) is found
+    quieter = np.array([1e-3, 2e-4, np.inf])  # than it was thought to be
+    some = measure.with_moving(found, 0 * moved, quieter)
+    assert some.scale.tolist() == [np.inf, 1e-3, np.inf]
 
 
 def test_a_run_that_the_others_contradict_is_told() -> None:
