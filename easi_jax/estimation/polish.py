@@ -165,7 +165,9 @@ class _Steps:
         progress = ~is_settled(c.least - cost, cost, _SETTLED, _ROUNDING)
         progressed = jnp.where(better & progress, c.k, c.progressed)
         foretold = -0.5 * gradient @ du
-        done = ~stepping | (better & (foretold < _SETTLED)) | (c.k + 1 >= self.looks)
+        # Parameters may be right while the starts are still as they were measured.
+        still = is_settled(jnp.abs(c.least - cost), cost, _SETTLED, _ROUNDING)
+        done = ~stepping | (still & (foretold < _SETTLED)) | (c.k + 1 >= self.looks)
         done |= c.k - progressed >= _STALE
         raised = raised_to_range(space, at)
         below = (raised != at).any() & stepping

@@ -82,6 +82,17 @@ def test_few_pieces_end_where_all_have_it(problem: Any, run: Any, fits: Any) -> 
     assert (found.raised_hessian == found.hessian).all()
 
 
+def test_starts_are_fitted_where_the_parameters_are_right(
+    problem: Any, run: Any, fits: Any
+) -> None:
+    """Then no step of the parameters gains anything, and all is in the starts."""
+    known = fits[1]
+    found = run(known, problem[2])
+    assert far(found, known) < 0.2
+    assert float(found.cost[0]) > 1.5 * float(known.cost[-1])
+    assert float(found.cost.min()) == pytest.approx(float(known.cost[-1]), rel=1e-3)
+
+
 def looks(problem: Any, found: RefineResult) -> float:
     _, space, pieces = problem
     whole = (1 + space.size + 4) * pieces.count * pieces.horizon
