@@ -6,10 +6,10 @@ Machines of one or two joints are recorded by MuJoCo itself, with the timestep a
 integrator of the owner's model, at control rates from 50 to 1,000 Hz, slow and fast,
 their readings plain, with velocities (also late ones) or in coarse steps; one drive has
 an activation, one joint is read by nobody, one machine is driven by its own readings,
-one runs against its end stop. ``train.gap`` then sees the true model and the logs: its
-gap should be its floor, and the verdict ``no_gap``. With ``--hidden`` the machine has
-an effect that the model lacks, as strong as raises the gap to about three floors, which
-should be found. One line a case is added to ``floor.jsonl``; a run that was stopped
+one runs against its end stop, one slides on a foot. ``train.gap`` then sees the true
+model and the logs: its gap should be its floor, and the verdict ``no_gap``. With
+``--hidden`` the machine has an effect that the model lacks, as strong as raises the gap
+to about three floors, which should be found. One line a case is added to ``floor.jsonl``; a run that was stopped
 goes on, and several share the work by ``--shard``.
 """
 
@@ -32,7 +32,10 @@ from train._command import main
 RATES = (50, 100, 250, 500, 1000)  # Hz
 SPEEDS = {"slow": 1.0, "fast": 3.0}  # of commands
 READINGS = ("plain", "velocities", "late velocities", "coarse")
-MACHINES = ("pendulum", "arm", "servo", "filtered", "coupled", "closed loop", "stop")
+MACHINES = (
+    *("pendulum", "arm", "servo", "filtered", "coupled", "closed loop", "stop"),
+    "foot",
+)
 EFFECTS = ("coulomb_friction", "constant_force", "armature", "actuator_gain")
 NEAR, WIDE, RIGHT, POWER = 0.03, (0.85, 1.2), 0.9, 0.8  # goals
 _SECONDS, _RUNS = 8.0, 3
@@ -112,9 +115,21 @@ def mjcf(machine: str, timestep: float, hidden: str = "", size: float = 0.0) -> 
     if machine == "coupled":
         law = 'joint1="b" joint2="a" polycoef="0 -0.6 0 0 0"'
         coupling = f"<equality><joint {law}/></equality>"
-    limit = 'limited="true" range="-1 0.6"' if machine == "stop" else ""
     joint = {"coulomb_friction": "frictionloss", "armature": "armature"}.get(hidden)
     more = f'{joint}="{size}"' if joint else ""
+    if machine == "foot":
+        return f"""
+<mujoco>
+  <option timestep="{timestep}" integrator="implicitfast"/>
+  <worldbody><geom type="plane" size="9 9 1" friction="0.3" solref="0.05 1"/>
+  <body pos="0 0 0.05">
+    <joint name="a" type="slide" axis="1 0 0" damping="0.5" {more}/>
+    <joint name="b" type="slide" axis="0 0 1"/>
+    <geom name="foot" size="0.05" mass="0.5" friction="0.3" solref="0.05 1"/>
+  </body></worldbody>
+  <actuator><motor name="m" joint="a" gear="4"/></actuator>
+</mujoco>"""
+    limit = 'limited="true" range="-1 0.6"' if machine == "stop" else ""
     m = f"""
 <mujoco>
   <compiler angle="radian"/>

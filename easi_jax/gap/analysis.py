@@ -691,7 +691,7 @@ class Analysis:
         notes, scale = list(notes), self.channels.scale
         before = self.held_out.look(self.predictor.neutral)
         refit = after = self.held_out.look(self._plain(base.fit.x))
-        noise = least = self.held_out.floor(self._plain(base.fit.x))
+        noise = self.held_out.floor(self._plain(base.fit.x))
         open_refit = open_after = openness(refit.square, noise, scale)
         found: list[Found] = []
         if model.places:
@@ -709,9 +709,11 @@ class Analysis:
                     "predicted no better with it, so it is not named; the recordings "
                     "differ, or are too few"
                 )
-                after, noise = refit, least
+                # Also of the noise nothing is kept that the effects made of it.
+                self.whiten(base.fit.x)
+                refit = after = self.held_out.look(self._plain(base.fit.x))
+                noise = self.held_out.floor(self._plain(base.fit.x))
                 open_refit = open_after = openness(refit.square, noise, scale)
-                self.held_out.look(self._plain(base.fit.x))
         last = model if found else base
         share = self._share(last.fit.x)
         fair = self.held_out.figures(self._plain(last.fit.x), share).gap
