@@ -9,8 +9,9 @@ an activation, one joint is read by nobody, one machine is driven by its own rea
 one runs against its end stop, one slides on a foot. ``train.gap`` then sees the true
 model and the logs: its gap should be its floor, and the verdict ``no_gap``. With
 ``--hidden`` the machine has an effect that the model lacks, as strong as raises the gap
-to about three floors, which should be found. One line a case is added to ``floor.jsonl``; a run that was stopped
-goes on, and several share the work by ``--shard``.
+to about three floors, which should be found. One line a case is added to
+``floor.jsonl``; a run that was stopped goes on, and several share the work by
+``--shard``.
 """
 
 import dataclasses
