@@ -169,19 +169,9 @@ def _runs(rows: list[dict[str, Any]]) -> list[str]:
         "in all": "{seconds:.0f} s",
         "other work on the cores": "{load}",
     }
-    slow = {
-        "skipped": "{skipped}",
-        "not reached": "{not_reached}",
-        "in all": "{seconds:.0f} s",
-        "failed, and what came of it": "{after}",
-        "other work on the cores": "{load}",
-    }
-    default = [r for r in rows if "not_reached" not in r]
     return [
         "In a fresh clone, with nothing cached, on 2 cores (goal 600 s):",
-        table(default, columns | timed),
-        "Slow tests, optimized programs, as `make test-slow` runs them:",
-        table([r for r in rows if r not in default], columns | slow),
+        table(rows, columns | timed),
     ]
 
 
