@@ -111,7 +111,7 @@ def run(config: Config) -> None:
     say("\n\n".join(paragraphs(json.loads(path.read_text()))))
     say(f"written: {path}")
     failed = [name for row in rows.values() for name in row["failures"]]
-    if failed or any(row["failed"] for row in rows.values()):
+    if failed:
         raise UserError(f"{len(failed)} tests failed; what they said is in {folder}")
 
 

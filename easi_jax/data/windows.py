@@ -70,7 +70,7 @@ def fitted_velocity(
 def slope_noise(dt: float) -> float:
     """Noise of a velocity of `fitted_velocity` inside a run [1/s], times that of a
     position."""
-    reach = max(int(_FIT_SECONDS / dt + 1e-6), _FIT_ROWS // 2)
+    reach = _reach(dt)
     return float(np.linalg.norm(_derivative_weights(-reach, reach)) / dt)
 
 
@@ -124,12 +124,17 @@ def make_windows(
     )
 
 
+def _reach(dt: float) -> int:
+    """Rows on either side of one that its velocity is fitted to, inside a run."""
+    return max(int(_FIT_SECONDS / dt + 1e-6), _FIT_ROWS // 2)
+
+
 def _fitted_rows(
     rows: int, row: np.ndarray, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """First and last row of each row's own span: within reach, inside the run, at
     least `_FIT_ROWS` rows."""
-    reach = max(int(_FIT_SECONDS / dt + 1e-6), _FIT_ROWS // 2)
+    reach = _reach(dt)
     low = np.minimum(np.maximum(row - reach, 0), max(rows - _FIT_ROWS, 0))
     high = np.maximum(np.minimum(row + reach, rows - 1), min(_FIT_ROWS, rows) - 1)
     return low, high

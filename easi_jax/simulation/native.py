@@ -521,15 +521,10 @@ class _Call:
         rows = {name: _rows(x, _OWN[name], lead) for name, x in given.items()}
         seen = rows["ctrl"].shape[1] // self.every
         shape = (b.size, seen, 2) if self.each else (b.size,)
-        ends = (
-            {
-                name: np.zeros((*shape, *x.shape[1:]))
-                for name, x in zip(self.read.fields, bound, strict=True)
-                if self.each
-            }
-            if self.read
-            else {}
-        )
+        ends = {}
+        if self.each and self.read:
+            named = zip(self.read.fields, bound, strict=True)
+            ends = {name: np.zeros((*shape, *x.shape[1:])) for name, x in named}
         after, qpos, qvel = self._simulated(host, b, rows, ends)
         if self.each:
             bound = [x.reshape(-1, *x.shape[3:]) for x in ends.values()]
