@@ -3,8 +3,9 @@
 Each file's slow tests, and each folder's other tests, are a process of pytest with
 programs optimized as users get them. What ended is a line of
 ``results/slow_tests/parts.jsonl``; a run that was stopped goes on at the part that it
-was in. Parts that failed are run again, and all of them at another commit. At the end
-the lines that tests reach are counted by package.
+was in. Parts that failed are run again, and all of them at another commit unless
+``--since`` names the first whose results still count. At the end the lines that tests
+reach are counted by package.
 """
 
 import dataclasses
@@ -59,6 +60,8 @@ class Config(Share):
     """Whether programs are compiled as users get them, or as quickly as possible."""
     workers: int = 2
     """Processes of pytest at a time."""
+    since: str = ""
+    """A commit: parts that passed at it or at a later one are not run again."""
     out: Path = _FOLDER / "parts.jsonl"
     """Where a line for each part is added."""
     results: Path = RESULTS
@@ -80,7 +83,12 @@ def run(config: Config) -> None:
     tiers = [t for t in TIERS if config.tier in (t, "all")]
     folder = config.out.parent.resolve()
     took = {(r["path"], r["tier"]): r["seconds"] for r in read_rows(config.out)}
-    every = [Part(p, t, commit, config.optimized) for t in tiers for p in _paths(t)]
+    passed = _passed_since(config.since, read_rows(config.out)) if config.since else {}
+    every = [
+        Part(p, t, passed.get((p, t), commit), config.optimized)
+        for t in tiers
+        for p in _paths(t)
+    ]
     # What took longest at an earlier commit goes first.
     every.sort(key=lambda p: -took.get((p.path, p.tier), 0.0))
     solve = functools.partial(_solve, folder=folder)
@@ -113,6 +121,29 @@ def run(config: Config) -> None:
     failed = [name for row in rows.values() for name in row["failures"]]
     if failed:
         raise UserError(f"{len(failed)} tests failed; what they said is in {folder}")
+
+
+def _passed_since(since: str, rows: list[dict[str, Any]]) -> dict[tuple[str, str], str]:
+    """Of parts that passed last, at the commit ``since`` or a later one, that commit.
+
+    Raises:
+        UserError: no such commit.
+    """
+    from easi_jax.errors import UserError
+
+    words = ["git", "rev-list", f"{since}^..HEAD", "--"]
+    done = subprocess.run(
+        words, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
+    )
+    if done.returncode:
+        raise UserError(f"--since {since}: no commit of this checkout with one before")
+    good = set(done.stdout.split())
+    last = {(r["path"], r["tier"]): r for r in rows}
+    return {
+        part: row["commit"]
+        for part, row in last.items()
+        if row["commit"].removesuffix("+") in good and not row["failed"]
+    }
 
 
 def _paths(tier: str) -> list[str]:

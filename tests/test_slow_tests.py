@@ -1,6 +1,7 @@
 """The slow tests' own runner: what ended is kept, what failed is run again."""
 
 import dataclasses
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,8 @@ import pytest
 
 from benchmarks import slow_tests
 from benchmarks._cells import Share, run_cells
+from benchmarks.slow_tests import ROOT
+from easi_jax.errors import UserError
 
 REPORT = """<testsuites><testsuite>
 <testcase classname="tests.train.test_gap" name="test_a" time="2.04"/>
@@ -74,3 +77,28 @@ def test_the_page_adds_up(tmp_path: Path) -> None:
     assert "4 passed, 1 failed" in text and "18 s of 2 processes" in text
     assert "Failed: `f.py::test`" in text and "1 of 3 parts" in text
     assert "| all | 8 | 75 % |" in text
+
+
+def test_what_passed_since_a_commit_counts(tmp_path: Path) -> None:
+    words = ["git", "rev-list", "--max-count=2", "HEAD"]
+    done = subprocess.run(
+        words, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
+    )
+    if done.returncode or len(done.stdout.split()) < 2:
+        pytest.skip("needs a checkout with a history of two commits")
+    head, before = done.stdout.split()
+
+    def row(path: str, commit: str, failed: int = 0) -> dict[str, Any]:
+        return {"path": path, "tier": "slow", "commit": commit, "failed": failed}
+
+    rows = [
+        *(row("old.py", before), row("new.py", head), row("edited.py", head + "+")),
+        *(row("failed.py", head, 1), row("elsewhere.py", "0" * 40)),
+        *(row("failed_later.py", head), row("failed_later.py", head, 1)),
+    ]
+    assert slow_tests._passed_since(head, rows) == {
+        ("new.py", "slow"): head,
+        ("edited.py", "slow"): head + "+",
+    }
+    with pytest.raises(UserError, match="--since nowhere: no commit"):
+        slow_tests._passed_since("nowhere", rows)
