@@ -66,10 +66,12 @@ def opened(m: mujoco.MjModel) -> mujoco.MjModel:
 _PLAY = fields_that_act("drive")
 # What is left out of a program, the quickest one first: a window takes the first that
 # holds all that it has. On native MuJoCo a window is one call unless something depends
-# on the state; drag of bodies is one more call a physics step.
+# on the state; drag of bodies is one more call a physics step, and simulations go one
+# by one where contacts of single pairs differ.
 _LEFT_OUT = {
     "mjx": (_PLAY, ()),
     "mujoco": (
+        native_step.SLOW,
         native_step.STATE_DEPENDENT,
         (*_PLAY, "resistance"),
         _PLAY,

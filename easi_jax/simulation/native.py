@@ -98,9 +98,12 @@ class _Host:
         self._free: list[_Batch] = []
 
     @cached_property
-    def _pairs(self) -> dict[frozenset[int], int]:
-        """The number of each pair of geoms that may touch."""
-        return {frozenset(p): k for k, p in enumerate(pair_ids(self.mj))}
+    def _pairs(self) -> np.ndarray:
+        """The number of each pair of geoms that may touch; -1 of others."""
+        number = np.full((self.mj.ngeom, self.mj.ngeom), -1)
+        for k, (i, j) in enumerate(pair_ids(self.mj)):
+            number[i, j] = number[j, i] = k
+        return number
 
     # Models ------------------------------------------------------------------
 
@@ -166,11 +169,13 @@ class _Host:
         xfrc: np.ndarray | None,
         every: int,
         edge: np.ndarray | None,
+        pairs: np.ndarray | None,
         ends: Mapping[str, np.ndarray],
     ) -> tuple["_State", np.ndarray, np.ndarray]:
         """Physics steps with commands ``ctrl (N, T, nu)``, other forces held; no joint
-        is faster than ``edge (N, nv)``. Fields in ``ends (N, T / every, 2, ...)`` are
-        filled with what the first and the last step of each ``every`` compute.
+        is faster than ``edge (N, nv)``, contacts of pairs are changed by ``pairs (N,
+        K, 3)``. Fields in ``ends (N, T / every, 2, ...)`` are filled with what the
+        first and the last step of each ``every`` compute.
 
         Returns:
             The state after the last, and positions and velocities after each
@@ -185,7 +190,11 @@ class _Host:
         qvel = np.empty((n, seen, self.mj.nv))
         wrong = b.failed.copy()
         try:
-            if edge is not None:
+            if pairs is not None:
+                self._one_by_one(
+                    *(b, ctrl, every, edge, pairs, wrong, qpos, qvel, ends)
+                )
+            elif edge is not None:
                 self._clipped(b, ctrl, every, edge, wrong, qpos, qvel, ends)
             elif (
                 seen == 1
@@ -211,45 +220,6 @@ class _Host:
         self._load(b, state)
         b.batch.forward(stage=int(mujoco.mjtStage.mjSTAGE_VEL))
         return state, state.qpos[:, None], state.qvel[:, None]
-
-    def one_by_one(
-        self,
-        b: _Batch,
-        state: "_State",
-        ctrl: np.ndarray,
-        qfrc: np.ndarray | None,
-        xfrc: np.ndarray | None,
-        pairs: np.ndarray,
-        edge: np.ndarray | None = None,
-        read: Sequence[str] = (),
-    ) -> tuple["_State", np.ndarray, np.ndarray]:
-        """One physics step whose contacts are changed where they are made; fields
-        ``read`` are as it computes them."""
-        self._load(b, state, qfrc, xfrc)
-        b.batch.bind("ctrl")[:] = ctrl
-        d = mujoco.MjData(self.mj)
-        wrong = b.failed.copy()
-        row = np.empty(b.batch.nstate)
-        for i in range(b.size):
-            if wrong[i]:
-                continue
-            m = b.batch.get_model(i)
-            mujoco.mj_setState(m, d, b.batch.state[i], _ALL)
-            mujoco.mj_step1(m, d)
-            _change_contacts(m, d, pairs[i], self._pairs)
-            mujoco.mj_step2(m, d)
-            mujoco.mj_getState(m, d, row, _ALL)
-            b.batch.state[i] = row
-            for name in read:
-                now = b.batch.bind(name)[i]
-                now[...] = np.reshape(getattr(d, name), now.shape)
-            wrong[i] = not np.isfinite(d.qacc).all()
-        if edge is not None:
-            speeds = b.batch.bind("qvel")
-            np.clip(speeds, -edge, edge, out=speeds)
-        after = self._read(b, state)
-        _lost(wrong, *after[:4])
-        return after, after.qpos[:, None], after.qvel[:, None]
 
     def _roll(
         self,
@@ -301,6 +271,45 @@ class _Host:
                 x[:, t // every, 1] = b.batch.bind(name)
             if (t + 1) % every == 0:
                 qpos[:, t // every], qvel[:, t // every] = b.batch.bind("qpos"), speeds
+
+    def _one_by_one(
+        self,
+        b: _Batch,
+        ctrl: np.ndarray,
+        every: int,
+        edge: np.ndarray | None,
+        pairs: np.ndarray,
+        wrong: np.ndarray,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        ends: Mapping[str, np.ndarray],
+    ) -> None:
+        """Simulation by simulation, half a step at a time: contacts are changed where
+        they are made."""
+        d, row = mujoco.MjData(self.mj), np.empty(b.batch.nstate)
+        m = None
+        for i in np.flatnonzero(~wrong).tolist():
+            m = b.batch.get_model(i, m)
+            mujoco.mj_setState(m, d, b.batch.state[i], _ALL)
+            warned = [d.warning[w].number for w in _BAD]
+            for t in range(ctrl.shape[1]):
+                d.ctrl[:] = ctrl[i, t]
+                mujoco.mj_step1(m, d)
+                _change_contacts(m, d, pairs[i], self._pairs)
+                mujoco.mj_step2(m, d)
+                if edge is not None:
+                    np.clip(d.qvel, -edge[i], edge[i], out=d.qvel)
+                k, at = divmod(t, every)
+                for name, x in ends.items():
+                    now = np.reshape(getattr(d, name), x.shape[3:])
+                    if at == 0:
+                        x[i, k, 0] = now
+                    x[i, k, 1] = now
+                if at == every - 1:
+                    qpos[i, k], qvel[i, k] = d.qpos, d.qvel
+            mujoco.mj_getState(m, d, row, _ALL)
+            b.batch.state[i] = row
+            wrong[i] = warned != [d.warning[w].number for w in _BAD]
 
     def _load(
         self,
@@ -374,19 +383,19 @@ def _lost(wrong: np.ndarray, *arrays: np.ndarray) -> None:
 
 
 def _change_contacts(
-    m: mujoco.MjModel, d: mujoco.MjData, factors: np.ndarray, number: dict
+    m: mujoco.MjModel, d: mujoco.MjData, factors: np.ndarray, number: np.ndarray
 ) -> None:
     """As `easi_jax.model.effects.pair_contacts`, between both halves of a step."""
-    if not d.ncon:
+    geoms = d.contact.geom
+    # Contacts of flexes have no two geoms.
+    pair = np.where((geoms >= 0).all(1), number[geoms[:, 0], geoms[:, 1]], -1)
+    (at,) = np.nonzero(pair >= 0)
+    if not len(at):
         return
-    for i in range(d.ncon):
-        contact = d.contact[i]
-        k = number.get(frozenset(contact.geom.tolist()))
-        if k is None:
-            continue
-        contact.friction[:2] *= factors[k, 0]
-        direct = -np.asarray(direct_solref(m, contact.solref))
-        contact.solref[:] = direct * factors[k, 1:]
+    friction, solref = d.contact.friction, d.contact.solref
+    friction[at, :2] *= factors[pair[at], :1]
+    direct = [direct_solref(m, solref[i]) for i in at.tolist()]
+    solref[at] = -np.array(direct) * factors[pair[at], 1:]
     mujoco.mj_makeConstraint(m, d)
     mujoco.mj_island(m, d)
     mujoco.mj_projectConstraint(m, d)
@@ -522,12 +531,15 @@ class _Call:
         seen = rows["ctrl"].shape[1] // self.every
         shape = (b.size, seen, 2) if self.each else (b.size,)
         ends = {}
-        if self.each and self.read:
+        if self.read and (self.each or "pairs" in rows):
             named = zip(self.read.fields, bound, strict=True)
-            ends = {name: np.zeros((*shape, *x.shape[1:])) for name, x in named}
+            size = b.size, seen, 2
+            ends = {name: np.zeros((*size, *x.shape[1:])) for name, x in named}
         after, qpos, qvel = self._simulated(host, b, rows, ends)
         if self.each:
             bound = [x.reshape(-1, *x.shape[3:]) for x in ends.values()]
+        elif ends:
+            bound = [x[:, -1, 1] for x in ends.values()]
         sensed = self.read(*bound) if self.read else np.zeros((b.size, 0))
         sensed = sensed.reshape(*shape, self.read.size if self.read else 0)
         host._back(b)
@@ -554,11 +566,7 @@ class _Call:
             return host.seen(b, state)
         ctrl = rows["ctrl"].astype(np.float64)
         forces = rows.get("qfrc"), rows.get("xfrc")
-        if "pairs" in rows:
-            given = (*forces, rows["pairs"], rows.get("edge"))
-            read = self.read.fields if self.read else ()
-            return host.one_by_one(b, state, ctrl[:, 0], *given, read)
-        more = (*forces, self.every, rows.get("edge"), ends)
+        more = (*forces, self.every, rows.get("edge"), rows.get("pairs"), ends)
         if "count" not in rows:
             return host.steps(b, state, ctrl, *more)
         count = int(rows["count"][0])
@@ -628,8 +636,8 @@ def run(
         every: physics steps between what is returned of the motion; T where None.
         read: see `Reading`; None for nothing.
         pairs: factors on friction, stiffness and damping of the contacts of pairs of
-            geoms (`easi_jax.model.contact_pairs`), ``(K, 3)``; one step then, and
-            simulations one by one, since MuJoCo has no number to write them into.
+            geoms (`easi_jax.model.contact_pairs`), ``(K, 3)``; simulations one by one
+            then, since MuJoCo has no number to write them into.
         stage: "step"; "velocity": nothing moves, and ``read`` sees the state itself.
         count: physics steps that are taken, ``()``, the same for all that are mapped
             over; T where None. Of later ones the motion is that of the start.

@@ -20,11 +20,14 @@ from easi_jax.model.effect_numbers import fields_that_act
 from easi_jax.model.joint_space import scalar_places
 from easi_jax.simulation import native
 
+_AT_PAIRS = ("slip", "give")  # for which MuJoCo is called simulation by simulation
 # Effects in the step that are the same at every state.
-_STEADY = ("coulomb", "damping", "stiffness", "spring", "constant", "force")
-_IN_STEPS = (*fields_that_act("step"), *fields_that_act("drive"), "slip", "give")
+_STEADY = ("coulomb", "damping", "stiffness", "spring", "constant", "force", *_AT_PAIRS)
+_IN_STEPS = (*fields_that_act("step"), *fields_that_act("drive"), *_AT_PAIRS)
 # Those for which MuJoCo is called once a physics step.
 STATE_DEPENDENT = tuple(f for f in _IN_STEPS if f not in _STEADY)
+# Those without which a call goes through all steps of all simulations.
+SLOW = (*STATE_DEPENDENT, *_AT_PAIRS)
 
 
 @flax.struct.dataclass
@@ -68,6 +71,13 @@ def _edge(model: Any) -> Any:
     return model.speed_limit if model.mjx.template.limits_speed else None
 
 
+def _pairs(model: Any) -> Any:
+    """Factors on the contacts of pairs of geoms, where there may be any."""
+    if not {*_AT_PAIRS} & {*_acting(model)}:
+        return None
+    return jnp.concatenate([model.effects.slip[:, None], model.effects.give], 1)
+
+
 def _reading(model: Any) -> Any:
     if model.sense is None:
         return None
@@ -89,6 +99,7 @@ def steps(model: Any, state: Any, arrived: jax.Array) -> Any:
     out, _, sensed = native.run(
         *(changed, state, arrived, qfrc, xfrc),
         read=_reading(model),
+        pairs=_pairs(model),
         edge=_edge(model),
     )
     return _after(model, state, out, sensed)
@@ -109,7 +120,7 @@ def replay(
     ctrl = arrived.reshape(h * substeps, nu)
     count = None if steps is None else jnp.asarray(steps * substeps)
     given = changed, state, ctrl, qfrc, xfrc
-    more = {"read": _reading(model), "edge": _edge(model)}
+    more = {"read": _reading(model), "pairs": _pairs(model), "edge": _edge(model)}
     _, path, sensed = native.run(*given, every=substeps, count=count, each=True, **more)
     return (*path, sensed)
 
@@ -160,19 +171,16 @@ def _one(model: Any, state: Any, ctrl: jax.Array) -> Any:
     d = StepData(
         *(state.qpos, state.qvel, state.act, ctrl), jnp.zeros_like(state.qvel), zero
     )
-    pairs = None
     if acting:
         m, d, rotor = effects.in_step(m, d, e, rotor)  # type: ignore[arg-type]
         if "resistance" in acting:
             places = native.bodies(m, state)
             d = d.replace(**dict(zip(native.PLACES, places, strict=True)))
             d = effects.body_resistance(m, d, e)  # type: ignore[arg-type]
-        if "slip" in acting or "give" in acting:
-            pairs = jnp.concatenate([e.slip[:, None], e.give], 1)
     out, _, sensed = native.run(
         *(m, state, ctrl[None], d.qfrc_applied, d.xfrc_applied),
         read=_reading(model),
-        pairs=pairs,
+        pairs=_pairs(model),
         edge=_edge(model),
     )
     return _after(model, state, out, sensed).replace(rotor=rotor)

@@ -37,6 +37,7 @@ TRAINING = SacConfig(
 class Point:
     qpos: jax.Array
     qvel: jax.Array
+    act: jax.Array = flax.struct.field(default_factory=lambda: jnp.zeros(0))
 
 
 class Push:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from easi_jax.data.segments import Segments
 from easi_jax.errors import UserError
 from easi_jax.io.runs.folder import RunFolder, engine_of
 from easi_jax.model.addresses import describe, split
+from easi_jax.model.contact_pairs import pair_ids
 from easi_jax.model.effect_catalog import CATALOG
 from easi_jax.model.effect_numbers import EFFECT_TABLE
 from easi_jax.model.mjx_model import for_every_effect
@@ -200,7 +202,7 @@ def test_steps_agree_with_the_replay_and_any_number_of_threads(
 
 @pytest.mark.parametrize("slip", [(), ("effect.slip.floor/tip",)])
 def test_speed_limits_clip_each_physics_step(slip: tuple[str, ...]) -> None:
-    """By one call for a replay, unless an effect takes more."""
+    """By one call for a replay, also where contacts of a pair differ."""
     m = _model()
     limit = declare(
         m, "limit", "joint.elbow.speed_limit", nominal=2.0, initial=(0.5, 9.0)
@@ -232,7 +234,46 @@ def test_speed_limits_clip_each_physics_step(slip: tuple[str, ...]) -> None:
         return open_loop.predict(simulator, simulator.model(t), seg)
 
     calls = str(jax.make_jaxpr(replay)(jnp.asarray(rows[0])))
-    assert ("scan" in calls) == bool(slip)
+    assert "scan" not in calls
+
+
+class _Read:
+    """Reads accelerations and forces of a step."""
+
+    fields = ("qacc", "qfrc_constraint")
+    size = 4
+
+    def __call__(self, *given: np.ndarray) -> np.ndarray:
+        return np.concatenate(given, 1)
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_simulations_one_by_one_are_those_at_once(each: bool) -> None:
+    """Contacts of pairs by neutral factors: positions, speeds and what is read."""
+    m = _model()
+    simulator = Simulator(m, ParameterSpace(()), 0.02, engine="mujoco")
+    seg = _segments(m, 3, 60)
+
+    def run(pairs: Any, q: jax.Array, v: jax.Array, u: jax.Array) -> Any:
+        state = simulator.start(q, v)
+        every = 20 if each else None
+        return native.run(
+            *(simulator.base.mjx, state, u),
+            every=every,
+            read=_Read(),
+            pairs=pairs,
+            each=each,
+        )
+
+    neutral = jnp.ones((len(pair_ids(m)), 3))
+    at_once, one_by_one = (
+        jax.jit(jax.vmap(partial(run, p)))(seg.qpos, seg.qvel, seg.ctrl)
+        for p in (None, neutral)
+    )
+    # Only a contact holds the elbow.
+    assert np.abs(at_once[2][..., 3]).max() > 0.1
+    for a, b in zip(*map(jax.tree.leaves, (at_once, one_by_one)), strict=True):
+        np.testing.assert_allclose(b, a, rtol=2e-4, atol=2e-4)
 
 
 def test_models_leave_nothing_to_the_next_ones() -> None:
