@@ -157,28 +157,9 @@ def _spending(found: dict[str, Any]) -> list[str]:
     return said
 
 
-def _runs(rows: list[dict[str, Any]]) -> list[str]:
-    columns = {
-        "command": "`{command}`",
-        "commit": "{commit}",
-        "passed": "{passed}",
-        "failed": "{failed}",
-    }
-    timed = {
-        "pytest": lambda r: f"{r['pytest_s']:.0f} s" if r["pytest_s"] else "",
-        "in all": "{seconds:.0f} s",
-        "other work on the cores": "{load}",
-    }
-    return [
-        "In a fresh clone, with nothing cached, on 2 cores (goal 600 s):",
-        table(rows, columns | timed),
-    ]
-
-
 SECTIONS = (
-    Section("## Time of the tests", "test_runs.jsonl", "where_tests_spend", _runs),
     Section(
-        "",
+        "### What the tests' time goes into",
         {"Before": "test_times_before.json", "Now": "test_times.json"},
         "where_tests_spend",
         _spending,
