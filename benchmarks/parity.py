@@ -124,7 +124,7 @@ def native(m: Any, qpos: Any, qvel: Any, _: Any, ctrl: Any) -> dict[str, Any]:
         except UserError as error:
             return {"native_error": None, "native_refusal": str(error)}
     assert got is not None
-    off = np.abs(np.concatenate(got, -1) - np.array(ends)).max()
+    off = np.abs(np.concatenate(got[:2], -1) - np.array(ends)).max()
     return {"native_error": float(off), "native_refusal": ""}
 
 

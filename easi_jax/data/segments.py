@@ -23,6 +23,9 @@ class Segments:
             simulation has use for them.
         act: activations of the start, ``(M, na)``, of a log a guess; () where the model
             has none. Zero where they are left out.
+        sensed: readings of N numbers of sensors where each step begins, or where it
+            ends (`easi_jax.data.sensor_channels.SensorNumber.at_end`), ``(M, H, N)``;
+            () where none are compared.
     """
 
     qpos: Any
@@ -33,6 +36,7 @@ class Segments:
     weight: Any
     past: Any = ()
     act: Any = ()
+    sensed: Any = ()
 
     @property
     def count(self) -> int:
@@ -67,11 +71,16 @@ def cut(
     past: int = 0,
     act: np.ndarray | None = None,
     before: np.ndarray | None = None,
+    sensed: np.ndarray | None = None,
 ) -> Segments | None:
     """Segments of one uninterrupted recording ``(T, ...)``, None if too short.
 
-    ``past``: how many commands before each start they hold. ``act``: activations at
-    each row, ``(T, na)``. ``before``: commands before the first row, ``(D, nu)``.
+    Args:
+        past: how many commands before each start they hold.
+        act: activations at each row, ``(T, na)``.
+        before: commands before the first row, ``(D, nu)``.
+        sensed: what sensors read where the step of a row begins, or ends,
+            ``(T - 1, N)``.
     """
     starts = np.arange(0, len(qpos) - horizon, every)
     if not len(starts):
@@ -88,6 +97,7 @@ def cut(
         weight=np.ones(len(starts)),
         past=sent[np.maximum(earlier, 0)] if past else (),
         act=act[starts] if act is not None and act.shape[1] else (),
+        sensed=sensed[steps] if sensed is not None and sensed.shape[1] else (),
     )
 
 

@@ -15,6 +15,7 @@ from easi_jax.data.activations import activation_guess, activation_spread
 from easi_jax.data.noise import resolutions
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import Segments, to_device
+from easi_jax.data.sensor_channels import NO_SENSORS, Sensors, read_at_end
 from easi_jax.data.windows import lead_rows
 from easi_jax.devices import distributed
 from easi_jax.devices.mesh import make_mesh, placed, replicated
@@ -64,6 +65,8 @@ _LACKING = 1.5  # times wider spreads, that are worth a note
 _FINISH = 0.5  # s, of pieces in the least-squares finish
 _COMPARED = 8  # runs at most that are fitted alone as well
 _FAR, _DIFFERENT = 5.0, 0.1  # standard deviations, and log ratio, that contradict
+_COMMANDED, _READ = 64, 8  # pieces, and steps at least, that say when sensors were read
+_FINE = 1e-6  # of what a sensor reads: noise of a log that has none
 _OUTLIER = 2.5  # times the median error: windows beyond it weigh less
 
 
@@ -161,12 +164,46 @@ def ready_finish(
     return estimates
 
 
+def _sensors_of(problem: Problem) -> Sensors:
+    """The problem's, with those known that were read before the command of their row
+    was sent, by what the model as given predicts."""
+    sensors, runs = problem.sensors, problem.fit
+    steps = min(max(problem.steps, _READ), max(len(r) for r in runs) - 1)
+    if steps < _READ or not any(n.of_forces for n in sensors):
+        return sensors
+    simulator = problem.simulator.sensing(sensors)
+    given = simulator, runs, steps, steps
+    pieces = segments_from_runs(*given, sensors=sensors)
+    most = min(pieces.count, _COMMANDED)
+    pieces = to_device(pieces.spread(most))
+
+    def sensed(theta: jax.Array) -> jax.Array:
+        model = simulator.model(theta)
+        return open_loop.predict_sensed(simulator, model, pieces)[2]
+
+    nominal = jnp.asarray(problem.simulator.space.nominal, jnp.result_type(float))
+    each = jax.jit(sensed, compiler_options=quick_compile())(nominal)
+    read = pieces.sensed[:, 1:]
+    reading = sensors.reading
+    span = np.ptp(np.asarray(read), axis=(0, 1))
+    size = np.maximum(sensors.noise(runs)[0], _FINE * span)
+    begins, ends = (
+        np.asarray(reading.alike(x, read) - read) / np.maximum(size, 1e-30)
+        for x in (each[:, 1:, 0], each[:, :-1, 1])
+    )
+    of_forces = {n.sensor for n in sensors if n.of_forces}
+    return sensors.ending(
+        [name for name in read_at_end(sensors, begins, ends) if name in of_forces]
+    )
+
+
 class _Finish:
     """The programs of a finish and what they are given.
 
     Attributes:
         whole: all pieces, M of them; `pieces` those that many trials are made with.
         owner: recording of each of ``whole``, ``(M,)``.
+        simulator: reads ``sensors``, N numbers, that are fitted as well.
         hidden: misfit that leaves out velocities that were derived from positions.
         start: what is known of starts.
         doubts: what the model may lack; None where nothing is refined.
@@ -182,7 +219,11 @@ class _Finish:
     ) -> None:
         self.problem, self.search, self.tell = problem, search, tell
         self.refined, self.restarts = refined, restarts
+        self.sensors = _sensors_of(problem) if refined else NO_SENSORS
         simulator = problem.simulator
+        if self.sensors:
+            simulator = simulator.sensing(self.sensors)
+        self.simulator = simulator
         self.doubts = doubts_of(simulator, search.space) if refined else None
         # With commands before each piece, where one that comes late needs them.
         cutting = self.doubts.simulator if self.doubts else simulator
@@ -190,18 +231,20 @@ class _Finish:
         self.steps = min(steps, max(len(r) for r in problem.fit) - 1)
         # Twice over, each counted half: where pieces begin matters less.
         every = max(1, self.steps // 2)
-        whole = segments_from_runs(cutting, problem.fit, self.steps, every)
-        whole = to_device(whole)
+        given = cutting, problem.fit, self.steps, every
+        whole = to_device(segments_from_runs(*given, sensors=self.sensors))
         self.whole = replace(whole, weight=whole.weight * every / self.steps)
         starts = [len(range(0, len(r) - self.steps, every)) for r in problem.fit]
         self.owner = np.repeat([r.recording for r in problem.fit], starts)
         self.pieces = few(simulator, self.whole) if refined else self.whole
-        self.noise = jnp.asarray(problem.noise, jnp.result_type(float))
+        noise = np.concatenate([problem.noise, self.sensors.noise(problem.fit)[0]])
+        self.noise = jnp.asarray(noise, jnp.result_type(float))
         # Velocities derived from the positions say nothing that those do not.
-        seen = np.concatenate([np.ones(simulator.mj_model.nv), problem.measured])
+        nv, count = simulator.mj_model.nv, len(self.sensors)
+        seen = np.concatenate([np.ones(nv), problem.measured, np.ones(count)])
         self.hidden = jnp.asarray(np.where(seen > 0, 0.0, np.inf), self.noise.dtype)
         assumed = effective_noise(simulator, self.whole, self.noise)
-        self.start = start_spread(problem, assumed)
+        self.start = start_spread(problem, assumed[: 2 * nv])
         self.mesh = search.mesh or make_mesh()
 
     def compile(self) -> None:
@@ -218,7 +261,7 @@ class _Finish:
         """What is fitted."""
         search = self.search
         return PairedFit(
-            *(self.problem.simulator, search.space, pieces, self.noise, search.mesh),
+            *(self.simulator, search.space, pieces, self.noise, search.mesh),
             start=self.start,
             misfit=misfit,
         )
@@ -245,8 +288,8 @@ class _Finish:
     def errors(
         self, found: Estimate, pieces: Segments, doubts: Doubts | None = None
     ) -> jax.Array:
-        """Measured less predicted, from the fitted starts, ``(M, H, 2 nv)``."""
-        simulator, space, unit = self.problem.simulator, self.search.space, found.fit
+        """Measured less predicted, from the fitted starts, ``(M, H, 2 nv + N)``."""
+        simulator, space, unit = self.simulator, self.search.space, found.fit
         if doubts is not None:
             simulator, space = doubts.simulator, doubts.space
             unit = space.clip(jnp.concatenate([unit, found.doubts[:, 0]]))
@@ -257,7 +300,10 @@ class _Finish:
 
     def passes(self, mean: Any, cov: Any) -> tuple[Estimate, jax.Array]:
         """The finish of one search, and the weights that its pieces end with."""
-        center, misfit, pieces = mean, self.hidden, self.pieces
+        center, pieces = mean, self.pieces
+        # What sensors read is taken for what the fit to the motion leaves of it.
+        motion = jnp.arange(len(self.hidden)) < len(self.problem.noise)
+        misfit = jnp.where(motion, self.hidden, jnp.inf)
         weighed = pieces
         for k in range(_PASSES):
             given = center, cov, weighed, misfit, 0 if k else _ROBUST, k > 0
@@ -285,7 +331,7 @@ class _Finish:
         self, error: jax.Array, weighed: Segments, pieces: Segments
     ) -> tuple[jax.Array, jax.Array]:
         """What the model errs by, and new weights, from what a fit leaves."""
-        assumed = effective_noise(self.problem.simulator, pieces, self.noise)
+        assumed = effective_noise(self.simulator, pieces, self.noise)
         misfit = misfit_of(error, assumed, weighed.weight)
         misfit = jnp.maximum(misfit, self.hidden)
         return misfit, outlier_weights(error, assumed, misfit, _OUTLIER)
@@ -308,6 +354,12 @@ class _Finish:
                 "something, and parameters take up part of that: their spreads are "
                 f"{times:.2g} times as wide for it. train.gap with these logs names "
                 "what is missing; then give --effects"
+            )
+        early = dict.fromkeys(n.sensor for n in self.sensors if n.at_end)
+        if early:
+            notes.append(
+                "sensors read before the command of their row was sent: "
+                f"{', '.join(early)}; compared as such"
             )
         if self.doubts is not None and found.doubts.size:
             notes += told(self.doubts, np.asarray(found.doubts, float))

@@ -10,6 +10,7 @@ from easi_jax.data.activations import activation_guess
 from easi_jax.data.cleaning import _STEPS_AGREE, trusted_velocity
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import Segments, cut, join, windows
+from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.errors import UserError
 from easi_jax.simulation.open_loop import motion
@@ -53,6 +54,7 @@ def segments_from_runs(
     horizon: int,
     every: int,
     fitted: bool = False,
+    sensors: Sensors = NO_SENSORS,
 ) -> Segments:
     """Segments of ``horizon`` control steps, none across two runs.
 
@@ -61,6 +63,7 @@ def segments_from_runs(
         every: steps from one start to the next.
         fitted: take all velocities from the positions, measured ones too, as the
             error measure of the log format does.
+        sensors: whose readings they have.
 
     Raises:
         UserError: no run is longer than ``horizon`` steps.
@@ -77,7 +80,7 @@ def segments_from_runs(
         )
         act = activation_guess(simulator.mj_model, run)
         given = run.qpos, qvel, run.ctrl, horizon, every, simulator.past_steps
-        parts.append(cut(*given, act, run.before))
+        parts.append(cut(*given, act, run.before, _read_in_steps(sensors, run)))
     whole = [p for p in parts if p is not None]
     if not whole:
         longest = max(runs, key=len)
@@ -87,6 +90,12 @@ def segments_from_runs(
             "shorten --horizon"
         )
     return join(whole)
+
+
+def _read_in_steps(sensors: Sensors, run: Run) -> np.ndarray:
+    """What was read of each step of a run, ``(T - 1, N)``."""
+    read = sensors.readings(run)
+    return np.where(sensors.at_end, read[1:], read[:-1])
 
 
 def finish_pieces(
@@ -143,7 +152,8 @@ def finish_rest(
 def effective_noise(
     simulator: Simulator, segments: Segments, noise: jax.Array
 ) -> jax.Array:
-    """Noise ``(2 nv,)``, not below a thousandth of the motion's RMS per channel."""
+    """Noise ``(2 nv,)``, and of sensors, not below a thousandth of the motion's RMS per
+    channel."""
     moved = motion(simulator, segments)
     w = segments.weight[:, None, None]
     square = (moved**2 * w).sum((0, 1)) / jnp.maximum(w.sum() * moved.shape[1], 1.0)

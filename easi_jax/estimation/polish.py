@@ -28,6 +28,7 @@ _LOOKS = 8, 48  # at most: at the fit, then after each step; with doubts
 _STALE = 6  # looks without progress that end it
 _ROUNDING = 3e-6  # of the cost, that single precision takes for progress
 _SETTLED = 0.01  # of the cost, that the next step is foretold to gain
+_STARTED = 1e-4  # of the cost: what starts gain by that says nothing of a misfit
 _STEPPING, _RAISING, _FINISHED = range(3)
 _PULL = 0.1  # information added to a unit coordinate, for what the data do not show
 _BEGUN = 1e-6  # damping of the first step
@@ -166,7 +167,7 @@ class _Steps:
         progressed = jnp.where(better & progress, c.k, c.progressed)
         foretold = -0.5 * gradient @ du
         # Parameters may be right while the starts are still as they were measured.
-        still = is_settled(jnp.abs(c.least - cost), cost, _SETTLED, _ROUNDING)
+        still = is_settled(jnp.abs(c.least - cost), cost, _SETTLED, _STARTED)
         done = ~stepping | (still & (foretold < _SETTLED)) | (c.k + 1 >= self.looks)
         done |= c.k - progressed >= _STALE
         raised = raised_to_range(space, at)

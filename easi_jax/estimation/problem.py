@@ -10,6 +10,7 @@ import numpy as np
 from easi_jax.data.cleaning import true_readings, trusted_velocity
 from easi_jax.data.measured import MeasuredRuns
 from easi_jax.data.recording import Run
+from easi_jax.data.sensor_channels import Sensors, measured_sensors
 from easi_jax.data.unmeasured import hidden_in_any
 from easi_jax.data.windows import lead_rows
 from easi_jax.errors import UserError
@@ -35,6 +36,7 @@ class Problem:
         noise: standard deviations of positions and velocities, ``(2 nv,)``; infinite
             where hidden.
         measured: velocities that were measured and can be trusted, ``(nv,)`` bool.
+        sensors: whose readings the finish fits, too.
         piece: control steps of a piece in the search.
         steps: control steps of the open-loop error that is reported.
         horizon: the same in seconds.
@@ -48,6 +50,7 @@ class Problem:
     held_name: str
     noise: np.ndarray
     measured: np.ndarray
+    sensors: Sensors
     piece: int
     steps: int
     horizon: float
@@ -107,6 +110,7 @@ def problem_of(
     logged = Logged.of([*fit, *held])
     simulator = Simulator(mj_model, space, fit[0].dt, fixed=fixed, logged=logged)
     measured, doubted = _measured(simulator, fit, hidden)
+    sensors, sensed = _sensors(simulator, fit)
     steps = max(1, round(seconds / simulator.dt))
     _check_lengths(fit, held, steps, simulator.dt)
     short = horizon is None
@@ -118,6 +122,7 @@ def problem_of(
         runs.held_name,
         scatter,
         measured,
+        sensors,
         visible_steps(fit, scatter, steps, _ABOVE_NOISE) if short else steps,
         steps,
         steps * simulator.dt,
@@ -130,8 +135,25 @@ def problem_of(
             ),
             *simulator.notes,
             *doubted,
+            *sensed,
         ],
     )
+
+
+def _sensors(simulator: Simulator, runs: Sequence[Run]) -> tuple[Sensors, list[str]]:
+    """Named sensors that take part, and notes on which do and why others do not."""
+    known, ignored = measured_sensors(simulator.mj_model, runs)
+    sensors, unpredicted = known.simulated_by(simulator.engine)
+    # What never moves says nothing of the parameters.
+    read = np.concatenate([sensors.readings(run) for run in runs])
+    moves = np.ptp(read, axis=0) > 0
+    still = dict.fromkeys(n.sensor for n, m in zip(sensors, moves, strict=True) if m)
+    sensors = Sensors(tuple(n for n in sensors if n.sensor in still))
+    names = dict.fromkeys(n.sensor for n in sensors)
+    notes = [f"sensors that are fitted as well: {', '.join(names)}"] if names else []
+    why = {c.split(".")[1]: text for c, text in {**ignored, **unpredicted}.items()}
+    notes += [f"sensor {name} is not fitted: {text}" for name, text in why.items()]
+    return sensors, notes
 
 
 def _noise_of(name: str, runs: MeasuredRuns, noise: Sequence[float]) -> np.ndarray:

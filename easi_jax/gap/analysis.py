@@ -16,6 +16,7 @@ import numpy as np
 
 from easi_jax.data.noise import pooled, resolutions
 from easi_jax.data.recording import Run, physics_steps
+from easi_jax.data.sensor_channels import Sensors, measured_sensors, read_at_end
 from easi_jax.data.windows import lead_rows
 from easi_jax.errors import UserError
 from easi_jax.estimation.least_squares import AT_BOUND
@@ -39,7 +40,6 @@ from easi_jax.gap.model_comparison import (
 from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.result import Figures, Found, Numbers, Outcome, Part
 from easi_jax.gap.scales import scales_of
-from easi_jax.gap.sensor_channels import Sensors, measured_sensors
 from easi_jax.gap.table import Place, covered, does
 from easi_jax.gap.verdict import openness, surely_better, verdict_of
 from easi_jax.gap.whitening import make_residuals
@@ -68,8 +68,6 @@ _STEPS_SEEN = 0.75  # of the floor: less is lost in noise
 _WHOLE = 1.15  # of the error of steps; a finer simulation leaves some of it
 _TOLD = 0.8  # of the gap without the own steps' error: worth a note
 _BENT = 0.1  # second beside first differences of errors with a start: not linear
-_EARLY = 0.8  # of the squared error otherwise: readings of before their row's command
-_EXPLAINED = 2.0  # times the squared noise: predicted but for that
 _LET_PASS = 0.05  # of what the model errs by, that no fit hangs on
 
 Tell = Callable[[str], None]
@@ -302,30 +300,17 @@ class Analysis:
 
     def _read_early(self) -> list[str]:
         """Tells which sensors were read before the command of their row was sent, by
-        what the model as given predicts: nearly all, or where readings jump; a note on
-        them."""
+        what the model as given predicts; a note on them."""
         p, starts, nv = self.predictor, self.fit_starts, self.m.nv
         if not p.sensors:
             return []
-        whole, jumps = np.zeros((2, 2, len(p.sensors)))
-        for k, early in enumerate((False, True)):
+        found = []
+        for early in (False, True):
             p.early[:] = early
             _, errors = starts.solve(p.neutral, self.selector.moved)
-            errors = errors[:, self.lead + 1 :, nv:] / self.noise[nv:]
-            whole[k] = np.nanmedian(measure.squares(errors), 0)
-            # What a wrong model errs by is smooth.
-            jumps[k] = np.nanmedian(measure.squares(np.diff(errors, 3, axis=1)), 0)
-        p.early[:] = False
-        of = np.array([n.sensor for n in p.sensors])
-        names = []
-        for name in dict.fromkeys(of.tolist()):
-            mine = of == name
-            after, before = whole[:, mine].mean(1)
-            rough, smooth = jumps[:, mine].mean(1)
-            told = before < min(_EARLY * after, _EXPLAINED)
-            if told or smooth < _EARLY * rough:
-                p.early[mine] = True
-                names.append(name)
+            found.append(errors[:, self.lead + 1 :, nv:] / self.noise[nv:])
+        names = read_at_end(p.sensors, *found)
+        p.early[:] = [n.sensor in names for n in p.sensors]
         if not names:
             return []
         return [

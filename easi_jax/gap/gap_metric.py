@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.data.recording import Run
-from easi_jax.gap.sensor_channels import NO_SENSORS, Sensors
+from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
 from easi_jax.model.joint_space import (
     FREE_WIDTH,
     dofs,

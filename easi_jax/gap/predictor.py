@@ -19,11 +19,11 @@ import mujoco
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
+from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
 from easi_jax.devices.distributed import started
 from easi_jax.devices.mesh import make_mesh, sharded_map
 from easi_jax.devices.runtime import fast_loops, on_cpu, quick_compile
 from easi_jax.gap.effect_vector import Layout
-from easi_jax.gap.sensor_channels import NO_SENSORS, SensorReading, Sensors
 from easi_jax.gap.window_set import Rows, WindowSet
 from easi_jax.model import backlash, effects
 from easi_jax.model.backlash import MotorState
@@ -132,7 +132,7 @@ class Predictor:
         )
         self.sensors, self.unpredicted = sensors.simulated_by(self.simulator.engine)
         if self.sensors:
-            self.simulator = self._sensing(mj_model)
+            self.simulator = self.simulator.sensing(self.sensors)
         self.early = np.zeros(len(self.sensors), bool)
         self._sensed = np.array([n in self.sensors.numbers for n in sensors], bool)
         # Centers of mass move.
@@ -180,22 +180,6 @@ class Predictor:
                 self._without[left_out] = np.array(told, int)
         self._without = dict(reversed(self._without.items()))
         self._compiled: dict[tuple[str, ...], Callable[[], Any]] = {}
-
-    def _sensing(self, m: mujoco.MjModel) -> Simulator:
-        """The simulator with sensors; of what is not compared MJX knows nothing."""
-        bare, columns = self.simulator, self.sensors.columns
-        out = opened(m)
-        named = {n.sensor for n in self.sensors}
-        for i in range(m.nsensor):
-            if bare.engine == "mjx" and m.sensor(i).name not in named:
-                out.sensor_type[i] = mujoco.mjtSensor.mjSENS_CLOCK
-                out.sensor_needstage[i] = mujoco.mjtStage.mjSTAGE_POS
-        return Simulator(
-            *(out, bare.space, bare.dt, SensorReading(columns), len(columns)),
-            fixed=bare.fixed,
-            engine=bare.engine,
-            logged=bare.logged,
-        )
 
     @property
     def _compared(self) -> np.ndarray:
@@ -416,12 +400,7 @@ class Predictor:
         row = start - early / simulator.dt + jnp.arange(self.steps + 1)
         read = jnp.broadcast_to(row[:, None], (len(row), len(self.sensors)))
         read = _between(sensed, read)
-        for part in self.sensors.orientations:
-            mine = readings[..., part]
-            mine *= jnp.where(jnp.sum(mine * read[:, None, part], 2) < 0, -1, 1)[
-                ..., None
-            ]
-            readings = readings.at[..., part].set(mine)
+        readings = self.sensors.reading.alike(readings, read[:, None])
         begins, ends = readings[:, 0] - read, readings[:-1, 1] - read[1:]
         return jnp.concatenate([error, begins, jnp.pad(ends, [(1, 0), (0, 0)])], 1)
 

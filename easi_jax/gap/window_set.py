@@ -10,8 +10,8 @@ import numpy as np
 from easi_jax.data.activations import activation_guess
 from easi_jax.data.drive_forces import exertion
 from easi_jax.data.recording import Run
+from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
 from easi_jax.data.windows import fitted_velocity, lead_rows, make_windows
-from easi_jax.gap.sensor_channels import NO_SENSORS, Sensors
 
 _BEFORE = 0.6  # s before a window in which a drive with play finds its side
 _EXTREME = 4  # for so many, one more that has large forces or speeds

@@ -23,18 +23,42 @@ def predict(
     ``steps``: how many control steps are simulated, all H by default; the others hold
     the start.
     """
-    model = simulator.without_sense(model)  # only controllers read it
+    # Nothing but a controller reads it.
+    model = simulator.without_sense(model)
+    return _predicted(simulator, model, segments, steps)[:2]
 
+
+def predict_sensed(
+    simulator: Simulator,
+    model: Any,
+    segments: Segments,
+    steps: int | jax.Array | None = None,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`predict`, and what is sensed in the first and the last physics step of each
+    control step, ``(M, H, 2, N)``; zero where nothing is simulated."""
+    return _predicted(simulator, model, segments, steps)
+
+
+def _predicted(
+    simulator: Simulator,
+    model: Any,
+    segments: Segments,
+    steps: int | jax.Array | None,
+) -> tuple[jax.Array, jax.Array, Any]:
     def one(
         qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array, past: Any, act: Any
     ) -> Any:
         def step(state: Any, u: jax.Array) -> Any:
-            state = simulator.step(model, state, u)
-            return state, (state.qpos, state.qvel)
+            if model.sense is None:
+                state, sensed = simulator.step(model, state, u), ()
+            else:
+                state, sensed = simulator.sensed_step(model, state, u)
+            return state, (state.qpos, state.qvel, sensed)
 
         known = None if isinstance(act, tuple) else act
         first = simulator.start(qpos, qvel, act=known)
-        first = dataclasses.replace(first, sensed=())
+        if model.sense is None:
+            first = dataclasses.replace(first, sensed=())
         if not isinstance(past, tuple):
             first = simulator.after(model, first, past)
         at_once = simulator.replay(model, first, ctrl, steps)
@@ -42,9 +66,10 @@ def predict(
             return at_once
         if steps is None:
             return jax.lax.scan(step, first, ctrl)[1]
+        nothing = () if model.sense is None else jnp.zeros((2, *first.sensed.shape))
         begun = jax.tree.map(
             lambda x: jnp.broadcast_to(x, (ctrl.shape[0], *x.shape)),
-            (first.qpos, first.qvel),
+            (first.qpos, first.qvel, nothing),
         )
 
         def at(i: jax.Array, carry: Any) -> Any:
@@ -69,7 +94,8 @@ def prediction_residuals(
 
 
 def errors(simulator: Simulator, model: Any, segments: Segments) -> jax.Array:
-    """Measured minus predicted, ``(M, H, 2 nv)``."""
+    """Measured minus predicted, ``(M, H, 2 nv)``, and of N numbers of sensors where the
+    segments have readings, ``(M, H, 2 nv + N)``."""
     return errors_from(simulator, model, segments, segments)
 
 
@@ -80,22 +106,41 @@ def errors_from(
     measured: Segments,
     steps: int | jax.Array | None = None,
 ) -> jax.Array:
-    """Measured minus what is predicted from other starts, ``(M, H, 2 nv)``; ``steps``
-    as in `predict`."""
+    """`errors` of what is predicted from other starts; ``steps`` as in `predict`."""
     target = (measured.next_qpos, measured.next_qvel)
-    return prediction_residuals(
-        simulator, predict(simulator, model, starts, steps), target
+    if not _senses(measured):
+        return prediction_residuals(
+            simulator, predict(simulator, model, starts, steps), target
+        )
+    *states, each = predict_sensed(simulator, model, starts, steps)
+    reading = simulator.base.sense
+    sensed = reading.alike(reading.chosen(each), measured.sensed)
+    return jnp.concatenate(
+        [
+            prediction_residuals(simulator, (states[0], states[1]), target),
+            measured.sensed - sensed,
+        ],
+        -1,
     )
 
 
+def _senses(segments: Segments) -> bool:
+    return not isinstance(segments.sensed, tuple)
+
+
 def motion(simulator: Simulator, segments: Segments) -> jax.Array:
-    """Measured change since the segment's start, ``(M, H, 2 nv)``."""
+    """Measured change since the segment's start, ``(M, H, 2 nv)``; of readings of
+    sensors since the first, ``(M, H, 2 nv + N)``."""
 
     def one(s: Segments) -> jax.Array:
         diff = jax.vmap(simulator.difference, in_axes=(None, None, 0, 0))
         return diff(s.qpos, s.qvel, s.next_qpos, s.next_qvel)
 
-    return jax.vmap(one)(segments)
+    moved = jax.vmap(one)(segments)
+    if not _senses(segments):
+        return moved
+    change = segments.sensed - segments.sensed[:, :1]
+    return jnp.concatenate([moved, change], -1)
 
 
 def features(simulator: Simulator, segments: Segments) -> jax.Array:

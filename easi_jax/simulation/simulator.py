@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.data.recording import physics_steps
+from easi_jax.data.sensor_channels import Sensors, only_read
 from easi_jax.devices.runtime import on_cpu
 from easi_jax.errors import UserError
 from easi_jax.model import effects
@@ -29,7 +30,14 @@ from easi_jax.model.torque_speed import TorqueSpeed
 from easi_jax.simulation import native_step
 from easi_jax.simulation.engine import Engine, resolved
 from easi_jax.simulation.logged import Logged, apart_in, apart_note
-from easi_jax.simulation.step import WRITTEN_OUT, Physics, at_rest, control_step
+from easi_jax.simulation.step import (
+    WRITTEN_OUT,
+    Physics,
+    arrived_step,
+    arriving,
+    at_rest,
+    control_step,
+)
 
 # Small enough for XLA to run a simulation as one piece (see `runtime`).
 _BATCH = 128  # of a Cartpole, tried by hand
@@ -177,6 +185,24 @@ class Simulator:
             self.logged,
         )
 
+    def sensing(self, sensors: Sensors) -> "Simulator":
+        """The same machine, which reads some numbers of named sensors.
+
+        On MJX other sensors are left out: they would be compiled, too.
+        """
+        m, reading = self.mj_model, sensors.reading
+        return Simulator(
+            only_read(m, sensors) if self.engine == "mjx" else m,
+            self.space,
+            self.dt,
+            reading,
+            len(sensors),
+            self.base.torque_speed,
+            self.fixed,
+            self.engine,
+            self.logged,
+        )
+
     def model(self, theta: jax.Array) -> Model:
         """The model at parameters ``theta`` ``(n,)`` in SI units."""
         return with_parameters(self.base, theta)
@@ -212,12 +238,27 @@ class Simulator:
         """One control step with ``ctrl`` ``(nu,)`` held."""
         return control_step(model, state, ctrl, self.substeps)
 
+    def sensed_step(
+        self, model: Model, state: Physics, ctrl: jax.Array
+    ) -> tuple[Physics, jax.Array]:
+        """One control step, and what is sensed in its first and its last physics step,
+        ``(2, sense_size)``."""
+        arrived, memory = arriving(model, state, ctrl, self.substeps)
+
+        def step(s: Physics, u: jax.Array) -> tuple[Physics, jax.Array]:
+            s = arrived_step(model, s, u[None])
+            return s, s.sensed
+
+        after, each = jax.lax.scan(step, state.replace(memory=()), arrived)
+        return after.replace(memory=memory), jnp.stack([each[0], each[-1]])
+
     def replay(
         self, model: Model, state: Physics, ctrl: jax.Array, steps: Any = None
-    ) -> tuple[jax.Array, jax.Array] | None:
-        """Positions and velocities ``(H, ...)`` after each of the commands
-        ``(H, nu)``, where the engine has a call for all of them; else None. ``steps``:
-        as for `easi_jax.simulation.open_loop.predict`."""
+    ) -> tuple[jax.Array, jax.Array, jax.Array] | None:
+        """Positions and velocities ``(H, ...)`` after each of the commands ``(H, nu)``,
+        and what is sensed in the first and the last physics step of each, ``(H, 2,
+        sense_size)``, where the engine has a call for all of them; else None.
+        ``steps``: as for `easi_jax.simulation.open_loop.predict`."""
         if self.engine != "mujoco":
             return None
         e, substeps = model.effects, self.substeps
@@ -231,8 +272,7 @@ class Simulator:
                 return memory, arrived
 
             arrived = jax.lax.scan(sent, state.memory, ctrl)[1]
-        found = native_step.replay(model, state, arrived, steps)
-        return found[:2] if found else None
+        return native_step.replay(model, state, arrived, steps)
 
     @cached_property
     def state_names(self) -> tuple[str, ...]:

@@ -217,21 +217,30 @@ _batched_substep = scalarized(substep, otherwise=partial(substep, wide=True))
 
 def control_step(model: Any, state: Physics, ctrl: jax.Array, substeps: int) -> Physics:
     """Holds ``ctrl`` ``(nu,)`` for ``substeps`` physics steps."""
-    if model.effects is None or not effects.has_command_memory(model.present):
-        if isinstance(model.mjx, NativeModel):
-            held = jnp.broadcast_to(ctrl, (substeps, *ctrl.shape))
-            return arrived_step(model, state, held)
+    if isinstance(model.mjx, NativeModel) or _remembers(model):
+        arrived, memory = arriving(model, state, ctrl, substeps)
+        bare = state.replace(memory=())
+        return arrived_step(model, bare, arrived).replace(memory=memory)
 
-        def step(s: Physics, _: None) -> tuple[Physics, None]:
-            return _batched_substep(model, s, ctrl), None
+    def step(s: Physics, _: None) -> tuple[Physics, None]:
+        return _batched_substep(model, s, ctrl), None
 
-        return jax.lax.scan(step, state, None, length=substeps)[0]
+    return jax.lax.scan(step, state, None, length=substeps)[0]
 
+
+def _remembers(model: Any) -> bool:
+    return model.effects is not None and effects.has_command_memory(model.present)
+
+
+def arriving(
+    model: Any, state: Physics, ctrl: jax.Array, substeps: int
+) -> tuple[jax.Array, Any]:
+    """What reaches the actuators in each physics step of a control step, ``(substeps,
+    nu)``, and the memory of commands after it."""
+    if not _remembers(model):
+        return jnp.broadcast_to(ctrl, (substeps, *ctrl.shape)), state.memory
     dt = model.mjx.opt.timestep * substeps
-    arrived, memory = effects.commands(model.effects, state.memory, ctrl, dt, substeps)
-
-    bare = state.replace(memory=())
-    return arrived_step(model, bare, arrived).replace(memory=memory)
+    return effects.commands(model.effects, state.memory, ctrl, dt, substeps)
 
 
 def arrived_step(model: Any, state: Physics, arrived: jax.Array) -> Physics:

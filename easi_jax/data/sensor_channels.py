@@ -1,9 +1,11 @@
 """Named sensors as channels: what was read, and what a simulation reads."""
 
+import copy
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco.mjx._src.types import SensorType
@@ -18,6 +20,8 @@ _ORIENTATION = {"FRAMEQUAT", "BALLQUAT"}
 _NOT_ON_MJX = {"CAMPROJECTION", "CONTACT", "RANGEFINDER", "TACTILE"}
 _ON_MJX = {kind.name for kind in SensorType} - _NOT_ON_MJX
 _ACCELERATION = mujoco.mjtStage.mjSTAGE_ACC
+_EARLY = 0.8  # of the squared error otherwise: readings of before their row's command
+_EXPLAINED = 2.0  # times the squared noise: predicted but for that
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,8 @@ class SensorNumber:
         column: place in ``sensordata``.
         kind: type, as MuJoCo names it.
         of_forces: whether commands show in it at once, as in torques.
+        at_end: whether it was read before the command of its row was sent, at the end
+            of the step before.
     """
 
     sensor: str
@@ -40,6 +46,7 @@ class SensorNumber:
     column: int
     kind: str
     of_forces: bool
+    at_end: bool = False
 
 
 @dataclass(frozen=True)
@@ -60,6 +67,11 @@ class Sensors:
         return tuple(n.column for n in self)
 
     @property
+    def at_end(self) -> np.ndarray:
+        """Which were read at the end of the step before their row, ``(N,)`` bool."""
+        return np.array([n.at_end for n in self], bool)
+
+    @property
     def orientations(self) -> list[slice]:
         """Where quaternions are among the numbers."""
         return [
@@ -67,6 +79,16 @@ class Sensors:
             for i, n in enumerate(self)
             if n.kind in _ORIENTATION and n.index == 0
         ]
+
+    @property
+    def reading(self) -> "SensorReading":
+        """What a simulation reads."""
+        first = tuple(part.start for part in self.orientations)
+        return SensorReading(self.columns, first, tuple(self.at_end.tolist()))
+
+    def ending(self, names: Sequence[str]) -> "Sensors":
+        """The same, those of some sensors `SensorNumber.at_end`."""
+        return Sensors(tuple(replace(n, at_end=n.sensor in names) for n in self))
 
     def readings(self, run: Run) -> np.ndarray:
         """What was read, ``(T, N)``; quaternions of one sign."""
@@ -109,9 +131,17 @@ NO_SENSORS = Sensors()
 
 @dataclass(frozen=True)
 class SensorReading:
-    """Reads some numbers of ``sensordata`` on either engine."""
+    """Reads N numbers of ``sensordata`` on either engine.
+
+    Attributes:
+        columns: their places there.
+        quaternions: where quaternions begin among them.
+        at_end: which are compared at the end of a control step, not where it begins.
+    """
 
     columns: tuple[int, ...]
+    quaternions: tuple[int, ...] = ()
+    at_end: tuple[bool, ...] = ()
 
     def __call__(self, _: Any, data: Any) -> Any:
         return data.sensordata[np.array(self.columns, int)]
@@ -120,6 +150,60 @@ class SensorReading:
     def native(self) -> "_NativeReading":
         """The same of native MuJoCo (`easi_jax.simulation.native.Reading`)."""
         return _NativeReading(self.columns)
+
+    def alike(self, simulated: Any, read: Any) -> Any:
+        """Numbers ``(..., N)`` of a simulation, quaternions of the sign that is nearer
+        to what was ``read (..., N)``."""
+        for first in self.quaternions:
+            part = slice(first, first + 4)
+            mine = simulated[..., part]
+            product = jnp.sum(mine * read[..., part], -1, keepdims=True)
+            sign = jnp.where(product < 0, -1, 1)
+            simulated = simulated.at[..., part].set(sign * mine)
+        return simulated
+
+    def chosen(self, each: Any) -> Any:
+        """Of numbers where steps begin and where they end ``(..., 2, N)``, those that
+        are compared, ``(..., N)``."""
+        ends = np.array(self.at_end or (False,) * len(self.columns), bool)
+        return jnp.where(ends, each[..., 1, :], each[..., 0, :])
+
+
+def only_read(m: mujoco.MjModel, sensors: Sensors) -> mujoco.MjModel:
+    """A copy of a model in which other sensors read nothing but the time."""
+    out, named = copy.deepcopy(m), {n.sensor for n in sensors}
+    for i in range(m.nsensor):
+        if m.sensor(i).name not in named:
+            out.sensor_type[i] = mujoco.mjtSensor.mjSENS_CLOCK
+            out.sensor_needstage[i] = mujoco.mjtStage.mjSTAGE_POS
+    return out
+
+
+def read_at_end(sensors: Sensors, begins: np.ndarray, ends: np.ndarray) -> list[str]:
+    """Names of sensors that were read before the command of their row was sent: nearly
+    all of their readings are predicted so, or they are where readings jump.
+
+    Args:
+        begins, ends: errors of a model in units of the noise, ``(W, T, N)``, readings
+            compared where steps begin and where the step before ends.
+    """
+
+    def squares(errors: np.ndarray) -> np.ndarray:
+        return np.nanmedian(np.mean(errors.astype(float) ** 2, 1), 0)
+
+    of = np.array([n.sensor for n in sensors])
+    names = []
+    for name in dict.fromkeys(of.tolist()):
+        after, before = (squares(e[..., of == name]).mean() for e in (begins, ends))
+        # What a wrong model errs by is smooth.
+        rough, smooth = (
+            squares(np.diff(e[..., of == name], 3, axis=1)).mean()
+            for e in (begins, ends)
+        )
+        told = before < min(_EARLY * after, _EXPLAINED)
+        if told or smooth < _EARLY * rough:
+            names.append(name)
+    return names
 
 
 @dataclass(frozen=True)

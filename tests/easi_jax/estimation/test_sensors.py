@@ -1,0 +1,179 @@
+"""Named sensors in the fit of parameters."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from easi_jax.data.measured import MeasuredRuns
+from easi_jax.data.recording import Run
+from easi_jax.data.segments import to_device
+from easi_jax.data.sensor_channels import NO_SENSORS
+from easi_jax.estimation import from_runs
+from easi_jax.estimation.normal_equations import PairedFit
+from easi_jax.estimation.pieces import segments_from_runs
+from easi_jax.estimation.problem import Problem, problem_of
+from easi_jax.model.distribution import covariance
+from easi_jax.model.joint_space import Configuration
+from easi_jax.model.parameters import ParameterSpace, declare
+from easi_jax.search.config import SearchConfig
+from easi_jax.search.easi import Search
+from easi_jax.simulation import engine, open_loop
+
+_DT, _ROWS = 0.01, 300
+_NOISE = np.array([2e-4, 2e-3])  # rad, rad/s
+_TORQUE, _RATE = 0.02, 0.01  # N m, rad/s
+# All that moves the joint may be twice as strong where it is twice as heavy.
+_XML = """<mujoco><option timestep="0.005" integrator="implicitfast"/>
+  <worldbody><body name="rod"><joint name="j" axis="0 1 0" damping="0.06"/>
+    <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.5"/>
+    <site name="s" pos="0 0 -.3"/></body></worldbody>
+  <actuator><motor name="a" joint="j" gear="2"/></actuator>
+  <sensor><jointactuatorfrc name="torque" joint="j"/><gyro name="rate" site="s"/>
+    <framequat name="turn" objtype="site" objname="s"/><clock name="time"/></sensor>
+</mujoco>"""
+_PLACES = {
+    "mass": ("body.rod.mass", 0.5),
+    "damping": ("joint.j.damping", 0.06),
+    "gear": ("actuator.a.gear", 2.0),
+}
+
+
+def _recorded(m: mujoco.MjModel, seed: int, early: bool = False) -> Run:
+    """Of MuJoCo C alone. ``early``: sensors read before the command of their row."""
+    rng, d = np.random.default_rng(seed), mujoco.MjData(m)
+    ctrl = np.repeat(rng.uniform(-0.6, 0.6, (_ROWS // 5, 1)), 5, 0)
+    q, v = np.empty((2, _ROWS, 1))
+    read: dict[str, list[Any]] = {"torque": [], "rate": [], "turn": [], "time": []}
+
+    def sense() -> None:
+        for name, rows in read.items():
+            rows.append(d.sensor(name).data.copy())
+
+    for k, u in enumerate(ctrl):
+        if early:
+            sense()
+        d.ctrl[:] = u
+        mujoco.mj_forward(m, d)
+        if not early:
+            sense()
+        q[k], v[k] = d.qpos, d.qvel
+        mujoco.mj_step(m, d, 2)
+    size = {"torque": _TORQUE, "rate": _RATE, "turn": 1e-3, "time": 0.0}
+    sensors = {
+        name: np.array(rows) + size[name] * rng.normal(size=np.shape(rows))
+        for name, rows in read.items()
+    }
+    q += _NOISE[0] * rng.normal(size=q.shape)
+    v += _NOISE[1] * rng.normal(size=v.shape)
+    time, shape = _DT * np.arange(_ROWS), Configuration.of(m)
+    name = f"r{seed}"
+    return Run(name, name, _DT, time, q, v, True, ctrl, shape, sensors=sensors)
+
+
+def _problem(early: bool = False, name: engine.Engine = "mujoco") -> Problem:
+    m = mujoco.MjModel.from_xml_string(_XML)
+    space = ParameterSpace(
+        tuple(
+            declare(m, name, address, nominal=value, initial=(value / 3, 3 * value))
+            for name, (address, value) in _PLACES.items()
+        )
+    )
+    fit, held = ([_recorded(m, seed, early)] for seed in (0, 1))
+    runs = MeasuredRuns(tuple(fit), _NOISE, fit, held, "r", [])
+    with engine.using(name):
+        return problem_of("rod", m, space, runs)
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    return _problem()
+
+
+def test_which_take_part_and_why_others_do_not(problem: Problem) -> None:
+    names = [n.sensor for n in problem.sensors]
+    assert names == ["torque", *3 * ["rate"], *4 * ["turn"]]
+    assert "sensors that are fitted as well: torque, rate, turn" in problem.notes
+    (why,) = (n for n in problem.notes if "sensor time is not fitted" in n)
+    assert "no simulation predicts this kind of sensor (CLOCK)" in why
+
+
+@pytest.mark.parametrize("name", ["mujoco", "mjx"])
+def test_what_is_predicted_is_what_mujoco_reads(name: engine.Engine) -> None:
+    problem = _problem(name=name)
+    simulator = problem.simulator.sensing(problem.sensors)
+    given = simulator, problem.fit, 5, 50
+    pieces = to_device(segments_from_runs(*given, sensors=problem.sensors))
+    theta = jnp.asarray(simulator.space.nominal)
+    each = jax.jit(
+        lambda p: open_loop.predict_sensed(simulator, simulator.model(theta), p)[2]
+    )(pieces)
+    m = problem.simulator.mj_model
+    columns = list(problem.sensors.columns)
+    for i in range(pieces.count):
+        d = mujoco.MjData(m)
+        d.qpos[:], d.qvel[:] = pieces.qpos[i], pieces.qvel[i]
+        for k in range(5):
+            d.ctrl[:] = pieces.ctrl[i, k]
+            for part in range(2):
+                mujoco.mj_step(m, d)
+                np.testing.assert_allclose(
+                    each[i, k, part], d.sensordata[columns], rtol=1e-4, atol=1e-4
+                )
+    moved = open_loop.motion(simulator, pieces)
+    assert moved.shape == (pieces.count, 5, 2 + len(columns))
+
+
+@pytest.mark.parametrize("early", [False, True])
+def test_readings_of_before_their_command_are_recognised(early: bool) -> None:
+    found = from_runs._sensors_of(_problem(early))
+    at_end = {n.sensor for n in found if n.at_end}
+    assert at_end == ({"torque"} if early else set())
+
+
+def test_a_torque_says_how_strong_all_of_it_is(problem: Problem) -> None:
+    """Motion shows ratios only."""
+    simulator = problem.simulator.sensing(problem.sensors)
+    space = simulator.space
+    unit = space.to_unit(jnp.asarray(space.nominal))
+    known = []
+    for machine, sensors in (
+        (problem.simulator, NO_SENSORS),
+        (simulator, problem.sensors),
+    ):
+        given = machine, problem.fit, 20, 20
+        pieces = to_device(segments_from_runs(*given, sensors=sensors))
+        noise = np.concatenate([_NOISE, sensors.noise(problem.fit)[0]])
+        paired = PairedFit(
+            *(machine, space, pieces, jnp.asarray(noise)), start=jnp.asarray(_NOISE)
+        )
+        hessian = np.asarray(jax.jit(paired.information)(unit), float)
+        known.append(np.sqrt(np.ones(3) @ hessian @ np.ones(3)))
+    assert known[1] > 50 * known[0]
+
+
+def test_the_finish_finds_all_of_it(problem: Problem) -> None:
+    """Though a gyro reads half a radian a second too much."""
+    space = problem.simulator.space
+    (run,) = problem.fit
+    wrong = {**run.sensors, "rate": np.asarray(run.sensors["rate"]) + 0.5}
+    problem = replace(problem, fit=[replace(run, sensors=wrong)])
+    config = SearchConfig(source="replay", horizon=problem.piece, population=4)
+    search = Search(problem.simulator, config)
+    finish = from_runs.ready_finish(problem, search)
+    truth = space.to_unit(jnp.asarray(space.nominal))
+    mean = truth + jnp.array([0.2, 0.25, 0.15])
+    ((found,), notes) = finish(mean[None], 0.01 * jnp.eye(3)[None])
+    off = np.asarray(found.distribution.mean - truth, float)
+    std = np.sqrt(np.diag(covariance(found.distribution)))
+    assert (np.abs(off) < 3.5 * std).all(), (off, std)
+    assert (std < 0.02).all(), std
+    assert not any("before the command" in n for n in notes)
+    rate = [i for i, n in enumerate(problem.sensors) if n.sensor == "rate"]
+    torque = [i for i, n in enumerate(problem.sensors) if n.sensor == "torque"]
+    misfit = np.asarray(found.misfit)[2:]
+    assert misfit[rate].max() > 0.4 and misfit[torque].max() < _TORQUE
