@@ -10,7 +10,7 @@ import numpy as np
 from easi_jax.data.cleaning import true_readings, trusted_velocity
 from easi_jax.data.measured import MeasuredRuns
 from easi_jax.data.recording import Run
-from easi_jax.data.sensor_channels import Sensors, measured_sensors
+from easi_jax.data.sensor_channels import NO_SENSORS, Sensors, measured_sensors
 from easi_jax.data.unmeasured import hidden_in_any
 from easi_jax.data.windows import lead_rows
 from easi_jax.errors import UserError
@@ -36,11 +36,11 @@ class Problem:
         noise: standard deviations of positions and velocities, ``(2 nv,)``; infinite
             where hidden.
         measured: velocities that were measured and can be trusted, ``(nv,)`` bool.
-        sensors: whose readings the finish fits, too.
         piece: control steps of a piece in the search.
         steps: control steps of the open-loop error that is reported.
         horizon: the same in seconds.
         notes: what the user should know of the data.
+        sensors: whose readings the finish fits, too.
     """
 
     name: str
@@ -50,11 +50,11 @@ class Problem:
     held_name: str
     noise: np.ndarray
     measured: np.ndarray
-    sensors: Sensors
     piece: int
     steps: int
     horizon: float
     notes: list[str]
+    sensors: Sensors = NO_SENSORS
 
 
 def checked_horizon(horizon: float | None) -> float:
@@ -122,7 +122,6 @@ def problem_of(
         runs.held_name,
         scatter,
         measured,
-        sensors,
         visible_steps(fit, scatter, steps, _ABOVE_NOISE) if short else steps,
         steps,
         steps * simulator.dt,
@@ -137,6 +136,7 @@ def problem_of(
             *doubted,
             *sensed,
         ],
+        sensors,
     )
 
 

@@ -113,7 +113,7 @@ def errors_from(
             simulator, predict(simulator, model, starts, steps), target
         )
     *states, each = predict_sensed(simulator, model, starts, steps)
-    reading = simulator.base.sense
+    reading: Any = simulator.base.sense
     sensed = reading.alike(reading.chosen(each), measured.sensed)
     return jnp.concatenate(
         [

@@ -156,6 +156,7 @@ def test_a_torque_says_how_strong_all_of_it_is(problem: Problem) -> None:
     assert known[1] > 50 * known[0]
 
 
+@pytest.mark.slow
 def test_the_finish_finds_all_of_it(problem: Problem) -> None:
     """Though a gyro reads half a radian a second too much."""
     space = problem.simulator.space
