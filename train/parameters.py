@@ -137,6 +137,7 @@ def _information(config: Config, m: Any, proposals: list[Any]) -> Any:
     from easi_jax.data.cleaning import to_common_step
     from easi_jax.data.noise import pooled_noise
     from easi_jax.data.segments import to_device
+    from easi_jax.data.sensor_channels import moving_sensors
     from easi_jax.estimation.from_runs import spread_of_starts
     from easi_jax.estimation.normal_equations import PairedFit
     from easi_jax.estimation.pieces import effective_noise, segments_from_runs
@@ -152,12 +153,17 @@ def _information(config: Config, m: Any, proposals: list[Any]) -> Any:
         say(f"note: {note}")
     space = space_of(proposals)
     simulator = Simulator(m, space, runs[0].dt, logged=Logged.of(runs))
-    for note in simulator.notes:
+    sensors, sensed = moving_sensors(m, runs, simulator.engine)
+    for note in (*simulator.notes, *sensed):
         say(f"note: {note}")
+    if sensors:
+        simulator = simulator.sensing(sensors)
+    noise = np.concatenate([noise, sensors.noise(runs)[0]])
     steps = max(1, round(_HORIZON / simulator.dt))
-    pieces = to_device(segments_from_runs(simulator, runs, steps, steps))
+    given = simulator, runs, steps, steps
+    pieces = to_device(segments_from_runs(*given, sensors=sensors))
     noise = effective_noise(simulator, pieces, jnp.asarray(noise, jnp.float32))
-    start = spread_of_starts(m, runs, noise, np.ones(m.nv, bool))
+    start = spread_of_starts(m, runs, noise[: 2 * m.nv], np.ones(m.nv, bool))
     unit = space.to_unit(jnp.asarray(space.nominal))
     unit = jnp.where(jnp.isfinite(unit), unit, 0.5)
     say("Fisher information of the logs ...")

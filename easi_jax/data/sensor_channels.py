@@ -245,6 +245,24 @@ def measured_sensors(
     return Sensors(tuple(numbers)), ignored
 
 
+def moving_sensors(
+    m: mujoco.MjModel, runs: Sequence[Run], engine: str
+) -> tuple[Sensors, list[str]]:
+    """Sensors that say something of a model's parameters, and notes on which these are
+    and why others are not among them."""
+    known, ignored = measured_sensors(m, runs)
+    sensors, unpredicted = known.simulated_by(engine)
+    read = np.concatenate([sensors.readings(run) for run in runs])
+    moves = np.ptp(read, axis=0) > 0
+    moving = {n.sensor for n, move in zip(sensors, moves, strict=True) if move}
+    sensors = Sensors(tuple(n for n in sensors if n.sensor in moving))
+    names = dict.fromkeys(n.sensor for n in sensors)
+    notes = [f"sensors that are fitted as well: {', '.join(names)}"] if names else []
+    why = {c.split(".")[1]: text for c, text in {**ignored, **unpredicted}.items()}
+    notes += [f"sensor {name} is not fitted: {text}" for name, text in why.items()]
+    return sensors, notes
+
+
 def _why_not(m: mujoco.MjModel, i: int, runs: Sequence[Run]) -> str:
     """Why a sensor is not compared; empty where it is."""
     name, kind = m.sensor(i).name, sensor_kind(m, i)

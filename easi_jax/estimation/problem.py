@@ -10,7 +10,7 @@ import numpy as np
 from easi_jax.data.cleaning import true_readings, trusted_velocity
 from easi_jax.data.measured import MeasuredRuns
 from easi_jax.data.recording import Run
-from easi_jax.data.sensor_channels import NO_SENSORS, Sensors, measured_sensors
+from easi_jax.data.sensor_channels import NO_SENSORS, Sensors, moving_sensors
 from easi_jax.data.unmeasured import hidden_in_any
 from easi_jax.data.windows import lead_rows
 from easi_jax.errors import UserError
@@ -110,7 +110,7 @@ def problem_of(
     logged = Logged.of([*fit, *held])
     simulator = Simulator(mj_model, space, fit[0].dt, fixed=fixed, logged=logged)
     measured, doubted = _measured(simulator, fit, hidden)
-    sensors, sensed = _sensors(simulator, fit)
+    sensors, sensed = moving_sensors(mj_model, fit, simulator.engine)
     steps = max(1, round(seconds / simulator.dt))
     _check_lengths(fit, held, steps, simulator.dt)
     short = horizon is None
@@ -138,22 +138,6 @@ def problem_of(
         ],
         sensors,
     )
-
-
-def _sensors(simulator: Simulator, runs: Sequence[Run]) -> tuple[Sensors, list[str]]:
-    """Named sensors that take part, and notes on which do and why others do not."""
-    known, ignored = measured_sensors(simulator.mj_model, runs)
-    sensors, unpredicted = known.simulated_by(simulator.engine)
-    # What never moves says nothing of the parameters.
-    read = np.concatenate([sensors.readings(run) for run in runs])
-    moves = np.ptp(read, axis=0) > 0
-    still = dict.fromkeys(n.sensor for n, m in zip(sensors, moves, strict=True) if m)
-    sensors = Sensors(tuple(n for n in sensors if n.sensor in still))
-    names = dict.fromkeys(n.sensor for n in sensors)
-    notes = [f"sensors that are fitted as well: {', '.join(names)}"] if names else []
-    why = {c.split(".")[1]: text for c, text in {**ignored, **unpredicted}.items()}
-    notes += [f"sensor {name} is not fitted: {text}" for name, text in why.items()]
-    return sensors, notes
 
 
 def _noise_of(name: str, runs: MeasuredRuns, noise: Sequence[float]) -> np.ndarray:

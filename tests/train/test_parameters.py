@@ -4,6 +4,7 @@ from importlib import resources
 from pathlib import Path
 
 import mujoco
+import numpy as np
 import pytest
 
 from easi_jax.io.models.parameter_file import read_parameter_file
@@ -172,3 +173,38 @@ def test_warnings_of_mujoco_are_notes_and_no_file(
     assert told.out.count("MuJoCo warned") == 1 and "close to singular" in told.out
     assert "WARNING" not in told.err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["p.yaml", "play.xml"]
+
+
+ROD = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>
+  <body name="rod"><joint name="swing" axis="0 1 0" damping="0.06"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".5"/></body></worldbody>
+  <actuator><motor name="drive" joint="swing" gear="2"/></actuator>
+  <sensor><jointactuatorfrc name="torque" joint="swing"/></sensor></mujoco>"""
+
+
+def test_a_measured_torque_spares_the_scales(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On native MuJoCo; without the column one mass has to be weighed."""
+    model, rng = tmp_path / "rod.xml", np.random.default_rng(0)
+    model.write_text(ROD)
+    m = mujoco.MjModel.from_xml_path(str(model))
+    d, rows = mujoco.MjData(m), []
+    for k in range(300):
+        d.ctrl[:] = np.sin(0.07 * k) + np.sin(0.19 * k)
+        mujoco.mj_forward(m, d)
+        q = d.qpos + 1e-4 * rng.normal(size=1)
+        torque = d.sensordata + 0.01 * rng.normal(size=1)
+        rows.append([0.01 * k, *q, *d.ctrl, *torque])
+        mujoco.mj_step(m, d, 2)
+    header = ["time", "qpos.swing", "ctrl.drive", "sensor.torque"]
+    for name, columns in (("with", 4), ("without", 3)):
+        lines = [",".join(f"{x:.9g}" for x in row[:columns]) for row in rows]
+        text = "\n".join([",".join(header[:columns]), *lines]) + "\n"
+        (tmp_path / f"{name}.csv").write_text(text)
+        log, out = tmp_path / f"{name}.csv", tmp_path / f"{name}.yaml"
+        given = "--model", model, "--data", log, "--out", out
+        call(*given, "--engine", "mujoco")
+        said = capsys.readouterr()
+        assert ("weigh it" in said.out + said.err) == (name == "without")
+        assert ("fitted as well: torque" in said.out + said.err) == (name == "with")
