@@ -24,6 +24,7 @@ from easi_jax.simulation.simulator import FORWARD_MODE, Simulator
 
 RESTARTS = 2  # of the finish on noisy data, where it has more than one minimum
 _SHARP = 1.0 / 3.0  # of a value: its standard deviation where logarithms will do
+_FAR = 3.0  # standard deviations
 _KNOWN = 0.5  # of the initial range's top: a standard deviation that says something
 _HIDDEN = 0.1  # of what a model errs by, that a parameter takes up unseen
 # Of a uniform initial range, unit coordinates.
@@ -211,7 +212,8 @@ def _stated(
 ) -> Estimate:
     noise, misfit = paired.noise, paired.misfit
     return Estimate(
-        distribution=gaussian(paired.space, center, spread),
+        # Where next to nothing is known, what others do may lead anywhere.
+        distribution=gaussian(paired.space, paired.space.clip(center), spread),
         search_mean=mean,
         search_cov=cov,
         hessian=fit.hessian,
@@ -379,6 +381,8 @@ def _near_zero(
     known = (error < _KNOWN * top) | (unit < raised)
     weak = space.log & known & (error > _SHARP * value)
     told = 1.0 + width * (_MIDDLE + pull - raised)
+    # What the data say next to nothing of they do not place far from where it may be.
+    told = jnp.clip(told, -_FAR * error, top + _FAR * error)
     mean, x_std, log_mean, log_std = _of_logarithm(raised, width, told, error)
     moved = jnp.where(weak, raised + (mean - 1.0) / width - shrunk, 0.0)
     # The others follow the weak ones all together (these may be known by their sum

@@ -1,13 +1,17 @@
 """The covariance of a result: single precision must not pass for knowledge."""
 
+from typing import Any, cast
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from easi_jax.data.segments import Segments
+from easi_jax.estimation.levenberg_marquardt import RefineResult
+from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.pieces import finish_pieces, finish_rest
-from easi_jax.estimation.posterior import _inverse, _near_zero, _posterior
+from easi_jax.estimation.posterior import _inverse, _near_zero, _posterior, _stated
 from easi_jax.model.parameters import Parameter, ParameterSpace
 from envs import make
 
@@ -121,7 +125,10 @@ def test_regions_cover_what_is_hardly_known() -> None:
     about the fit alone the regions would cover too few."""
     names = ("body.a.mass", "body.b.mass", "body.c.mass")
     space = ParameterSpace(
-        tuple(Parameter(n, (n,), 1.0, (1.0, 1.5), (1e-9, 1e9)) for n in names)
+        tuple(
+            Parameter(n, (f"joint.{n}.damping",), 1.0, (1.0, 1.5), (1e-9, 1e9))
+            for n in names
+        )
     )
     rng, count = np.random.default_rng(1), 4000
     root = rng.normal(size=(3, 3)) * 4.0
@@ -156,6 +163,36 @@ def test_values_known_by_their_sum_alone_stay_finite() -> None:
         got = _inverse(cov, std) @ x
         assert np.isfinite(got).all()
         np.testing.assert_allclose(cov @ got, x, atol=2e-3 * np.abs(x).max())
+
+
+def test_what_is_hardly_known_stays_within_reach() -> None:
+    """By data of any condition, from any end of a fit."""
+    places = [
+        Parameter(n, (f"joint.{n}.damping",), 1.0, (0.3, 3.0), (1e-3, 1e3))
+        for n in "abcdef"
+    ]
+    space, rng = ParameterSpace(tuple(places)), np.random.default_rng(0)
+    low, high = (np.asarray(edge) for edge in space.unit_bounds)
+
+    def stated(unit: jax.Array, hessian: jax.Array) -> tuple[jax.Array, jax.Array]:
+        known = _posterior(hessian)
+        return _near_zero(space, unit, jnp.maximum(unit, 0.0), *known)
+
+    many = 400
+    j = rng.normal(size=(many, 6, 6)) * 10.0 ** rng.uniform(-3, 2.5, (many, 6, 1))
+    unit = rng.uniform(low, high, (many, 6))
+    given = jnp.asarray(unit, jnp.float32), jnp.asarray(np.swapaxes(j, 1, 2) @ j)
+    mean, cov = map(np.asarray, jax.jit(jax.vmap(stated))(*given))
+    std = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    assert np.isfinite(mean).all() and (std < 2.0).all()
+    # What is stated lies within bounds, wherever that led.
+    paired = PairedFit(cast(Any, None), space, cast(Any, None), jnp.ones(2))
+    fit = RefineResult(*([jnp.zeros(6)] * len(RefineResult.__dataclass_fields__)))
+    for center, spread in zip(mean[:20], cov[:20], strict=True):
+        found = _stated(paired, fit, fit.unit, jnp.eye(6), center, spread)
+        assert (found.distribution.mean >= low).all()
+        assert (found.distribution.mean <= high).all()
+    assert (mean > high).any() or (mean < low).any()
 
 
 @pytest.mark.parametrize(
