@@ -42,7 +42,6 @@ from easi_jax.simulation.step import Physics, arrived_step
 
 BLOCK = 16  # windows
 _ITEMS = 4  # that a core works on together: many requests ask for few
-_NATIVE_ITEMS = 16  # a call costs as much as hundreds of steps of a small robot
 _ACCELERATOR_ITEMS = 256
 _ROW = 0.01  # s of it at a time
 
@@ -155,9 +154,8 @@ class Predictor:
         self._scalar = scalar_places(m).T
         self._mesh = make_mesh()
         engine = self.simulator.engine
-        self._items = _ITEMS if on_cpu() else _ACCELERATOR_ITEMS
-        if engine == "mujoco":
-            self._items = _NATIVE_ITEMS
+        on_host = on_cpu() or engine == "mujoco"
+        self._items = _ITEMS if on_host else _ACCELERATOR_ITEMS
         # By powers of two, so that the program of one log often serves the next.
         self._room = 1 << (self.blocks - 1).bit_length()
         self._data = self._placed(windows)

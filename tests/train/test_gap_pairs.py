@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from easi_jax.gap import analysis, predictor
+from easi_jax.gap import analysis
 from easi_jax.gap.candidates import places
 from easi_jax.io.models.effects_file import read_effects
 from tests.commands import command, read
@@ -68,7 +68,6 @@ def test_friction_under_one_foot(
 ) -> None:
     """Small and short, so that it takes seconds: on MuJoCo, which compiles little."""
     only(monkeypatch, "contact_friction", "coulomb_friction")
-    monkeypatch.setattr(predictor, "_NATIVE_ITEMS", 4)
     told, _ = named(
         *((0.9,), tmp_path, 80, 0.01),
         *("--engine", "mujoco", "--horizon", "0.15"),
