@@ -99,9 +99,11 @@ class _Host:
 
     @cached_property
     def _pairs(self) -> np.ndarray:
-        """The number of each pair of geoms that may touch; -1 of others."""
-        number = np.full((self.mj.ngeom, self.mj.ngeom), -1)
-        for k, (i, j) in enumerate(pair_ids(self.mj)):
+        """The number of each pair of geoms that may touch; one more of others, and in a
+        last row and column of what is no geom."""
+        pairs = pair_ids(self.mj)
+        number = np.full((self.mj.ngeom + 1, self.mj.ngeom + 1), len(pairs))
+        for k, (i, j) in enumerate(pairs):
             number[i, j] = number[j, i] = k
         return number
 
@@ -287,7 +289,8 @@ class _Host:
         """Simulation by simulation, half a step at a time: contacts are changed where
         they are made."""
         d, row = mujoco.MjData(self.mj), np.empty(b.batch.nstate)
-        m = None
+        one = np.ones((len(pairs), 1, pairs.shape[2]))
+        pairs, m = np.concatenate([pairs, one], 1), None
         for i in np.flatnonzero(~wrong).tolist():
             m = b.batch.get_model(i, m)
             mujoco.mj_setState(m, d, b.batch.state[i], _ALL)
@@ -385,17 +388,18 @@ def _lost(wrong: np.ndarray, *arrays: np.ndarray) -> None:
 def _change_contacts(
     m: mujoco.MjModel, d: mujoco.MjData, factors: np.ndarray, number: np.ndarray
 ) -> None:
-    """As `easi_jax.model.effects.pair_contacts`, between both halves of a step."""
-    geoms = d.contact.geom
-    # Contacts of flexes have no two geoms.
-    pair = np.where((geoms >= 0).all(1), number[geoms[:, 0], geoms[:, 1]], -1)
-    (at,) = np.nonzero(pair >= 0)
-    if not len(at):
+    """As `easi_jax.model.effects.pair_contacts`, between both halves of a step; the
+    last of ``factors (K + 1, 3)`` are of other pairs."""
+    if not d.ncon:
         return
-    friction, solref = d.contact.friction, d.contact.solref
-    friction[at, :2] *= factors[pair[at], :1]
-    direct = [direct_solref(m, solref[i]) for i in at.tolist()]
-    solref[at] = -np.array(direct) * factors[pair[at], 1:]
+    contact = d.contact
+    geoms, solref = contact.geom, contact.solref
+    factor = factors[number[geoms[:, 0], geoms[:, 1]]]
+    contact.friction[:, :2] *= factor[:, :1]
+    for i in np.flatnonzero(solref[:, 0] > 0).tolist():
+        stiffness, damping = direct_solref(m, solref[i])
+        solref[i] = -stiffness, -damping
+    solref *= factor[:, 1:]
     mujoco.mj_makeConstraint(m, d)
     mujoco.mj_island(m, d)
     mujoco.mj_projectConstraint(m, d)
