@@ -82,11 +82,9 @@ _DETAILS = ("rotor", "cycles", "phase", "stribeck")
 
 
 def _fields(layout: Layout) -> tuple[str, ...]:
-    """Of `Effects`, those that predictions reckon with."""
+    """Of `Effects`, those that predictions reckon with: all others stay neutral."""
     varied = {c.field for c in layout.columns}
-    contacts = effects.has_contact_effects(varied)
-    unused = () if contacts else fields_that_act("contacts")
-    return tuple(f for f in Effects.__dataclass_fields__ if f not in unused)
+    return tuple(f for f in Effects.__dataclass_fields__ if f in varied)
 
 
 class Predictor:
