@@ -64,7 +64,7 @@ def write(
     from easi_jax.io.report.logs_report import logs_report
     from easi_jax.io.runs.versions import versions
 
-    results = seed_results(problem.simulator, space, estimates)
+    results = seed_results(problem.sensing, space, estimates)
     means = [found.distribution.mean for found in estimates]
     errors = held_out_errors(problem, space, means, errors_of)
     best = errors.best

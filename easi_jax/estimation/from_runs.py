@@ -15,7 +15,7 @@ from easi_jax.data.activations import activation_guess, activation_spread
 from easi_jax.data.noise import resolutions
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import Segments, to_device
-from easi_jax.data.sensor_channels import NO_SENSORS, Sensors, read_at_end
+from easi_jax.data.sensor_channels import NO_SENSORS
 from easi_jax.data.windows import lead_rows
 from easi_jax.devices import distributed
 from easi_jax.devices.mesh import make_mesh, placed, replicated
@@ -65,8 +65,6 @@ _LACKING = 1.5  # times wider spreads, that are worth a note
 _FINISH = 0.5  # s, of pieces in the least-squares finish
 _COMPARED = 8  # runs at most that are fitted alone as well
 _FAR, _DIFFERENT = 5.0, 0.1  # standard deviations, and log ratio, that contradict
-_COMMANDED, _READ = 64, 8  # pieces, and steps at least, that say when sensors were read
-_FINE = 1e-6  # of what a sensor reads: noise of a log that has none
 _OUTLIER = 2.5  # times the median error: windows beyond it weigh less
 
 
@@ -164,39 +162,6 @@ def ready_finish(
     return estimates
 
 
-def _sensors_of(problem: Problem) -> Sensors:
-    """The problem's, with those known that were read before the command of their row
-    was sent, by what the model as given predicts."""
-    sensors, runs = problem.sensors, problem.fit
-    steps = min(max(problem.steps, _READ), max(len(r) for r in runs) - 1)
-    if steps < _READ or not any(n.of_forces for n in sensors):
-        return sensors
-    simulator = problem.simulator.sensing(sensors)
-    given = simulator, runs, steps, steps
-    pieces = segments_from_runs(*given, sensors=sensors)
-    most = min(pieces.count, _COMMANDED)
-    pieces = to_device(pieces.spread(most))
-
-    def sensed(theta: jax.Array) -> jax.Array:
-        model = simulator.model(theta)
-        return open_loop.predict_sensed(simulator, model, pieces)[2]
-
-    nominal = jnp.asarray(problem.simulator.space.nominal, jnp.result_type(float))
-    each = jax.jit(sensed, compiler_options=quick_compile())(nominal)
-    read = pieces.sensed[:, 1:]
-    reading = sensors.reading
-    span = np.ptp(np.asarray(read), axis=(0, 1))
-    size = np.maximum(sensors.noise(runs)[0], _FINE * span)
-    begins, ends = (
-        np.asarray(reading.alike(x, read) - read) / np.maximum(size, 1e-30)
-        for x in (each[:, 1:, 0], each[:, :-1, 1])
-    )
-    of_forces = {n.sensor for n in sensors if n.of_forces}
-    return sensors.ending(
-        [name for name in read_at_end(sensors, begins, ends) if name in of_forces]
-    )
-
-
 class _Finish:
     """The programs of a finish and what they are given.
 
@@ -219,10 +184,8 @@ class _Finish:
     ) -> None:
         self.problem, self.search, self.tell = problem, search, tell
         self.refined, self.restarts = refined, restarts
-        self.sensors = _sensors_of(problem) if refined else NO_SENSORS
-        simulator = problem.simulator
-        if self.sensors:
-            simulator = simulator.sensing(self.sensors)
+        self.sensors = problem.fitted_sensors if refined else NO_SENSORS
+        simulator = problem.sensing if refined else problem.simulator
         self.simulator = simulator
         self.doubts = doubts_of(simulator, search.space) if refined else None
         # With commands before each piece, where one that comes late needs them.

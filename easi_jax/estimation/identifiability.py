@@ -15,7 +15,6 @@ from easi_jax.estimation.least_squares import (
     flag_codes,
     result_code,
 )
-from easi_jax.estimation.normal_equations import _NUMERIC
 from easi_jax.model.parameters import Parameter, ParameterSpace
 from easi_jax.model.results import (
     LEAK,
@@ -26,6 +25,7 @@ from easi_jax.model.results import (
 )
 
 WEAK = 0.5  # std of a log ratio beyond which a direction is called undetermined
+_ROUNDING = 1e-6  # eigenvalue of a correlation matrix that single precision makes
 _ALONE = 0.998  # of a parameter's own direction unseen: it leaves no trace
 _PART = 0.3  # of a mass in what is unseen: enough to settle a direction
 _AT = 1e-3  # unit coordinates from a bound that count as at it
@@ -74,11 +74,9 @@ def identifiability(
     Directions are judged in log ratios, where one unit is a factor e.
     """
     scale = space.log_width  # d log(xi) / d unit, or 1 for linear parameters
-    info = np.asarray(hessian, np.float64) / np.outer(scale, scale)
-    info = 0.5 * (info + info.T)
+    info = _resolved(np.asarray(hessian, np.float64)) / np.outer(scale, scale)
     values, vectors = np.linalg.eigh(info)
-    top = max(values[-1], 1e-300)
-    seen = (values > (_NUMERIC**2) * top) & (values > 1.0 / weak**2)
+    seen = values > 1.0 / weak**2
     null = vectors[:, ~seen]
     safe = np.where(seen, values, np.inf)
     cov = (vectors / safe) @ vectors.T
@@ -103,6 +101,15 @@ def identifiability(
         null=null,
         scale=scale,
     )
+
+
+def _resolved(hessian: np.ndarray) -> np.ndarray:
+    """Information ``(n, n)`` without what sums in single precision leave of nothing."""
+    size = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    alike = 0.5 * (hessian + hessian.T) / np.outer(size, size)
+    values, vectors = np.linalg.eigh(alike)
+    kept = np.where(values > _ROUNDING, values, 0.0)
+    return (vectors * kept) @ vectors.T * np.outer(size, size)
 
 
 def forces(space: ParameterSpace) -> np.ndarray:

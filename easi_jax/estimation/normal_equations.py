@@ -30,7 +30,6 @@ _LANES = 64  # simulations at once of a smaller robot, whose loop is one piece t
 # limit looks like knowledge where there is none, of 0.001 rounding does.
 _STEP = 0.004
 _MOVE = 1e-4, 0.1  # at least and at most, along a start [m, rad, m/s, rad/s]
-_NUMERIC = 1e-4  # relative singular value that single precision cannot resolve
 
 
 @flax.struct.dataclass

@@ -3,24 +3,37 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from easi_jax.data.cleaning import true_readings, trusted_velocity
 from easi_jax.data.measured import MeasuredRuns
 from easi_jax.data.recording import Run
-from easi_jax.data.sensor_channels import NO_SENSORS, Sensors, moving_sensors
+from easi_jax.data.segments import to_device
+from easi_jax.data.sensor_channels import (
+    NO_SENSORS,
+    Sensors,
+    moving_sensors,
+    read_at_end,
+)
 from easi_jax.data.unmeasured import hidden_in_any
 from easi_jax.data.windows import lead_rows
+from easi_jax.devices.runtime import quick_compile
 from easi_jax.errors import UserError
-from easi_jax.estimation.pieces import visible_steps
+from easi_jax.estimation.pieces import segments_from_runs, visible_steps
 from easi_jax.model.found_effects import FoundEffects, joined
 from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation import open_loop
 from easi_jax.simulation.logged import Logged
 from easi_jax.simulation.simulator import Simulator
 
 HORIZON = 0.2  # s, of the error that is reported; pieces are no longer
+_COMMANDED, _READ = 64, 8  # pieces, and steps at least, that say when sensors were read
+_FINE = 1e-6  # of what a sensor reads: noise of a log that has none
 _ABOVE_NOISE = 30.0  # RMS motion over a piece in units of its noise
 
 
@@ -55,6 +68,41 @@ class Problem:
     horizon: float
     notes: list[str]
     sensors: Sensors = NO_SENSORS
+
+    @cached_property
+    def fitted_sensors(self) -> Sensors:
+        """The sensors, with those known that were read before the command of their row
+        was sent, by what the model as given predicts."""
+        sensors, runs = self.sensors, self.fit
+        steps = min(max(self.steps, _READ), max(len(r) for r in runs) - 1)
+        if steps < _READ or not any(n.of_forces for n in sensors):
+            return sensors
+        simulator = self.simulator.sensing(sensors)
+        pieces = segments_from_runs(simulator, runs, steps, steps, sensors=sensors)
+        pieces = to_device(pieces.spread(min(pieces.count, _COMMANDED)))
+
+        def sensed(theta: jax.Array) -> jax.Array:
+            model = simulator.model(theta)
+            return open_loop.predict_sensed(simulator, model, pieces)[2]
+
+        nominal = jnp.asarray(self.simulator.space.nominal, jnp.result_type(float))
+        each = jax.jit(sensed, compiler_options=quick_compile())(nominal)
+        read = pieces.sensed[:, 1:]
+        span = np.ptp(np.asarray(read), axis=(0, 1))
+        size = np.maximum(sensors.noise(runs)[0], _FINE * span)
+        begins, ends = (
+            np.asarray(sensors.reading.alike(x, read) - read) / np.maximum(size, 1e-30)
+            for x in (each[:, 1:, 0], each[:, :-1, 1])
+        )
+        of_forces = {n.sensor for n in sensors if n.of_forces}
+        names = read_at_end(sensors, begins, ends)
+        return sensors.ending([name for name in names if name in of_forces])
+
+    @cached_property
+    def sensing(self) -> Simulator:
+        """The simulator, which reads the sensors where there are any."""
+        sensors = self.fitted_sensors
+        return self.simulator.sensing(sensors) if sensors else self.simulator
 
 
 def checked_horizon(horizon: float | None) -> float:

@@ -12,11 +12,12 @@ import pytest
 from easi_jax.data.measured import MeasuredRuns
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import to_device
-from easi_jax.data.sensor_channels import NO_SENSORS
+from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
 from easi_jax.estimation import from_runs
 from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.pieces import segments_from_runs
 from easi_jax.estimation.problem import Problem, problem_of
+from easi_jax.estimation.relative import seed_results
 from easi_jax.model.distribution import covariance
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace, declare
@@ -130,7 +131,7 @@ def test_what_is_predicted_is_what_mujoco_reads(name: engine.Engine) -> None:
 
 @pytest.mark.parametrize("early", [False, True])
 def test_readings_of_before_their_command_are_recognised(early: bool) -> None:
-    found = from_runs._sensors_of(_problem(early))
+    found = _problem(early).fitted_sensors
     at_end = {n.sensor for n in found if n.at_end}
     assert at_end == ({"torque"} if early else set())
 
@@ -174,7 +175,25 @@ def test_the_finish_finds_all_of_it(problem: Problem) -> None:
     assert (np.abs(off) < 3.5 * std).all(), (off, std)
     assert (std < 0.02).all(), std
     assert not any("before the command" in n for n in notes)
+    # A mass that is taken for known is held in a fit of the same readings.
+    (told,) = seed_results(problem.sensing, space, [found])
+    assert told.relative is None and set(told.flags) == {"determined"}
     rate = [i for i, n in enumerate(problem.sensors) if n.sensor == "rate"]
     torque = [i for i, n in enumerate(problem.sensors) if n.sensor == "torque"]
     misfit = np.asarray(found.misfit)[2:]
     assert misfit[rate].max() > 0.4 and misfit[torque].max() < _TORQUE
+
+
+@pytest.mark.slow
+def test_values_beside_a_known_mass_are_of_the_same_readings(problem: Problem) -> None:
+    """A gyro tells no scale: one mass is taken as known, and the fit made again."""
+    some = tuple(n for n in problem.sensors if n.sensor == "rate")
+    problem = replace(problem, sensors=Sensors(some))
+    space = problem.simulator.space
+    config = SearchConfig(source="replay", horizon=problem.piece, population=4)
+    finish = from_runs.ready_finish(problem, Search(problem.simulator, config))
+    truth = space.to_unit(jnp.asarray(space.nominal))
+    ((found,), _) = finish((truth + 0.2)[None], 0.01 * jnp.eye(3)[None])
+    (told,) = seed_results(problem.sensing, space, [found])
+    assert told.relative is not None and list(told.relative.taken) == ["mass"]
+    np.testing.assert_allclose(told.relative.mean, space.nominal, rtol=0.05)
