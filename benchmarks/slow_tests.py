@@ -247,7 +247,9 @@ def _lines(folder: Path, data: list[Path]) -> dict[str, list[int]]:
     if not there:
         return {}
     whole, told = folder / "coverage", folder / "coverage.json"
-    for words in (["combine", "--keep", *there], ["json", "-q", "-o", str(told)]):
+    # Of files that were moved since, nothing is known.
+    read = ["json", "-q", "-i", "-o", str(told)]
+    for words in (["combine", "--keep", *there], read):
         subprocess.run(
             [sys.executable, "-m", "coverage", *words],
             cwd=ROOT,

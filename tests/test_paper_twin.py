@@ -1,5 +1,6 @@
 """The twins that stand for the paper's hardware: what they share, what they add."""
 
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -350,7 +351,8 @@ def test_cells_at_their_smallest(
             assert len(row["mean"]) == len(row["names"]) and np.all(
                 np.isfinite(row["mean"])
             )
-            assert next(tmp_path.glob(f"{method.replace(' ', '_')}*/training"))
+            folder = re.sub(r"\W", "_", method)
+            assert next(tmp_path.glob(f"{folder}*/training"))
     again = paper_twin.solve(replace(cell, method=method), tmp_path)
     same = [k for k in row if k != "seconds"]
     assert [again[k] for k in same] == [row[k] for k in same]
