@@ -62,6 +62,8 @@ class Config(Share):
     """Processes of pytest at a time."""
     since: str = ""
     """A commit: parts that passed at it or at a later one are not run again."""
+    report: bool = False
+    """Add up what was run, without running any."""
     out: Path = _FOLDER / "parts.jsonl"
     """Where a line for each part is added."""
     results: Path = RESULTS
@@ -92,11 +94,12 @@ def run(config: Config) -> None:
     # What took longest at an earlier commit goes first.
     every.sort(key=lambda p: -took.get((p.path, p.tier), 0.0))
     solve = functools.partial(_solve, folder=folder)
-    run_cells(
-        *(every, config, solve, _told),
-        workers=config.workers,
-        passed=lambda row: not row["failed"],
-    )
+    if not config.report:
+        run_cells(
+            *(every, config, solve, _told),
+            workers=config.workers,
+            passed=lambda row: not row["failed"],
+        )
     if config.list:
         return
     # Of each part the last line counts; parts of earlier commits whose files are gone

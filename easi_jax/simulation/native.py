@@ -38,6 +38,7 @@ _REST = (
 # What calls have raised, which jax passes on as a text only.
 failures: list[Exception] = []
 _KEPT = 8  # batches kept for each model: chunks of a few sizes, on each device
+_KEPT_BYTES = 2**28  # of the models of one batch, beside the batch's own
 _RECORDED = 2**25  # numbers recorded at once, 256 MB
 
 
@@ -69,6 +70,8 @@ class _Batch:
         self.size, self.fields = size, fields
         self.written: dict[str, bytes] = {}
         self.failed = np.zeros(size, bool)
+        self._models: list[mujoco.MjModel | None] = [None] * size
+        self._keeps = size * mujoco.mj_sizeModel(mj) < _KEPT_BYTES
         self.batch = mujoco_batch.Batch(mj, size, _threads())
         # Set before the first write: rows are shared with what is bound.
         self.first = self.batch.state[:1].copy()
@@ -78,6 +81,19 @@ class _Batch:
         where these were not always nominal."""
         found = ((n, self.batch.expanded(n)) for n in mujoco_batch.MODEL_FIELDS)
         return {name: rows for name, rows in found if rows is not None}
+
+    def model(self, i: int) -> mujoco.MjModel:
+        """Simulation i's model; kept until another is written."""
+        found = self._models[i]
+        if found is None:
+            found = self.batch.get_model(i)
+            if self._keeps:
+                self._models[i] = found
+        return found
+
+    def set_written(self, written: dict[str, bytes]) -> None:
+        """Notes what the models' fields are now."""
+        self.written, self._models = written, [None] * self.size
 
     def component(self, part: mujoco.mjtState) -> np.ndarray:
         offset, size = self.batch._component(part)
@@ -157,7 +173,7 @@ class _Host:
                 nominal = nominal_field(self.mj, name)
                 b.batch.expand(name)[...] = nominal if rows is None else rows[which]
             b.failed = models.failed[which]
-        b.written = written
+        b.set_written(written)
         return b
 
     # Simulation --------------------------------------------------------------
@@ -290,9 +306,9 @@ class _Host:
         they are made."""
         d, row = mujoco.MjData(self.mj), np.empty(b.batch.nstate)
         one = np.ones((len(pairs), 1, pairs.shape[2]))
-        pairs, m = np.concatenate([pairs, one], 1), None
+        pairs = np.concatenate([pairs, one], 1)
         for i in np.flatnonzero(~wrong).tolist():
-            m = b.batch.get_model(i, m)
+            m = b.model(i)
             mujoco.mj_setState(m, d, b.batch.state[i], _ALL)
             warned = [d.warning[w].number for w in _BAD]
             for t in range(ctrl.shape[1]):
