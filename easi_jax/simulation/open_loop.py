@@ -25,7 +25,7 @@ def predict(
     """
     # Nothing but a controller reads it.
     model = simulator.without_sense(model)
-    return _predicted(simulator, model, segments, steps)[:2]
+    return _predicted(simulator, model, segments, steps, False)[:2]
 
 
 def predict_sensed(
@@ -36,7 +36,7 @@ def predict_sensed(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """`predict`, and what is sensed in the first and the last physics step of each
     control step, ``(M, H, 2, N)``; zero where nothing is simulated."""
-    return _predicted(simulator, model, segments, steps)
+    return _predicted(simulator, model, segments, steps, True)
 
 
 def _predicted(
@@ -44,20 +44,21 @@ def _predicted(
     model: Any,
     segments: Segments,
     steps: int | jax.Array | None,
+    senses: bool,
 ) -> tuple[jax.Array, jax.Array, Any]:
     def one(
         qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array, past: Any, act: Any
     ) -> Any:
         def step(state: Any, u: jax.Array) -> Any:
-            if model.sense is None:
-                state, sensed = simulator.step(model, state, u), ()
-            else:
+            if senses:
                 state, sensed = simulator.sensed_step(model, state, u)
+            else:
+                state, sensed = simulator.step(model, state, u), ()
             return state, (state.qpos, state.qvel, sensed)
 
         known = None if isinstance(act, tuple) else act
         first = simulator.start(qpos, qvel, act=known)
-        if model.sense is None:
+        if not senses:
             first = dataclasses.replace(first, sensed=())
         if not isinstance(past, tuple):
             first = simulator.after(model, first, past)
@@ -66,7 +67,7 @@ def _predicted(
             return at_once
         if steps is None:
             return jax.lax.scan(step, first, ctrl)[1]
-        nothing = () if model.sense is None else jnp.zeros((2, *first.sensed.shape))
+        nothing = jnp.zeros((2, *first.sensed.shape)) if senses else ()
         begun = jax.tree.map(
             lambda x: jnp.broadcast_to(x, (ctrl.shape[0], *x.shape)),
             (first.qpos, first.qvel, nothing),
