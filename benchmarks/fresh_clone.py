@@ -92,7 +92,8 @@ def _run(config: Config, clone: Path) -> dict[str, Any]:
         ) from None
     seconds = time.monotonic() - begin
     if done.returncode:
-        say(done.stdout[-5000:])
+        failed = re.findall(r"^(?:FAILED|ERROR) .*$", done.stdout, re.MULTILINE)
+        say("\n".join([*failed, done.stdout[-2000:]]))
     return {
         "command": f"make {config.target}",
         "status": done.returncode,
