@@ -84,8 +84,9 @@ def run(config: Config) -> None:
     commit = versions()["commit"] or "none"
     tiers = [t for t in TIERS if config.tier in (t, "all")]
     folder = config.out.parent.resolve()
-    took = {(r["path"], r["tier"]): r["seconds"] for r in read_rows(config.out)}
-    passed = _passed_since(config.since, read_rows(config.out)) if config.since else {}
+    earlier = read_rows(config.out)
+    took = {(r["path"], r["tier"]): r["seconds"] for r in earlier}
+    passed = _passed_since(config.since, earlier) if config.since else {}
     every = [
         Part(p, t, passed.get((p, t), commit), config.optimized)
         for t in tiers

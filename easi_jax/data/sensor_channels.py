@@ -140,8 +140,8 @@ class SensorReading:
     """
 
     columns: tuple[int, ...]
-    quaternions: tuple[int, ...] = ()
-    at_end: tuple[bool, ...] = ()
+    quaternions: tuple[int, ...]
+    at_end: tuple[bool, ...]
 
     def __call__(self, _: Any, data: Any) -> Any:
         return data.sensordata[np.array(self.columns, int)]
@@ -165,8 +165,7 @@ class SensorReading:
     def chosen(self, each: Any) -> Any:
         """Of numbers where steps begin and where they end ``(..., 2, N)``, those that
         are compared, ``(..., N)``."""
-        ends = np.array(self.at_end or (False,) * len(self.columns), bool)
-        return jnp.where(ends, each[..., 1, :], each[..., 0, :])
+        return jnp.where(np.array(self.at_end), each[..., 1, :], each[..., 0, :])
 
 
 def only_read(m: mujoco.MjModel, sensors: Sensors) -> mujoco.MjModel:

@@ -25,6 +25,7 @@ from easi_jax.data.windows import lead_rows
 from easi_jax.devices.runtime import quick_compile
 from easi_jax.errors import UserError
 from easi_jax.estimation.pieces import segments_from_runs, visible_steps
+from easi_jax.estimation.starts import known_noise
 from easi_jax.model.found_effects import FoundEffects, joined
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import open_loop
@@ -33,7 +34,6 @@ from easi_jax.simulation.simulator import Simulator
 
 HORIZON = 0.2  # s, of the error that is reported; pieces are no longer
 _COMMANDED, _READ = 64, 8  # pieces, and steps at least, that say when sensors were read
-_FINE = 1e-6  # of what a sensor reads: noise of a log that has none
 _ABOVE_NOISE = 30.0  # RMS motion over a piece in units of its noise
 
 
@@ -89,7 +89,7 @@ class Problem:
         each = jax.jit(sensed, compiler_options=quick_compile())(nominal)
         read = pieces.sensed[:, 1:]
         span = np.ptp(np.asarray(read), axis=(0, 1))
-        size = np.maximum(sensors.noise(runs)[0], _FINE * span)
+        size = known_noise(sensors.noise(runs)[0], span)
         begins, ends = (
             np.asarray(sensors.reading.alike(x, read) - read) / np.maximum(size, 1e-30)
             for x in (each[:, 1:, 0], each[:, :-1, 1])

@@ -224,6 +224,8 @@ class Selector:
         self, base: Model, candidates: Sequence[Candidate]
     ) -> list[tuple[float, Candidate]]:
         """Candidates with the cost that one Gauss-Newton step promises, best first."""
+        if not candidates:
+            return []
         kept = self.journal.remember(lambda: self._tried(base, candidates))
         out = [
             (float(cost), replace(candidates[i], ends=tuple(end)))

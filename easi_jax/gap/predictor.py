@@ -38,7 +38,7 @@ from easi_jax.simulation import native_step
 from easi_jax.simulation.compile_time import expected
 from easi_jax.simulation.logged import Logged
 from easi_jax.simulation.simulator import Simulator
-from easi_jax.simulation.step import Physics, arrived_step
+from easi_jax.simulation.step import Physics, arrived_sensed, arrived_step
 
 BLOCK = 16  # windows
 _ITEMS = 4  # that a core works on together: many requests ask for few
@@ -364,16 +364,12 @@ class Predictor:
             before = (past_q, past_v)
             physics = self._turned(model, physics, arrived[: len(past)], *before)
 
-        def physics_step(state: Physics, u: jax.Array) -> tuple:
-            state = arrived_step(model, state, u[None])
-            return state, state.sensed
-
         def step(state: Physics, u: jax.Array) -> tuple:
             if not self.sensors:
                 state = arrived_step(model, state, u)
                 return state, (state.qpos, ())
-            state, each = jax.lax.scan(physics_step, state, u)
-            return state, (state.qpos, jnp.stack([each[0], each[-1]]))
+            state, each = arrived_sensed(model, state, u)
+            return state, (state.qpos, each)
 
         arrived, at_once = arrived[len(past) :], None
         if simulator.engine == "mujoco":

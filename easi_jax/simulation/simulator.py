@@ -33,7 +33,7 @@ from easi_jax.simulation.logged import Logged, apart_in, apart_note
 from easi_jax.simulation.step import (
     WRITTEN_OUT,
     Physics,
-    arrived_step,
+    arrived_sensed,
     arriving,
     at_rest,
     control_step,
@@ -169,16 +169,17 @@ class Simulator:
         mj_model: mujoco.MjModel | None = None,
         space: ParameterSpace | None = None,
         fixed: Mapping[str, float] | None = None,
+        sense: tuple[Sense, int] | None = None,
     ) -> "Simulator":
-        """The same machine, what it senses and its drives included, of another model
-        or with other parameters or fixed values."""
+        """The same machine, its drives included, of another model, with other
+        parameters or fixed values, or which senses something else: ``sense`` and its
+        size."""
         base = self.base
         return Simulator(
             self.mj_model if mj_model is None else mj_model,
             self.space if space is None else space,
             self.dt,
-            base.sense,
-            base.sense_size,
+            *(sense or (base.sense, base.sense_size)),
             base.torque_speed,
             self.fixed if fixed is None else fixed,
             self.engine,
@@ -190,18 +191,8 @@ class Simulator:
 
         On MJX other sensors are left out: they would be compiled, too.
         """
-        m, reading = self.mj_model, sensors.reading
-        return Simulator(
-            only_read(m, sensors) if self.engine == "mjx" else m,
-            self.space,
-            self.dt,
-            reading,
-            len(sensors),
-            self.base.torque_speed,
-            self.fixed,
-            self.engine,
-            self.logged,
-        )
+        m = only_read(self.mj_model, sensors) if self.engine == "mjx" else None
+        return self.rebuilt(m, sense=(sensors.reading, len(sensors)))
 
     def model(self, theta: jax.Array) -> Model:
         """The model at parameters ``theta`` ``(n,)`` in SI units."""
@@ -244,13 +235,8 @@ class Simulator:
         """One control step, and what is sensed in its first and its last physics step,
         ``(2, sense_size)``."""
         arrived, memory = arriving(model, state, ctrl, self.substeps)
-
-        def step(s: Physics, u: jax.Array) -> tuple[Physics, jax.Array]:
-            s = arrived_step(model, s, u[None])
-            return s, s.sensed
-
-        after, each = jax.lax.scan(step, state.replace(memory=()), arrived)
-        return after.replace(memory=memory), jnp.stack([each[0], each[-1]])
+        after, sensed = arrived_sensed(model, state.replace(memory=()), arrived)
+        return after.replace(memory=memory), sensed
 
     def replay(
         self, model: Model, state: Physics, ctrl: jax.Array, steps: Any = None

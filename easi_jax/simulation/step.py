@@ -252,3 +252,17 @@ def arrived_step(model: Any, state: Physics, arrived: jax.Array) -> Physics:
         return _batched_substep(model, s, u), None
 
     return jax.lax.scan(step, state, arrived)[0]
+
+
+def arrived_sensed(
+    model: Any, state: Physics, arrived: jax.Array
+) -> tuple[Physics, jax.Array]:
+    """`arrived_step`, and what is sensed in its first and its last physics step,
+    ``(2, sense_size)``."""
+
+    def step(s: Physics, u: jax.Array) -> tuple[Physics, jax.Array]:
+        s = arrived_step(model, s, u[None])
+        return s, s.sensed
+
+    state, each = jax.lax.scan(step, state, arrived)
+    return state, jnp.stack([each[0], each[-1]])

@@ -103,7 +103,7 @@ def test_friction_is_named_where_it_is(
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(3600)
+@pytest.mark.timeout(1500)
 def test_friction_of_one_foot_among_all_effects(tmp_path: Path) -> None:
     effect = named((0.9, 0.6), tmp_path)[0]["effects"][0]
     assert (effect["effect"], effect["at"]) == ("contact_friction", "floor/left_foot")

@@ -121,8 +121,7 @@ def test_the_next_commands_for_the_stand(
         *("--out", tmp_path / "excite"),
     )
     log = read_logs([tmp_path / "excite" / "commands.csv"], hung())
-    # Of both drives; how much of which is a matter of what the machine takes.
-    assert np.abs(log.runs[0].ctrl).max(0).min() > 1e-3  # N m
+    assert np.abs(log.runs[0].ctrl).max(0).min() > 0.01  # N m, of both drives
 
 
 @pytest.mark.slow

@@ -8,10 +8,13 @@ import pytest
 
 from easi_jax.data.recording import Run
 from easi_jax.data.sensor_channels import Sensors, measured_sensors
+from easi_jax.data.windows import fitted_velocity
 from easi_jax.gap import gap_metric
+from easi_jax.gap.analysis import Analysis
 from easi_jax.gap.candidates import places
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.predictor import Predictor
+from easi_jax.gap.result import Outcome
 from easi_jax.gap.scales import scales_of
 from easi_jax.gap.sensor_faults import ReadingFault, without_faults
 from easi_jax.gap.window_set import window_set
@@ -41,6 +44,7 @@ ARM = """
 </mujoco>
 """
 DT, STEPS, ROWS = 0.01, 5, 400
+NOISE = {"gyro": 0.01, "torque": 0.01, "acc": 0.05, "turn": 1e-3}
 
 
 @pytest.fixture(scope="module")
@@ -166,6 +170,61 @@ def test_faults_are_taken_out_of_readings(arm: mujoco.MjModel) -> None:
     (right,) = without_faults([wrong], faults)
     np.testing.assert_allclose(right.sensors["gyro"][:-2], gyro[:-2], atol=1e-12)
     np.testing.assert_array_equal(right.sensors["acc"], run.sensors["acc"])
+
+
+def noisy(run: Run, seed: int, gain: float = 1.0) -> Run:
+    """With noise; torques are read as ``gain`` times what they are."""
+    rng = np.random.default_rng(seed)
+    sensors = {
+        k: run.sensors[k] * (gain if k == "torque" else 1.0)
+        + size * rng.normal(size=run.sensors[k].shape)
+        for k, size in NOISE.items()
+    }
+    qpos = run.qpos + 3e-4 * rng.normal(size=run.qpos.shape)
+    qvel = fitted_velocity(qpos, run.dt, run.configuration)
+    return replace(run, qpos=qpos, qvel=qvel, qvel_measured=False, sensors=sensors)
+
+
+def ended(arm: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch, gain: float) -> Outcome:
+    """The analysis without any effect to try; torques are read ``gain`` times."""
+    monkeypatch.setattr("easi_jax.gap.analysis.places", lambda *_: [])
+    monkeypatch.setattr("easi_jax.gap.analysis.ripples", lambda *_: [])
+    runs = [noisy(recorded(arm, seed=k), k, gain) for k in range(3)]
+    noise = np.array([3e-4, 1.0])
+    with engine.using("mujoco"):
+        given = arm, ParameterSpace(()), runs[:2], runs[2:], noise, 0.2
+        return Analysis(*given).run()
+
+
+@pytest.mark.slow
+def test_sensors_are_part_of_the_gap_beside_their_floor(
+    arm: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A right model is at its floor."""
+    right = ended(arm, monkeypatch, 1.0)
+    assert right.verdict == "no_gap"
+    names = right.channels.names
+    compared = {n for n, s in zip(names, right.channels.scale, strict=True) if s < 1e9}
+    assert compared >= {"a", "sensor.gyro.1", "sensor.torque", "sensor.acc.0"}
+    assert "sensor.gyro.0" not in compared  # does not turn that way
+    assert 0.9 < right.refit.gap / right.floor < 1.1
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(
+    raises=AssertionError,
+    strict=True,
+    reason="through the fitted starts a wrong torque opens its joint as well",
+)
+def test_torques_that_are_read_wrong_are_open_alone(
+    arm: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right, wrong = (ended(arm, monkeypatch, gain) for gain in (1.0, 1.1))
+    assert wrong.verdict == "unexplained"
+    names = right.channels.names
+    told = dict(zip(names, wrong.open_refit.is_open[:-1], strict=True))
+    assert told["sensor.torque"] and not told["a"] and not told["sensor.gyro.1"]
+    np.testing.assert_allclose(wrong.refit.si[0], right.refit.si[0], rtol=0.1)
 
 
 def test_noise_of_no_sensors_is_none(arm: mujoco.MjModel) -> None:
