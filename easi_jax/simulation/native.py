@@ -83,7 +83,7 @@ class _Batch:
         return {name: rows for name, rows in found if rows is not None}
 
     def model(self, i: int) -> mujoco.MjModel:
-        """Simulation i's model; kept until another is written."""
+        """Simulation i's model; kept until what follows from others is written."""
         found = self._models[i]
         if found is None:
             found = self.batch.get_model(i)
@@ -91,9 +91,25 @@ class _Batch:
                 self._models[i] = found
         return found
 
-    def set_written(self, written: dict[str, bytes]) -> None:
-        """Notes what the models' fields are now."""
-        self.written, self._models = written, [None] * self.size
+    def set_written(
+        self, written: dict[str, bytes], alone: Sequence[str] | None = None
+    ) -> None:
+        """Notes what the models' fields are now.
+
+        Args:
+            written: as the attribute.
+            alone: fields that changed, where no other did: models that are kept get
+                them, in a tenth of the time that a copy takes; no model is kept if
+                None.
+        """
+        self.written = written
+        if alone is None:
+            self._models = [None] * self.size
+        rows = {name: self.batch.expand(name) for name in alone or ()}
+        for i, m in enumerate(self._models):
+            if m is not None:
+                for name, values in rows.items():
+                    nominal_field(m, name)[...] = values[i]
 
     def component(self, part: mujoco.mjtState) -> np.ndarray:
         offset, size = self.batch._component(part)
@@ -154,14 +170,14 @@ class _Host:
         count = len(values[0]) if fields else 0
         own = count == b.size and np.array_equal(which, np.arange(count))
         models = b if own or not fields else _Batch(self.mj, count, fields)
-        changed = fields
+        changed, alone = fields, None
         if own and b.written.get("which") == written["which"]:
-            changed = [f for f in fields if b.written[f] != written[f]]
+            changed = alone = [f for f in fields if b.written[f] != written[f]]
         for name, rows in zip(fields, values, strict=True):
             if name in changed:
                 models.batch.expand(name)[...] = rows
         if any(name in _SET_CONST or name.startswith("opt.") for name in changed):
-            models.failed[:] = False
+            models.failed[:], alone = False, None
             try:
                 models.batch.set_const()
             except mujoco_batch.SimulationError as error:
@@ -173,7 +189,7 @@ class _Host:
                 nominal = nominal_field(self.mj, name)
                 b.batch.expand(name)[...] = nominal if rows is None else rows[which]
             b.failed = models.failed[which]
-        b.set_written(written)
+        b.set_written(written, alone)
         return b
 
     # Simulation --------------------------------------------------------------

@@ -247,18 +247,22 @@ class _Read:
         return np.concatenate(given, 1)
 
 
-@pytest.mark.parametrize("each", [False, True])
-def test_simulations_one_by_one_are_those_at_once(each: bool) -> None:
-    """Contacts of pairs by neutral factors: positions, speeds and what is read."""
+@pytest.mark.parametrize(
+    ("each", "address"),
+    [(False, "body.fore.mass"), (True, "body.fore.mass"), (True, "joint.elbow.damping")],
+)
+def test_simulations_one_by_one_are_those_at_once(each: bool, address: str) -> None:
+    """Contacts of pairs by neutral factors: positions, speeds and what is read.
+    Other fields follow from a mass, none from damping."""
     m = _model()
-    space = ParameterSpace((declare(m, "mass", "body.fore.mass"),))
+    space = ParameterSpace((declare(m, "value", address),))
     simulator = Simulator(m, space, 0.02, engine="mujoco")
     seg = _segments(m, 3, 60)
 
-    def run(pairs: Any, mass: Any, q: jax.Array, v: jax.Array, u: jax.Array) -> Any:
+    def run(pairs: Any, value: Any, q: jax.Array, v: jax.Array, u: jax.Array) -> Any:
         state = simulator.start(q, v)
         return native.run(
-            *(simulator.model(mass[None]).mjx, state, u),
+            *(simulator.model(value[None]).mjx, state, u),
             every=20 if each else None,
             read=_Read(),
             pairs=pairs,
@@ -267,11 +271,12 @@ def test_simulations_one_by_one_are_those_at_once(each: bool) -> None:
 
     neutral = jnp.ones((len(pair_ids(m)), 3))
     at_once, one_by_one = (
-        jax.jit(jax.vmap(partial(run, p), (None, 0, 0, 0))) for p in (None, neutral)
+        jax.jit(jax.vmap(partial(run, p))) for p in (None, neutral)
     )
     found = []
-    for mass in jnp.array([0.5, 1.2]):  # of which nothing is left to the next
-        given = mass, seg.qpos, seg.qvel, seg.ctrl
+    for value in jnp.array([[0.5, 0.6, 0.7], [1.2, 0.9, 0.8]]):
+        # Nothing of it is left to the next.
+        given = value, seg.qpos, seg.qvel, seg.ctrl
         a, b = at_once(*given), one_by_one(*given)
         # Only a contact holds the elbow.
         assert np.abs(a[2][..., 3]).max() > 0.1
