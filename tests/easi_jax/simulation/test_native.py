@@ -249,7 +249,11 @@ class _Read:
 
 @pytest.mark.parametrize(
     ("each", "address"),
-    [(False, "body.fore.mass"), (True, "body.fore.mass"), (True, "joint.elbow.damping")],
+    [
+        (False, "body.fore.mass"),
+        (True, "body.fore.mass"),
+        (True, "joint.elbow.damping"),
+    ],
 )
 def test_simulations_one_by_one_are_those_at_once(each: bool, address: str) -> None:
     """Contacts of pairs by neutral factors: positions, speeds and what is read.
@@ -270,9 +274,7 @@ def test_simulations_one_by_one_are_those_at_once(each: bool, address: str) -> N
         )
 
     neutral = jnp.ones((len(pair_ids(m)), 3))
-    at_once, one_by_one = (
-        jax.jit(jax.vmap(partial(run, p))) for p in (None, neutral)
-    )
+    at_once, one_by_one = (jax.jit(jax.vmap(partial(run, p))) for p in (None, neutral))
     found = []
     for value in jnp.array([[0.5, 0.6, 0.7], [1.2, 0.9, 0.8]]):
         # Nothing of it is left to the next.
