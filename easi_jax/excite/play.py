@@ -212,12 +212,17 @@ class Bench:
         """Scales ``(nu,)`` of a test's columns that keep all models inside the limits,
         with their motions; None where none are found.
 
+        A joint that goes too far has its own command made smaller; where that helps
+        little, other joints swing it, and all commands are.
+
         Args:
             test: ``(T, nu)``.
             scale: the largest that are tried, ``(nu,)``.
         """
         m = self.models[0]
         joint = {a: j for j, many in driven(m).items() for a in many}
+        dofs = {a: int(m.jnt_dofadr[j]) for a, j in joint.items()}
+        swung, before, shrunk = np.zeros(m.nv, bool), np.zeros(m.nv), np.ones(m.nu)
         for k in range(_ROUNDS):
             motions, used = self.played(scale * test)
             last = used[-1]
@@ -225,11 +230,14 @@ class Bench:
                 return scale, motions
             if scale.max() < _NOTHING:
                 break
+            for a, dof in dofs.items():
+                helped = last.joint[dof] <= before[dof] * 0.5 * (1 + shrunk[a])
+                swung[dof] |= shrunk[a] < 1 and not helped
+            before = last.joint
             over, others = last.actuator.copy(), last.joint.copy()
-            for a in range(len(scale)):
-                if a in joint:
-                    dof = int(m.jnt_dofadr[joint[a]])
-                    over[a] = max(over[a], last.joint[dof])
+            for a, dof in dofs.items():
+                over[a] = max(over[a], last.joint[dof])
+                if not swung[dof]:
                     others[dof] = 0.0
             # What no actuator of its own moves, all of them move.
             over = np.maximum(over, others.max(initial=0))
@@ -238,5 +246,6 @@ class Bench:
             shrink = np.clip(_AIM / np.maximum(over, 1e-9), 0.4, 0.9)
             if not last.whole:
                 shrink = np.minimum(shrink, 0.7)
-            scale = np.where((over > 1.0) | (not last.whole), scale * shrink, scale)
+            shrunk = np.where((over > 1.0) | (not last.whole), shrink, 1.0)
+            scale = scale * shrunk
         return None

@@ -169,3 +169,19 @@ def test_play_may_reach_its_ends() -> None:
     limits, _ = bench_of(m)
     free = np.isinf(limits.low) & np.isinf(limits.high)
     assert np.flatnonzero(free).tolist() == [m.joint("play").dofadr[0]]
+
+
+def test_a_joint_that_others_swing_keeps_its_own_command() -> None:
+    """Nearly without damping, an elbow is swung out of its limits by the shoulder; its
+    own command made ever smaller would not help."""
+    m = built('<motor name="a" joint="shoulder"/><motor name="b" joint="elbow"/>')
+    m.dof_damping[:] = 0.05, 0.02  # N m s/rad
+    _, bench = bench_of(m)
+    tests = candidates.make_tests(
+        *(bench, candidates.recipes(1 / DT, SECONDS)[:3], np.full(2, np.inf)),
+        *(SECONDS, 0),
+    )
+    assert len(tests) == 3
+    for test in tests:
+        assert test.amplitude[0] > 0.3
+        assert test.amplitude[1] > 0.05 * test.amplitude[0]
