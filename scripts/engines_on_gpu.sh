@@ -5,11 +5,11 @@
 #   sh scripts/engines_on_gpu.sh [OUT.jsonl]
 python=${PYTHON:-python3}
 out=${1:-benchmarks/results/engines.jsonl}
-for robot in go2 ant; do
-  timeout 230 "$python" -m benchmarks.engines --robots "$robot" --at-once 8 \
-    --programs mjx mjx.step --kinds replay search --populations 4096 16384 \
-    --repeats 3 --out "$out"
-done
+timeout 200 "$python" -m benchmarks.engines --robots go2 ant --at-once 8 \
+  --programs mjx mjx.step --kinds replay --populations 4096 16384 \
+  --repeats 3 --out "$out"
+timeout 260 "$python" -m benchmarks.engines --robots go2 ant --programs mjx \
+  --kinds search --out "$out"
 "$python" -c 'import warp' 2>/dev/null || { echo "no warp-lang: skipped"; exit 0; }
 timeout 130 "$python" -m benchmarks.engines --robots go2 ant --programs warp \
   --kinds replay --populations 4096 16384 --repeats 3 --out "$out"
