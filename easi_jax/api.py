@@ -26,7 +26,7 @@ from easi_jax.estimation.from_runs import (
     search_data,
 )
 from easi_jax.estimation.identifiability import seed_result
-from easi_jax.estimation.posterior import diverged
+from easi_jax.estimation.posterior import diverged, no_region
 from easi_jax.estimation.problem import HORIZON, Problem, checked_horizon, problem_of
 from easi_jax.export.mjcf import written_machine
 from easi_jax.export.policy import Interface, interface_of, policy_files
@@ -39,7 +39,7 @@ from easi_jax.io.logs.reader import read_logs
 from easi_jax.io.models.completed import base_joint, own_pose
 from easi_jax.io.models.mjcf import read_machine
 from easi_jax.io.models.parameter_file import read_parameter_file
-from easi_jax.io.report.numbers import quantity, shown_unit, with_unit
+from easi_jax.io.report.numbers import number, quantity, shown_unit, with_unit
 from easi_jax.model import distribution
 from easi_jax.model.checks import checked_array
 from easi_jax.model.distribution import Distribution
@@ -158,6 +158,8 @@ class Estimated:
             than where the search started.
         flags: ``determined``, ``not determined`` or ``at bound``, ``n``.
         undetermined: combinations that the logs leave open, a sentence each.
+        no_region: why ``std`` means nothing, as the model lacks something unknown;
+            empty where it holds.
         held_out: errors of predictions on data that no fit saw.
         notes: on data and fit, one line each.
         space: the parameters, ``distribution`` in its unit coordinates.
@@ -171,6 +173,7 @@ class Estimated:
     std: np.ndarray
     flags: tuple[Flag, ...]
     undetermined: tuple[str, ...]
+    no_region: str
     held_out: HeldOutErrors
     notes: tuple[str, ...]
     space: ParameterSpace
@@ -183,7 +186,8 @@ class Estimated:
         e = self.held_out
         width = max(map(len, (*self.names, *e.channels)))
         lines = [
-            f"{name:{width}}  {with_unit(quantity(mean, std), unit)}"
+            f"{name:{width}}  "
+            + with_unit(number(mean) if self.no_region else quantity(mean, std), unit)
             + (f"  ({flag})" if flag != "determined" else "")
             for name, mean, std, unit, flag in zip(
                 *(self.names, self.mean, self.std, self.units, self.flags), strict=True
@@ -322,6 +326,7 @@ def _estimated(
         std=np.array(result.std),
         flags=tuple(result.flags),
         undetermined=tuple(u.meaning for u in result.undetermined),
+        no_region=no_region(found),
         held_out=held_out_errors(problem, space, [unit], errors),
         notes=(*problem.notes, *notes),
         space=space,

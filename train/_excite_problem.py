@@ -241,7 +241,7 @@ def _from_data(
         return None, np.full(m.nv, _NOISE), None
     from easi_jax.data.cleaning import to_common_step
     from easi_jax.data.noise import pooled_noise
-    from easi_jax.gap.scales import scales_of
+    from easi_jax.data.scales import scales_of
     from easi_jax.io.logs.reader import read_logs
 
     log = read_logs(list(config.data), m, config.mapping, config.unmeasured)

@@ -5,28 +5,44 @@ A command that comes late moves every parameter, by the same amount in every pie
 so no scatter shows it. Whoever trusts the model in this states values that are sure and
 wrong. So the last steps of a fit to measured logs are made with such effects as
 nuisances, each with a prior about nothing: what the data tell of them is taken off the
-parameters, and what they leave open widens what is stated.
+parameters, and what they leave open widens what is stated. Commands that come late are
+always in doubt (`doubts_of`); where the model errs by more than the noise, drives,
+friction and constant forces are too (`all_doubts`).
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
+from easi_jax.errors import UserError
 from easi_jax.estimation.levenberg_marquardt import RefineResult
 from easi_jax.model import effects
 from easi_jax.model.addresses import describe
+from easi_jax.model.effect_catalog import Scales
+from easi_jax.model.effect_numbers import EFFECT_TABLE
+from easi_jax.model.joint_space import joint_name, scalar_dofs
 from easi_jax.model.parameters import Parameter, ParameterSpace
+from easi_jax.model.quantities import actuator_name
 from easi_jax.simulation.simulator import Simulator
 
 LATE = "commands come late"
 _LATE = 0.005  # s, or a control step, that commands may well be late: a deviation
-_FARTHEST = 3.0  # deviations that a simulation goes
+_FARTHEST = 3.0  # deviations that a late command's simulation goes
 _NEVER = 1e-4  # deviations: at none at all the slope would be that of an early command
 _SHOWN = 4.0  # standard deviations from nothing, that are worth a note
 _SMALL = 0.02  # deviations before any data: nobody would look for so little
+# Deviations of what else is in doubt: data sheets of drives are seldom better, and
+# seals and cables seldom lighter.
+_STRENGTH = 0.05  # of a drive's force
+_FORCE = 0.05  # of what moves a joint: dry friction, a constant force
+_ROOM = 10.0  # deviations that these go
+_EACH = 6  # joints or drives at most that have doubts of their own
+_SETS_FORCE = ("gain", "strength", "gear", "kp", "kv")
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,34 +53,94 @@ class Doubts:
         simulator: with these effects.
         space: parameters asked for, then effects: 0 is nothing, 1 a deviation of what
             is likely before any data.
-        names: of the effects.
-        units: of the effects.
+        parameters: the effects.
     """
 
     simulator: Simulator
     space: ParameterSpace
-    names: tuple[str, ...]
-    units: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
 
     @property
     def count(self) -> int:
         """Number of effects."""
-        return len(self.names)
+        return len(self.parameters)
 
     @cached_property
     def deviations(self) -> np.ndarray:
         """Of each effect before any data, SI, ``(k,)``."""
-        low, high = self.space.initial
-        return (high - low)[-self.count :]
+        return np.array([p.initial[1] - p.initial[0] for p in self.parameters])
+
+
+def doubted(
+    simulator: Simulator, space: ParameterSpace, parameters: Sequence[Parameter]
+) -> Doubts | None:
+    """The machine with effects in doubt; None where there are none."""
+    if not parameters:
+        return None
+    wider = ParameterSpace((*space.parameters, *parameters))
+    return Doubts(simulator.rebuilt(space=wider), wider, tuple(parameters))
 
 
 def doubts_of(simulator: Simulator, space: ParameterSpace) -> Doubts | None:
     """The doubts that measured logs are fitted with; None where there are none, since
     nothing is commanded, or since the model has its own word for it."""
+    return doubted(simulator, space, _late(simulator))
+
+
+def all_doubts(
+    simulator: Simulator, space: ParameterSpace, scales: Scales
+) -> Doubts | None:
+    """Doubts where the model is known to lack something: late commands, the strength of
+    drives, dry friction and constant forces of joints, of each kind what no parameter
+    that is asked for sets. Of more than six joints or drives all have the same.
+
+    Args:
+        scales: of the logs.
+    """
+    m = simulator.mj_model
+    asked = {a for p in space.parameters for a in p.addresses}
+    asked |= set(simulator.fixed)
+    found = list(_late(simulator))
+    drives = [
+        (m.actuator(a).name or str(a), f'"{actuator_name(m, a)}"') for a in range(m.nu)
+    ]
+    joints = [
+        (joint_name(m, j), f'"{joint_name(m, j)}"')
+        for j, (_, d) in scalar_dofs(m).items()
+        if not scales.hidden or not scales.hidden[d]
+    ]
+    push = {joint_name(m, j): scales.torque[d] for j, (_, d) in scalar_dofs(m).items()}
+    kinds = (
+        ("strength", "the strength of {} is another", drives, _SETS_FORCE),
+        ("coulomb", "{} has more dry friction", joints, ("frictionloss", "coulomb")),
+        ("constant", "a constant force acts on {}", joints, ("constant", "springref")),
+    )
+    for field, text, places, same in kinds:
+        free = [
+            (name, shown, f"effect.{field}.{name}")
+            for name, shown in places
+            if not any(_sets(address, name, same) for address in asked)
+        ]
+        free = [x for x in free if _possible(m, x[2])]
+        together = len(free) > _EACH
+        if together and field == "constant":
+            continue  # of one sign and size in all joints: nobody's effect
+        groups = [free] if together else [[x] for x in free]
+        for group in (g for g in groups if g):
+            shown = "every joint or drive" if together else group[0][1]
+            size = _STRENGTH
+            if field != "strength":
+                size = _FORCE * float(np.median([push[x[0]] for x in group]))
+            found.append(_parameter(m, field, text.format(shown), group, size))
+    return doubted(simulator, space, found)
+
+
+def _late(simulator: Simulator) -> tuple[Parameter, ...]:
+    """Commands that come late, where the model has no word of its own for it."""
     m, base = simulator.mj_model, simulator.base
     told = base.effects is not None and effects.has_command_memory(base.present)
     if not m.nu or told:
-        return None
+        return ()
     places = tuple(f"effect.delay.{m.actuator(i).name or i}" for i in range(m.nu))
     unit, (_, most) = describe(m, places)
     usual = max(_LATE, simulator.dt)
@@ -75,9 +151,44 @@ def doubts_of(simulator: Simulator, space: ParameterSpace) -> Doubts | None:
         unit=unit,
         log=False,
     )
-    wider = ParameterSpace((*space.parameters, late))
-    machine = simulator.rebuilt(space=wider)
-    return Doubts(machine, wider, (LATE,), (unit,))
+    return (late,)
+
+
+def _parameter(
+    m: mujoco.MjModel,
+    field: str,
+    name: str,
+    group: Sequence[tuple[str, str, str]],
+    size: float,
+) -> Parameter:
+    """An effect at the places of a ``group``, alike, of a deviation ``size``."""
+    places = tuple(address for _, _, address in group)
+    unit, (least, most) = describe(m, places)
+    neutral = EFFECT_TABLE[field].neutral
+    low, high = neutral - _ROOM * size, min(most, neutral + _ROOM * size)
+    # A force that only brakes has no slope at none at all.
+    none = neutral + _NEVER * size if least >= neutral else neutral
+    return Parameter(
+        *(name, places, none, (none, neutral + size)),
+        bounds=(none if least >= neutral else max(least, low), high),
+        unit=unit,
+        log=False,
+    )
+
+
+def _possible(m: mujoco.MjModel, address: str) -> bool:
+    """Whether a model has such an effect at all."""
+    try:
+        describe(m, (address,))
+    except UserError:
+        return False
+    return True
+
+
+def _sets(address: str, name: str, fields: Sequence[str]) -> bool:
+    """Whether an address is of one of some fields of the place ``name``."""
+    parts = address.split(".")
+    return name in parts and not set(fields).isdisjoint(parts)
 
 
 def without(fit: RefineResult, count: int) -> tuple[RefineResult, jax.Array]:
@@ -86,44 +197,55 @@ def without(fit: RefineResult, count: int) -> tuple[RefineResult, jax.Array]:
     ``(k, 2)``."""
     n = len(fit.unit) - count
 
+    def held(hessian: jax.Array) -> jax.Array:
+        own = hessian[n:, n:] + jnp.eye(count)
+        return jnp.linalg.solve(own, hessian[n:, :n])
+
     def less(hessian: jax.Array) -> jax.Array:
-        across, own = hessian[:n, n:], hessian[n:, n:] + jnp.eye(count)
-        return hessian[:n, :n] - across @ jnp.linalg.solve(own, across.T)
+        return hessian[:n, :n] - hessian[:n, n:] @ held(hessian)
 
     whole = fit.hessian + jnp.diag(jnp.where(jnp.arange(n + count) < n, 0.0, 1.0))
     size = 1.0 / jnp.sqrt(jnp.maximum(jnp.diag(whole), 1e-12))
     scaled = whole * size[:, None] * size + 1e-6 * jnp.eye(n + count)
     variance = jnp.diag(jnp.linalg.inv(scaled)) * size**2
     told = jnp.stack([fit.unit[n:], jnp.sqrt(variance[n:])], 1)
+    slopes = fit.gradients
     reduced = replace(
         fit,
         unit=fit.unit[:n],
         hessian=less(fit.hessian),
         raised=fit.raised[:n],
         raised_hessian=less(fit.raised_hessian),
+        gradients=slopes[:, :n] - slopes[:, n:] @ held(fit.hessian),
     )
     return reduced, told
 
 
-def told(doubts: Doubts, found: np.ndarray) -> list[str]:
-    """Notes on effects that the data show; ``found (k, 2)`` as of `without`."""
-    step = doubts.simulator.dt / doubts.simulator.substeps
-    notes = []
-    for name, unit, size, (mean, std) in zip(
-        doubts.names, doubts.units, doubts.deviations, found, strict=True
-    ):
-        if mean <= _SHOWN * std or mean <= _SMALL:
+def told(
+    parameters: Sequence[Parameter], found: np.ndarray, step: float
+) -> Iterator[str]:
+    """Notes on effects that the data show.
+
+    Args:
+        parameters: in doubt.
+        found: ``(k, 2)``, as of `without`.
+        step: of the physics [s].
+    """
+    for p, (mean, std) in zip(parameters, found, strict=True):
+        size = p.initial[1] - p.initial[0]
+        if abs(mean) <= _SHOWN * std or abs(mean) <= _SMALL:
             continue
-        by = f"{name}, by {mean * size:.2g} ± {std * size:.1g} {unit}, which the model "
-        held = "does not know: values are stated as if it did"
-        if mean * size < step:
-            notes.append(
-                f"{by}{held} (a timestep of {step:g} s makes about half of itself; a "
-                "smaller one predicts better)"
+        by = (
+            f"{p.name}, by {mean * size:.2g} ± {std * size:.1g} {p.unit}".rstrip()
+            + ", which the model does not know: values are stated as if it did"
+        )
+        if p.name == LATE and mean * size < step:
+            yield (
+                f"{by} (a timestep of {step:g} s makes about half of itself; a smaller "
+                "one predicts better)"
             )
         else:
-            notes.append(
-                f"{by}{held}, so they are truer, but alone they do not predict better. "
+            yield (
+                f"{by}, so they are truer, but alone they do not predict better. "
                 "train.gap with these logs names what is missing; then give --effects"
             )
-    return notes

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -14,13 +15,15 @@ from easi_jax.data import unmeasured
 from easi_jax.data.activations import activation_guess, activation_spread
 from easi_jax.data.noise import resolutions
 from easi_jax.data.recording import Run
+from easi_jax.data.scales import scales_of
 from easi_jax.data.segments import Segments, to_device
 from easi_jax.data.sensor_channels import NO_SENSORS
 from easi_jax.data.windows import lead_rows
 from easi_jax.devices import distributed
 from easi_jax.devices.mesh import make_mesh, placed, replicated
 from easi_jax.devices.runtime import quick_compile
-from easi_jax.estimation.doubts import Doubts, doubts_of, told
+from easi_jax.estimation.blocks import FEWEST, enough
+from easi_jax.estimation.doubts import Doubts, all_doubts, doubts_of, told
 from easi_jax.estimation.identifiability import identifiability
 from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.pieces import effective_noise, few, segments_from_runs
@@ -28,6 +31,7 @@ from easi_jax.estimation.posterior import (
     Estimate,
     diverged,
     estimate,
+    no_region,
     polished,
     widened,
 )
@@ -172,6 +176,7 @@ class _Finish:
         hidden: misfit that leaves out velocities that were derived from positions.
         start: what is known of starts.
         doubts: what the model may lack; None where nothing is refined.
+        lacking: what it may lack as well where it errs by more than the noise.
     """
 
     def __init__(
@@ -188,6 +193,7 @@ class _Finish:
         simulator = problem.sensing if refined else problem.simulator
         self.simulator = simulator
         self.doubts = doubts_of(simulator, search.space) if refined else None
+        self.endings: dict[bool, Any] = {}
         # With commands before each piece, where one that comes late needs them.
         cutting = self.doubts.simulator if self.doubts else simulator
         steps = max(problem.steps, round(_FINISH / simulator.dt))
@@ -215,10 +221,25 @@ class _Finish:
         n = self.search.space.size
         like = jnp.zeros(n), jnp.eye(n), self.pieces, self.hidden, _ROBUST, False
         self._fit = jax.jit(self.fit).lower(*placed(like)).compile(quick_compile())
-        self.more = self.doubts is not None or self.pieces.count < self.whole.count
-        if self.more:
-            like = jnp.zeros(n), jnp.eye(n), self.whole, self.hidden
-            self._end = jax.jit(self.end).lower(*placed(like)).compile(quick_compile())
+        if self.refined:
+            self.ending(False)
+
+    @cached_property
+    def lacking(self) -> Doubts | None:
+        """Of the logs, in which something is missing."""
+        m = self.simulator.mj_model
+        scales = scales_of(m, self.problem.fit)
+        return all_doubts(self.simulator, self.search.space, scales)
+
+    def ending(self, lacking: bool) -> Any:
+        """The compiled last steps, with the doubts that are usual or with all."""
+        if lacking not in self.endings:
+            n = self.search.space.size
+            doubts = self.lacking if lacking else self.doubts
+            like = placed((jnp.zeros(n), jnp.eye(n), self.whole, self.hidden))
+            program = jax.jit(partial(self.end, doubts)).lower(*like)
+            self.endings[lacking] = program.compile(quick_compile())
+        return self.endings[lacking]
 
     def paired(self, pieces: Any, misfit: Any) -> PairedFit:
         """What is fitted."""
@@ -240,13 +261,13 @@ class _Finish:
         return found, self.errors(found, pieces)
 
     def end(
-        self, center: Any, cov: Any, whole: Any, misfit: Any
+        self, doubts: Doubts | None, center: Any, cov: Any, whole: Any, misfit: Any
     ) -> tuple[Estimate, jax.Array]:
-        """The last steps, on all pieces and with all doubts."""
+        """The last steps, on all pieces and with ``doubts``."""
         informed = self.search.config.informed_spread
         given = self.paired(whole, misfit), center, cov, informed
-        found = polished(*given, doubts=self.doubts)
-        return found, self.errors(found, whole, self.doubts)
+        found = polished(*given, doubts=doubts)
+        return found, self.errors(found, whole, doubts)
 
     def errors(
         self, found: Estimate, pieces: Segments, doubts: Doubts | None = None
@@ -275,16 +296,29 @@ class _Finish:
             weighed = replace(pieces, weight=pieces.weight * weight)
             center = found.fit
             self.tell(f"least-squares finish: pass {k + 1} of {_PASSES}")
-        if self.more and self.pieces.count < self.whole.count:
+        if self.refined and self.pieces.count < self.whole.count:
             weighed = self.whole
-        for k in range(_ENDINGS if self.more and not self.lost(found) else 0):
-            given = center, cov, weighed, misfit
-            found, error = distributed.local(self._end(*placed(given)))
-            misfit, weight = self.judged(error, weighed, self.whole)
-            weighed = replace(self.whole, weight=self.whole.weight * weight)
-            center = found.fit
-            self.tell(f"on all of the logs: pass {k + 1} of {_ENDINGS}")
+        for lacking in (False, True):
+            if not self.refined or self.lost(found):
+                break
+            if lacking and not self.lacks(found):
+                break
+            what = ", with more in doubt" if lacking else ""
+            for k in range(_ENDINGS):
+                given = center, cov, weighed, misfit
+                found, error = distributed.local(self.ending(lacking)(*placed(given)))
+                misfit, weight = self.judged(error, weighed, self.whole)
+                weighed = replace(self.whole, weight=self.whole.weight * weight)
+                center = found.fit
+                self.tell(f"on all of the logs{what}: pass {k + 1} of {_ENDINGS}")
         return found.replace(search_mean=mean, search_cov=cov), weight
+
+    def lacks(self, found: Estimate) -> bool:
+        """Whether the model surely errs by more than the noise, and more can be in
+        doubt than was."""
+        if float(widened(found.excess)) <= _LACKING or self.lacking is None:
+            return False
+        return self.lacking.count > len(found.doubted)
 
     def lost(self, found: Estimate) -> bool:
         """Whether a fit is none."""
@@ -310,8 +344,10 @@ class _Finish:
                 "fit much worse than the rest and weigh less than half "
                 "(a bump, a wrong reading, or motion that the model lacks)"
             )
-        times = float(widened(found.excess))
-        if times > _LACKING:
+        times, why = float(widened(found.excess)), no_region(found)
+        if why:
+            notes.append(why)
+        elif times > _LACKING:
             notes.append(
                 "the model errs by more than the noise explains, so it lacks "
                 "something, and parameters take up part of that: their spreads are "
@@ -324,16 +360,22 @@ class _Finish:
                 "sensors read before the command of their row was sent: "
                 f"{', '.join(early)}; compared as such"
             )
-        if self.doubts is not None and found.doubts.size:
-            notes += told(self.doubts, np.asarray(found.doubts, float))
+        if self.refined and not enough(self.whole.count):
+            notes.append(
+                f"spreads are those of the noise model: {self.whole.count} pieces make "
+                f"fewer than {FEWEST} blocks, too few to see how values scatter between"
+            )
+        step = self.simulator.dt / self.simulator.substeps
+        notes += told(found.doubted, np.asarray(found.doubts, float), step)
         return notes + self.contradictions(found, weight)
 
     def contradictions(self, found: Estimate, weight: jax.Array) -> list[str]:
         """Notes on recordings that lead elsewhere than all of them together do."""
         names = list(dict.fromkeys(run.recording for run in self.problem.fit))
-        if not (self.more and 2 <= len(names) <= _COMPARED):
+        if not (self.refined and 2 <= len(names) <= _COMPARED):
             return []
-        notes = []
+        usual = self.doubts.count if self.doubts else 0
+        end, notes = self.ending(len(found.doubted) > usual), []
         for name in names:
             mine = self.whole.weight * weight * (self.owner == name)
             if not np.any(mine > 0):
@@ -342,7 +384,7 @@ class _Finish:
                 *(found.fit, found.search_cov),
                 *(replace(self.whole, weight=mine), found.misfit),
             )
-            alone = distributed.local(self._end(*placed(given)))[0]
+            alone = distributed.local(end(*placed(given)))[0]
             notes += _contradiction(self.search.space, name, alone, found)
         return notes
 

@@ -72,6 +72,8 @@ class RefineResult:
         excess: by how much the weighted squared error at ``unit`` exceeds what the
             noise accounts for (`easi_jax.estimation.weights.excess`), ``()``.
         simulated: control steps simulated, ``()``; a derivative counts as one more.
+        gradients: of each piece at ``unit``, ``(M, n)``; none, ``(0, n)``, where the
+            fit has only begun (`easi_jax.estimation.polish` tells them).
     """
 
     unit: jax.Array
@@ -82,6 +84,7 @@ class RefineResult:
     raised_hessian: jax.Array
     excess: jax.Array
     simulated: jax.Array
+    gradients: jax.Array
 
 
 def refine(
@@ -125,6 +128,7 @@ def refine(
         raised_hessian=hessian[-1],
         excess=weights.excess(best.pieces, fit.weight),
         simulated=1.0 * fit.points * paired.segments.count * steps.sum(),
+        gradients=jnp.zeros((0, unit.size)),
     )
 
 

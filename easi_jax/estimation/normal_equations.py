@@ -38,7 +38,7 @@ class Normal:
 
     Attributes:
         hessian: ``(n, n)``, information in unit coordinates.
-        gradient: ``(n,)``.
+        gradients: of each piece, ``(M, n)``.
         costs: half the weighted squared error of each piece, ``(M,)``; inf where the
             simulation is not finite, which leaves no other trace here.
         start_step: ``(M, S)`` correction of each start at zero parameter step.
@@ -46,10 +46,15 @@ class Normal:
     """
 
     hessian: jax.Array
-    gradient: jax.Array
+    gradients: jax.Array
     costs: jax.Array
     start_step: jax.Array
     start_gain: jax.Array
+
+    @property
+    def gradient(self) -> jax.Array:
+        """Of all pieces, ``(n,)``."""
+        return self.gradients.sum(0)
 
 
 @dataclass(frozen=True)
@@ -199,7 +204,7 @@ class PairedFit:
 
     def _summed(self, parts: Any) -> Normal:
         hess, grad, cost, step, gain = parts
-        return Normal(hess.sum(0), grad.sum(0), cost, step, gain)
+        return Normal(hess.sum(0), grad, cost, step, gain)
 
     def _cost(self, r: jax.Array, d: jax.Array, w: jax.Array) -> jax.Array:
         square = jnp.where(w > 0, w * (r / self.noise) ** 2, 0.0).sum()

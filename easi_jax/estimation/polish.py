@@ -89,6 +89,7 @@ def polish(paired: PairedFit, unit: jax.Array, doubts: int = 0) -> RefineResult:
         raised_hessian=jnp.where(below, end.seen, told.hessian),
         excess=excess(jnp.where(end.used, told.costs, jnp.inf), weight),
         simulated=1.0 * whole * end.k,
+        gradients=told.gradients,
     )
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import flax.struct
 import jax
@@ -11,15 +10,16 @@ import numpy as np
 from jax.sharding import Mesh
 
 from easi_jax.data.segments import Segments
+from easi_jax.estimation.blocks import scattered
 from easi_jax.estimation.doubts import Doubts, without
 from easi_jax.estimation.levenberg_marquardt import RefineResult, refine
 from easi_jax.estimation.normal_equations import RESOLVED, PairedFit
 from easi_jax.estimation.pieces import effective_noise, finish_pieces, finish_rest
 from easi_jax.estimation.polish import polish
 from easi_jax.estimation.profile_score import adjust
-from easi_jax.estimation.weights import excess
+from easi_jax.estimation.weights import excess, step_weights, times_noise
 from easi_jax.model.distribution import Distribution, gaussian
-from easi_jax.model.parameters import ParameterSpace
+from easi_jax.model.parameters import Parameter, ParameterSpace
 from easi_jax.simulation.simulator import FORWARD_MODE, Simulator
 
 RESTARTS = 2  # of the finish on noisy data, where it has more than one minimum
@@ -27,6 +27,7 @@ _SHARP = 1.0 / 3.0  # of a value: its standard deviation where logarithms will d
 _FAR = 3.0  # standard deviations
 _KNOWN = 0.5  # of the initial range's top: a standard deviation that says something
 _HIDDEN = 0.1  # of what a model errs by, that a parameter takes up unseen
+_UNSTATED = 2.0  # times the noise, that a model errs by with all doubts
 # Of a uniform initial range, unit coordinates.
 _MIDDLE, _INITIAL_VARIANCE = 0.5, 1.0 / 12.0
 
@@ -55,6 +56,7 @@ class Estimate:
         start: what was known of starts, standard deviations ``(S,)``.
         doubts: of effects that the model may lack, means and standard deviations in
             those before any data, ``(k, 2)`` (`easi_jax.estimation.doubts`).
+        doubted: these effects.
     """
 
     distribution: Distribution
@@ -71,6 +73,7 @@ class Estimate:
     misfit: jax.Array
     start: jax.Array
     doubts: jax.Array
+    doubted: tuple[Parameter, ...] = flax.struct.field(pytree_node=False, default=())
 
 
 def estimate(
@@ -146,7 +149,8 @@ def polished(
         wider = replace(paired, simulator=doubts.simulator, space=doubts.space)
         begin = jnp.concatenate([center, jnp.zeros(doubts.count)])
         fit, told = without(polish(wider, begin, doubts.count), doubts.count)
-        return replace(_of_fit(paired, fit, center, cov, informed), doubts=told)
+        found = _of_fit(paired, fit, center, cov, informed)
+        return replace(found, doubts=told, doubted=doubts.parameters)
     fit = polish(paired, center)
     if adjusted:
         fit = _adjusted(paired, fit)
@@ -179,6 +183,7 @@ def _of_search(
         raised_hessian=eq.hessian,
         excess=left,
         simulated=simulated,
+        gradients=jnp.zeros((0, mean.size)),
     )
     stated = (center, spread) if informed else (mean, cov)
     return _stated(paired, ended, mean, cov, *stated)
@@ -193,12 +198,14 @@ def _of_fit(
 ) -> Estimate:
     """What is stated of a fit, after a search that ended at ``mean``, ``cov``."""
 
-    def said(trusted: Any) -> tuple[jax.Array, jax.Array]:
-        known = _posterior(fit.raised_hessian * trusted)
+    def said(information: jax.Array) -> tuple[jax.Array, jax.Array]:
+        known = _posterior(information)
         return _near_zero(paired.space, fit.unit, fit.raised, *known)
 
-    center = said(1.0)[0]  # what predicts best, whatever it stands in for
-    spread = said(_trusted(fit.excess))[1]
+    # What predicts best, whatever it stands in for.
+    center = said(fit.raised_hessian)[0]
+    left = scattered(fit.raised_hessian, fit.hessian, fit.gradients)
+    spread = said(left * _trusted(fit.excess))[1]
     return _stated(paired, fit, mean, cov, center, spread if informed else cov)
 
 
@@ -300,6 +307,25 @@ def _trusted(excess: jax.Array) -> jax.Array:
 def widened(excess: jax.Array) -> jax.Array:
     """How many times wider spreads are for what the model errs by beyond the noise."""
     return 1.0 / jnp.sqrt(_trusted(excess))
+
+
+def no_region(found: Estimate) -> str:
+    """Why no region can be stated of an estimate; empty where one can.
+
+    With all that is likely in doubt the model still errs by so much more than the noise
+    that what moves the parameters is nothing that anybody thought of.
+    """
+    weight = step_weights(found.pieces, found.noise, found.misfit)
+    times = float(times_noise(found.excess, weight))
+    if times <= _UNSTATED:
+        return ""
+    return (
+        f"no region is stated: the model errs by {times:.2g} times the noise, also "
+        "where late commands, friction, constant forces and the strength of drives are "
+        "allowed for. How far values are from the truth cannot be said, only that they "
+        "predict best. train.gap with these logs names what is missing; then give "
+        "--effects"
+    )
 
 
 def diverged(found: Estimate, names: Sequence[str]) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from easi_jax.devices import distributed
 from easi_jax.devices.mesh import placed
 from easi_jax.devices.runtime import quick_compile
-from easi_jax.estimation.doubts import doubts_of
+from easi_jax.estimation.doubts import doubted
 from easi_jax.estimation.identifiability import (
     WEAK,
     identifiability,
@@ -27,10 +27,12 @@ from easi_jax.estimation.identifiability import (
     settled,
 )
 from easi_jax.estimation.normal_equations import PairedFit
-from easi_jax.estimation.posterior import Estimate, polished
-from easi_jax.model.parameters import ParameterSpace
+from easi_jax.estimation.posterior import Estimate, no_region, polished
+from easi_jax.model.parameters import Parameter, ParameterSpace
 from easi_jax.model.results import Relative, SeedResult
 from easi_jax.simulation.simulator import Simulator
+
+Effects = tuple[Parameter, ...]
 
 
 def seed_results(
@@ -49,14 +51,14 @@ def seed_results(
     """
 
     @functools.cache
-    def held(taken: tuple[int, ...], doubted: bool) -> tuple[ParameterSpace, Any]:
+    def held(taken: tuple[int, ...], doubts: Effects) -> tuple[ParameterSpace, Any]:
         """The other parameters, and their fit."""
         given = [space.parameters[i] for i in taken]
         rest = tuple(p for p in space.parameters if p not in given)
         rest = ParameterSpace(rest)
         fixed = {a: p.nominal for p in given for a in p.addresses}
         machine = simulator.rebuilt(space=rest, fixed={**simulator.fixed, **fixed})
-        doubts = doubts_of(machine, rest) if doubted else None
+        wider = doubted(machine, rest, doubts)
 
         def fit(unit: Any, pieces: Any, noise: Any, misfit: Any, start: Any) -> Any:
             paired = PairedFit(
@@ -66,7 +68,7 @@ def seed_results(
                 misfit=misfit,
             )
             nothing = jnp.eye(rest.size)
-            return polished(paired, unit, nothing, adjusted=adjusted, doubts=doubts)
+            return polished(paired, unit, nothing, adjusted=adjusted, doubts=wider)
 
         compiled: list[Any] = []
 
@@ -88,7 +90,7 @@ def seed_results(
         scaled = np.asarray(found.fit, float) * ident.scale
         off = scaled[taken] - nominal[taken] * ident.scale[taken]
         start = np.clip((scaled - gain @ off) / ident.scale, low, high)
-        rest, fit = held(tuple(taken), bool(found.doubts.size))
+        rest, fit = held(tuple(taken), found.doubted)
         at = np.delete(np.arange(space.size), taken)
         new = fit(
             jnp.asarray(start[at], found.fit.dtype),
@@ -115,4 +117,6 @@ def seed_results(
 
 def _result(space: ParameterSpace, found: Estimate) -> SeedResult:
     root = np.asarray(found.distribution.factor, np.float64)
-    return seed_result(space, found.distribution.mean, root @ root.T, found.hessian)
+    stated = found.distribution.mean, root @ root.T
+    result = seed_result(space, *stated, found.hessian)
+    return replace(result, no_region=no_region(found))

@@ -39,6 +39,13 @@ def excess(costs: jax.Array, weight: jax.Array) -> jax.Array:
     return jnp.maximum(error - _NOISIER**2 * numbers, 0.0)
 
 
+def times_noise(excess: jax.Array, weight: jax.Array) -> jax.Array:
+    """RMS error in units of the noise, ``()``, of what leaves an `excess`; ``weight``
+    as there."""
+    share = excess / jnp.maximum(weight.sum(), 1e-30)
+    return jnp.sqrt(share + _NOISIER**2)
+
+
 def huber(size: A, limit: float) -> A:
     """Huber's weight of each error by its ``size (M,)``: less than 1 beyond ``limit``
     median sizes."""

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.data.recording import physics_steps
+from easi_jax.data.scales import scales_of
 from easi_jax.errors import UserError, nearest
 from easi_jax.excite import evaluate as ev
 from easi_jax.excite.candidates import Test
@@ -20,7 +21,6 @@ from easi_jax.excite.separation import (
 )
 from easi_jax.gap.batched_least_squares import bounds_of
 from easi_jax.gap.candidates import places, ripples
-from easi_jax.gap.scales import scales_of
 from easi_jax.gap.table import Place, covered, does
 from easi_jax.model.effect_catalog import EFFECTS, Scales
 from easi_jax.model.joint_space import scalar_dofs

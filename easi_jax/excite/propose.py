@@ -8,13 +8,13 @@ import mujoco
 import numpy as np
 
 from easi_jax.data.recording import Run
+from easi_jax.data.scales import scales_of
 from easi_jax.errors import UserError
 from easi_jax.excite import candidates, drives
 from easi_jax.excite import evaluate as ev
 from easi_jax.excite.separation import Design, alike, separation
 from easi_jax.gap.batched_least_squares import Bounds
 from easi_jax.gap.predictor import Predictor
-from easi_jax.gap.scales import scales_of
 from easi_jax.gap.table import Place
 from easi_jax.gap.window_set import WindowSet, join
 from easi_jax.model.joint_space import scalar_dofs

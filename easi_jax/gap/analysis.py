@@ -16,6 +16,7 @@ import numpy as np
 
 from easi_jax.data.noise import pooled, resolutions
 from easi_jax.data.recording import Run, physics_steps
+from easi_jax.data.scales import scales_of
 from easi_jax.data.sensor_channels import Sensors, measured_sensors, read_at_end
 from easi_jax.data.windows import lead_rows
 from easi_jax.errors import UserError
@@ -39,7 +40,6 @@ from easi_jax.gap.model_comparison import (
 )
 from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.result import Figures, Found, Numbers, Outcome, Part
-from easi_jax.gap.scales import scales_of
 from easi_jax.gap.table import Place, covered, does
 from easi_jax.gap.verdict import openness, surely_better, verdict_of
 from easi_jax.gap.whitening import make_residuals

@@ -296,6 +296,7 @@ class SeedResult:
         relative: None where no mass or length settles a direction.
         outcome: how its fit ended; ``reason`` names what it is about. One that diverged
             has no result, and is no `SeedResult`.
+        no_region: why no region is stated about ``mean``; empty where one is.
     """
 
     mean: list[float]
@@ -310,6 +311,7 @@ class SeedResult:
     relative: Relative | None = None
     outcome: Outcome = "converged"
     reason: str = ""
+    no_region: str = ""
 
 
 @dataclass(frozen=True)

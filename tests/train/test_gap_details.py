@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from easi_jax.data.cleaning import true_readings
+from easi_jax.data.scales import scales_of
 from easi_jax.gap.candidates import places
-from easi_jax.gap.scales import scales_of
 from easi_jax.gap.table import covered
 from easi_jax.io.logs.reader import read_logs
 from easi_jax.io.models.effects_file import read_effects

@@ -51,6 +51,7 @@ class ParameterRow:
         bounds: where it may go; given with the flag ``at bound``.
         nominal: the model's value.
         depends: parameters taken from the model that a ``relative`` value rests on.
+        region: whether ``std`` may be stated.
     """
 
     name: str
@@ -64,11 +65,12 @@ class ParameterRow:
     bounds: tuple[float, float] | None = None
     nominal: float | None = None
     depends: tuple[str, ...] = ()
+    region: bool = True
 
     @property
     def found(self) -> str:
-        """What was found, with its standard deviation."""
-        if self.flag == "taken":
+        """What was found, with its standard deviation where one may be stated."""
+        if self.flag == "taken" or not self.region:
             return number(self.mean)
         return quantity(self.mean, self.std)
 
@@ -84,9 +86,11 @@ class ParameterRow:
     @property
     def verdict(self) -> str:
         """What may be believed of it."""
-        if self.flag == "relative":
-            return f"given {', '.join(self.depends)}"
-        return "taken from the model" if self.flag == "taken" else self.flag
+        if self.flag == "taken":
+            return "taken from the model"
+        given = f"given {', '.join(self.depends)}"
+        said = given if self.flag == "relative" else self.flag
+        return said if self.region else f"{said}; no region"
 
 
 @dataclasses.dataclass(frozen=True)

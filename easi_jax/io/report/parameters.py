@@ -61,6 +61,7 @@ def parameter_rows(
                 bounds=p.bounds,
                 nominal=p.nominal,
                 depends=depends if flag == "relative" else (),
+                region=not result.no_region,
             )
         )
     return sorted(rows, key=_rank)

@@ -1,23 +1,36 @@
 """Effects that a model may lack: commands that come late."""
 
+import copy
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
+from easi_jax.data.recording import Run
+from easi_jax.data.scales import scales_of
 from easi_jax.data.segments import Segments, cut, join, to_device
-from easi_jax.estimation.doubts import LATE, Doubts, doubts_of, told, without
+from easi_jax.estimation.doubts import (
+    LATE,
+    Doubts,
+    all_doubts,
+    doubts_of,
+    told,
+    without,
+)
 from easi_jax.estimation.levenberg_marquardt import RefineResult
 from easi_jax.estimation.normal_equations import PairedFit
-from easi_jax.estimation.posterior import Estimate, polished
+from easi_jax.estimation.posterior import Estimate, no_region, polished
 from easi_jax.model.distribution import covariance
+from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace, declare
 from easi_jax.simulation.simulator import Simulator
 
 _DT, _STEPS = 0.01, 20  # s, control steps
 _NOISE = np.array([2e-4, 5e-3])  # rad, rad/s
 _LATE = 0.004  # s
+_FRICTION = 0.05  # N m
 _XML = """<mujoco><option timestep="0.002" integrator="implicitfast"/>
   <worldbody><body><joint name="j" axis="0 1 0" damping="0.1" armature="0.01"/>
     <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.5"/></body>
@@ -39,7 +52,9 @@ def _space(m: mujoco.MjModel) -> ParameterSpace:
     )
 
 
-def _recorded(m: mujoco.MjModel, late: int, past: int, seed: int) -> Segments:
+def _recorded(
+    m: mujoco.MjModel, late: int, past: int, seed: int
+) -> tuple[Segments, Run]:
     """Pieces with noise, of MuJoCo C alone, commands late by physics steps."""
     rng, rows, sub = np.random.default_rng(seed), 600, 5
     d = mujoco.MjData(m)
@@ -57,7 +72,9 @@ def _recorded(m: mujoco.MjModel, late: int, past: int, seed: int) -> Segments:
     q, v = np.split(states, 2, axis=1)
     piece = cut(q, v, u[:, None], _STEPS, _STEPS, past)
     assert piece is not None
-    return to_device(join([piece]))
+    configuration = Configuration.of(m)
+    run = Run(*("run", "made", _DT, time[:, 0], q, v, True, u[:, None], configuration))
+    return to_device(join([piece])), run
 
 
 @pytest.fixture(scope="module")
@@ -86,8 +103,12 @@ def test_what_is_said_of_parameters_whatever_the_effects_are() -> None:
     info = jnp.asarray(root.T @ root, jnp.float32)
     zero = jnp.zeros(())
     unit = jnp.arange(5.0)
-    fit = RefineResult(unit, info, zero, zero, unit, 2 * info, zero, zero)
+    slopes = jnp.asarray(root, jnp.float32)
+    fit = RefineResult(unit, info, zero, zero, unit, 2 * info, zero, zero, slopes)
     reduced, effects = without(fit, 2)
+    own = np.asarray(info)[3:, 3:] + np.eye(2)
+    less = root[:, :3] - root[:, 3:] @ np.linalg.solve(own, np.asarray(info)[3:, :3])
+    np.testing.assert_allclose(reduced.gradients, less, rtol=2e-3, atol=1e-4)
     for got, given in ((reduced.hessian, info), (reduced.raised_hessian, 2 * info)):
         whole = np.asarray(given, float) + np.diag([0.0, 0.0, 0.0, 1.0, 1.0])
         exact = np.linalg.inv(whole)
@@ -114,15 +135,88 @@ def test_values_hold_where_commands_come_late(doubts: Doubts) -> None:
         std = np.sqrt(np.diag(covariance(stated.distribution)))
         return float((np.abs(found.distribution.mean - truth) / std).max())
 
-    late = _recorded(m, 2, simulator.past_steps, 0)
+    late, _ = _recorded(m, 2, simulator.past_steps, 0)
     alone, marginal = fit(late)
     assert off(alone, marginal) > 10.0 and off(marginal, marginal) < 3.0
     mean, std = np.asarray(marginal.doubts[0]) * float(doubts.deviations[0])
     assert abs(mean - _LATE) < 4.0 * std and std < 0.1 * _LATE
-    (line,) = told(doubts, np.asarray(marginal.doubts))
+    (line,) = told(doubts.parameters, np.asarray(marginal.doubts), 0.002)
     assert line.startswith(LATE) and "0.004" in line
     # On time, nothing is lost but a little sureness.
-    alone, marginal = fit(_recorded(m, 0, simulator.past_steps, 1))
+    alone, marginal = fit(_recorded(m, 0, simulator.past_steps, 1)[0])
     spreads = [np.sqrt(np.diag(covariance(x.distribution))) for x in (alone, marginal)]
     assert off(marginal, marginal) < 3.0 and (spreads[1] < 3.0 * spreads[0]).all()
-    assert not told(doubts, np.asarray(marginal.doubts))
+    assert not list(told(doubts.parameters, np.asarray(marginal.doubts), 0.002))
+
+
+def test_what_is_in_doubt_where_something_is_missing() -> None:
+    """What no parameter that is asked for sets; of many joints all alike."""
+    m = mujoco.MjModel.from_xml_string(_XML)
+    _, run = _recorded(m, 0, 0, 0)
+    scales = scales_of(m, [run])
+    asked = _space(m).select(["damping"])
+    found = all_doubts(Simulator(m, asked, _DT, engine="mujoco"), asked, scales)
+    assert found is not None
+    late, strength, friction, force = found.parameters
+    assert late.name == LATE and strength.addresses == ("effect.strength.a",)
+    assert strength.nominal == 1.0 and strength.initial == (1.0, 1.05)
+    assert friction.addresses == ("effect.coulomb.j",) and friction.bounds[0] > 0
+    assert force.addresses == ("effect.constant.j",) and force.bounds[0] < 0
+    assert force.initial[1] == pytest.approx(0.05 * scales.torque[0])
+    # A drive's gains are its strength.
+    whole = _space(m)
+    found = all_doubts(Simulator(m, whole, _DT, engine="mujoco"), whole, scales)
+    assert found is not None
+    assert not any("strength" in p.name for p in found.parameters)
+
+
+def test_values_hold_where_friction_is_missing() -> None:
+    """Without doubt they are wrong by many of the standard deviations with it."""
+    m = mujoco.MjModel.from_xml_string(_XML)
+    real = copy.copy(m)
+    real.dof_frictionloss[:] = _FRICTION
+    space = _space(m)
+    simulator = Simulator(m, space, _DT, engine="mujoco")
+    pieces, run = _recorded(real, 0, simulator.past_steps, 3)
+    doubts = all_doubts(simulator, space, scales_of(m, [run]))
+    assert doubts is not None
+    pieces, _ = _recorded(real, 0, doubts.simulator.past_steps, 3)
+    noise, cov = jnp.asarray(_NOISE, jnp.float32), 0.01 * jnp.eye(3)
+    truth = space.to_unit(jnp.asarray(space.nominal))
+
+    @jax.jit
+    def fit(pieces: Segments) -> tuple[Estimate, Estimate]:
+        given = PairedFit(simulator, space, pieces, noise), truth, cov
+        return polished(*given), polished(*given, doubts=doubts)
+
+    alone, marginal = fit(pieces)
+    std = np.sqrt(np.diag(covariance(marginal.distribution)))
+    assert (np.abs(alone.distribution.mean - truth) / std).max() > 5.0
+    assert (np.abs(marginal.distribution.mean - truth) / std).max() < 3.0
+    told_of = list(told(marginal.doubted, np.asarray(marginal.doubts), 0.002))
+    assert any('"j" has more dry friction' in line for line in told_of)
+    assert not no_region(marginal)
+
+
+def test_no_region_is_stated_where_nothing_likely_explains_the_error() -> None:
+    """A spring that grows with the cube of the angle, and a noise far below it."""
+    m = mujoco.MjModel.from_xml_string(_XML)
+    odd = _XML.replace('damping="0.1"', 'damping="0.1" stiffness="0 0 30"')
+    space = _space(m)
+    simulator = Simulator(m, space, _DT, engine="mujoco")
+    doubts = doubts_of(simulator, space)
+    assert doubts is not None
+    past = doubts.simulator.past_steps
+    truth = space.to_unit(jnp.asarray(space.nominal))
+    noise, cov = jnp.asarray(_NOISE, jnp.float32), 0.01 * jnp.eye(3)
+
+    @jax.jit
+    def fit(pieces: Segments) -> Estimate:
+        given = PairedFit(simulator, space, pieces, noise), truth, cov
+        return polished(*given, doubts=doubts)
+
+    right, _ = _recorded(m, 0, past, 4)
+    wrong, _ = _recorded(mujoco.MjModel.from_xml_string(odd), 0, past, 4)
+    assert not no_region(fit(right))
+    why = no_region(fit(wrong))
+    assert why.startswith("no region is stated") and "times the noise" in why

@@ -8,12 +8,12 @@ import pytest
 
 from easi_jax.data.cleaning import rows_of
 from easi_jax.data.recording import Run
+from easi_jax.data.scales import scales_of
 from easi_jax.data.windows import lead_rows
 from easi_jax.excite import candidates, choose, drives, play, separation
 from easi_jax.excite import evaluate as ev
 from easi_jax.excite.propose import propose, quick_tests
 from easi_jax.gap.batched_least_squares import bounds_of, least_squares, lockstep
-from easi_jax.gap.scales import scales_of
 from easi_jax.gap.whitening import make_residuals
 from easi_jax.gap.window_starts import window_starts
 from easi_jax.model.joint_space import Configuration

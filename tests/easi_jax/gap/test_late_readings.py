@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from easi_jax.data.recording import Run
+from easi_jax.data.scales import scales_of
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.gap.candidates import places
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.predictor import Predictor
-from easi_jax.gap.scales import scales_of
 from easi_jax.gap.window_set import window_set
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace

@@ -4,10 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
+from easi_jax.data.scales import scales_of
 from easi_jax.gap.candidates import places
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.predictor import Predictor
-from easi_jax.gap.scales import scales_of
 from easi_jax.gap.window_set import window_set
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import engine, native

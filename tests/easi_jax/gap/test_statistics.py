@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from easi_jax.data.recording import Run, physics_steps
+from easi_jax.data.scales import scales_of
 from easi_jax.data.windows import fitted_velocity, lead_rows
 from easi_jax.estimation.starts import Starts, floor
 from easi_jax.gap import gap_metric as measure
@@ -33,7 +34,6 @@ from easi_jax.gap.model_comparison import (
     simplest,
 )
 from easi_jax.gap.predictor import BLOCK, Predictor
-from easi_jax.gap.scales import scales_of
 from easi_jax.gap.sensor_faults import velocity_lags
 from easi_jax.gap.table import Place
 from easi_jax.gap.whitening import Residuals, make_residuals, row_groups

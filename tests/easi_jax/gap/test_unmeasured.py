@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from easi_jax.data.recording import Run
+from easi_jax.data.scales import scales_of
 from easi_jax.data.unmeasured import start_spread
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.gap.candidates import places
 from easi_jax.gap.excitation_coverage import coverage_notes
-from easi_jax.gap.scales import scales_of
 from easi_jax.gap.sensor_faults import reading_faults, velocity_lags
 from easi_jax.model.contact_pairs import never_near
 from easi_jax.model.joint_space import Configuration

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from easi_jax.data.recording import Run
+from easi_jax.data.scales import scales_of
 from easi_jax.data.segments import to_device, windows
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.errors import UserError
@@ -18,7 +19,6 @@ from easi_jax.estimation.pieces import segments_from_runs
 from easi_jax.gap.candidates import places
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.predictor import Predictor
-from easi_jax.gap.scales import scales_of
 from easi_jax.gap.window_set import window_set
 from easi_jax.model.effect_numbers import EFFECT_TABLE, fields_that_act
 from easi_jax.model.found_effects import EffectEntry, FoundEffects, joined

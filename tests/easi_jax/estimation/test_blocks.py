@@ -1,0 +1,51 @@
+"""How far an estimate scatters between blocks of the data."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from easi_jax.estimation.blocks import enough, scattered
+
+PIECES, SIZE = 400, np.array([3.0, 40.0, 900.0])
+
+
+def score(alike: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Information, and gradients whose neighbours are correlated by ``alike``, each
+    with the covariance that the information gives a piece."""
+    rng = np.random.default_rng(seed)
+    mix = np.array([[1.0, 0.6, 0.0], [0.0, 1.0, 0.3], [0.0, 0.0, 1.0]])
+    noise = rng.normal(size=(PIECES, 3))
+    for k in range(1, PIECES):
+        noise[k] = alike * noise[k - 1] + np.sqrt(1 - alike**2) * noise[k]
+    gradients = noise @ mix * SIZE
+    return PIECES * (mix * SIZE).T @ (mix * SIZE), gradients
+
+
+def left(alike: float, seed: int) -> np.ndarray:
+    """Variances with the scatter of blocks over those without."""
+    info, gradients = score(alike, seed)
+    found = scattered(*(jnp.asarray(x) for x in (info, info, gradients)))
+    np.testing.assert_allclose(found, found.T, rtol=1e-4)
+    variances = [np.diag(np.linalg.inv(np.asarray(x, float))) for x in (found, info)]
+    return variances[0] / variances[1]
+
+
+def test_a_right_model_keeps_what_it_knows() -> None:
+    """Nearly: one direction in twenty seems to scatter more by chance."""
+    ratios = np.array([left(0.0, seed) for seed in range(60)])
+    assert (ratios > 1 - 1e-3).all()
+    assert ratios.mean() < 1.08
+
+
+@pytest.mark.parametrize("alike", [0.5, 0.8])
+def test_errors_that_hang_together_count_as_fewer(alike: float) -> None:
+    """By the share that is known of such a series: (1 + a) / (1 - a)."""
+    ratios = np.array([left(alike, seed) for seed in range(60)])
+    assert np.median(ratios) == pytest.approx((1 + alike) / (1 - alike), rel=0.25)
+
+
+def test_few_pieces_are_left_as_they_are() -> None:
+    info, gradients = (jnp.asarray(x) for x in score(0.8, 0))
+    assert enough(PIECES) and not enough(79)
+    np.testing.assert_array_equal(scattered(info, info, gradients[:79]), info)
+    np.testing.assert_array_equal(scattered(info, info, gradients[:0]), info)
