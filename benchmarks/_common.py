@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-RESULTS = Path(__file__).parent / "results"
+ROOT = Path(__file__).parents[1]  # of the checkout
+RESULTS = ROOT / "benchmarks" / "results"
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -92,7 +93,7 @@ def first_start(words: Sequence[str], cache: Path, limit: float) -> tuple[float,
     begin = time.monotonic()
     done = subprocess.run(
         [sys.executable, *words],
-        cwd=Path(__file__).parents[1],
+        cwd=ROOT,
         env={**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache)},
         stdout=subprocess.PIPE,
         text=True,
@@ -106,7 +107,7 @@ def _without_home(value: Any) -> Any:
     """Paths without the places of one machine; anything else as it is."""
     if not isinstance(value, Path) or not value.is_absolute():
         return value
-    root = Path(__file__).parents[1]
+    root = ROOT
     return value.relative_to(root) if value.is_relative_to(root) else value.name
 
 

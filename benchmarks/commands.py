@@ -30,7 +30,7 @@ from types import ModuleType
 from typing import Any
 
 from benchmarks._cells import Share, add_row, read_rows, run_cells, shard
-from benchmarks._common import RESULTS, commits_of
+from benchmarks._common import RESULTS, ROOT, commits_of
 from benchmarks._page import Section, load, table
 from benchmarks.parity_models import feature_models
 from train._command import INTERRUPTED, USER_ERROR, main, say
@@ -90,7 +90,7 @@ def run(config: Config) -> None:
     given += ["--engine", config.engine, "--limit", str(config.limit), "--worker"]
     words = [sys.executable, "-m", "benchmarks.commands", *given]
     env = {**os.environ, "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {_QUICK}"}
-    root, status = RESULTS.parents[1], _LATE_STATUS
+    root, status = ROOT, _LATE_STATUS
     while status == _LATE_STATUS or -status in _CRASHES:
         status = subprocess.run(words, cwd=root, env=env, check=False).returncode
         if -status in _CRASHES:

@@ -24,10 +24,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks._cells import Share, read_rows, run_cells
-from benchmarks._common import RESULTS
+from benchmarks._common import RESULTS, ROOT
 from train._command import main
 
-_ROOT = Path(__file__).parents[1]
 _SMALL = ("--env-steps", "12000", "--eval-episodes", "4", "--target", "cart_kp*0.5")
 _SEARCH = (
     *("--generations", "6", "--population", "16", "--trajectories", "8"),
@@ -111,7 +110,7 @@ class Jobs:
         began = time.monotonic()
         again = subprocess.run(
             [sys.executable, "-m", *words, "--resume"],
-            cwd=_ROOT,
+            cwd=ROOT,
             capture_output=True,
             text=True,
             timeout=_LIMIT,
@@ -154,7 +153,7 @@ class Jobs:
             began = time.monotonic()
             subprocess.run(
                 [sys.executable, "-m", *words, "--out", str(out), *more],
-                cwd=_ROOT,
+                cwd=ROOT,
                 stdout=subprocess.DEVNULL,
                 timeout=_LIMIT,
                 check=True,
@@ -167,7 +166,7 @@ def started(words: Sequence[str], moment: float) -> bool:
     """Starts a command and kills it after ``moment`` [s]; whether it was running."""
     process = subprocess.Popen(
         [sys.executable, "-m", *words],
-        cwd=_ROOT,
+        cwd=ROOT,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,

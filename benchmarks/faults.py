@@ -13,10 +13,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from benchmarks._common import RESULTS, command_of, write_result
+from benchmarks._common import RESULTS, ROOT, command_of, write_result
 from train._command import main, say, show_table
-
-_ROOT = Path(__file__).parents[1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +58,7 @@ def run(config: Config) -> None:
 
     from easi_jax.errors import UserError
 
-    os.chdir(_ROOT)
+    os.chdir(ROOT)
     faults = Faults()
     chosen = "fault" if config.slow else "fault and not slow"
     words = ["-q", "-p", "no:cacheprovider", "-m", f"({chosen}) and not gpu", "tests"]

@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks._cells import add_row, check_out
-from benchmarks._common import RESULTS
+from benchmarks._common import RESULTS, ROOT
 from benchmarks._page import Section, table
 from train._command import main, say
 
-ROOT = Path(__file__).parents[1]
 TARGETS = ("test", "demo")
 
 

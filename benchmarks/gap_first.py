@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks._common import ROOT
 from easi_jax.baselines import Budget, Easi, Identified, Task
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import Segments
@@ -23,8 +24,6 @@ from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.with_effects import simulator_with
-
-_ROOT = Path(__file__).parents[1]
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ class GapFirst:
             words = ["--model", model, "--data", log, "--parameters", parameters]
             done = subprocess.run(
                 [sys.executable, "-m", "train.gap", *map(str, words), "--out", out],
-                cwd=_ROOT,
+                cwd=ROOT,
                 timeout=self.time_limit,
                 capture_output=True,
                 text=True,

@@ -13,7 +13,7 @@ from collections import Counter
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from benchmarks._common import RESULTS, command_of, markdown_table, write_result
+from benchmarks._common import RESULTS, ROOT, command_of, markdown_table, write_result
 from train._command import main, say
 
 SUMMED = ("easi_jax", "train", "benchmarks")  # what is to become less
@@ -53,7 +53,7 @@ def counts(revision: str) -> Counter[str]:
     from easi_jax.errors import UserError
 
     words = ["git", "archive", "--format=tar", revision]
-    root = Path(__file__).parents[1]
+    root = ROOT
     done = subprocess.run(words, cwd=root, capture_output=True, timeout=60, check=False)
     if done.returncode:
         raise UserError(f"{revision}: {done.stderr.decode().strip()}")

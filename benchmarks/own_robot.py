@@ -14,7 +14,6 @@ from pathlib import Path
 from train._command import main, say
 
 EXAMPLE = Path("examples/lift_arm")
-ROOT = Path(__file__).parents[1]
 GOAL = 120  # s
 _LIMIT = 1200  # s
 
@@ -26,7 +25,7 @@ class Config:
 
 def run(config: Config) -> None:
     """Runs the command in a process and a compilation cache of its own."""
-    from benchmarks._common import command_of, first_start, write_result
+    from benchmarks._common import ROOT, command_of, first_start, write_result
 
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"

@@ -19,6 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from benchmarks._common import ROOT
 from train._command import main
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ def timed(cell: "Cell") -> dict[str, Any]:
         begin = time.monotonic()
         subprocess.run(
             [sys.executable, "-m", "benchmarks.paper_runtime", *words],
-            cwd=Path(__file__).parents[1],
+            cwd=ROOT,
             env={**os.environ, "JAX_COMPILATION_CACHE_DIR": str(Path(folder) / "c")},
             timeout=_LIMIT,
             check=True,

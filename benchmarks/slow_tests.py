@@ -22,11 +22,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from benchmarks._cells import Share, read_rows, run_cells
-from benchmarks._common import RESULTS, short, write_result
+from benchmarks._common import RESULTS, ROOT, short, write_result
 from benchmarks._page import Section, table
 from train._command import main, say
 
-ROOT = Path(__file__).parents[1]
 COVERED = ("easi_jax", "envs", "train")  # packages whose lines are counted
 TIERS = {"slow": "slow and not gpu", "default": "not slow and not gpu"}
 _FOLDER = Path("results") / "slow_tests"

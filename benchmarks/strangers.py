@@ -16,9 +16,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+from benchmarks._common import ROOT
 from train._command import main, say
 
-ROOT = Path(__file__).parents[1]
 STAND = ROOT.parent / "shared" / "data" / "go2_in_air"
 MACHINES = ("arm6_capsules", "go2_in_air")
 FIRST, SEARCH = 10, 120  # s, goals
