@@ -93,7 +93,7 @@ def _solver(config: Config) -> Any:
     from easi_jax.estimation.doubts import doubts_of
     from easi_jax.estimation.normal_equations import PairedFit
     from easi_jax.estimation.pieces import finish_pieces
-    from easi_jax.estimation.posterior import RESTARTS, estimate
+    from easi_jax.estimation.posterior import RESTARTS, errs_by, estimate
     from easi_jax.search.config import preset
     from easi_jax.search.easi import Search, SearchData
     from easi_jax.simulation.rollout import collect, measured
@@ -136,17 +136,19 @@ def _solver(config: Config) -> Any:
                 restarts=RESTARTS,
                 adjusted=True,
                 doubts=doubts,
-            ).distribution
+            )
             for how in ((False, False), (False, True), (True, True))
         ]
-        return found, fit.information(truth)
+        told = [e.distribution for e in found], errs_by(found[-1])
+        return *told, fit.information(truth)
 
     def solve(seed: int) -> dict[str, Any]:
         k_truth, k_rest = jax.random.split(jax.random.key(seed))
         truth = jax.random.uniform(k_truth, (space.size,))
         demos, mean, cov, lost = find(k_rest, truth)
-        found, bound = judge(demos, mean, cov, truth)
-        return _row(space, truth, found, bound, int(lost))
+        found, times, bound = judge(demos, mean, cov, truth)
+        row = _row(space, truth, found, bound, int(lost))
+        return {**row, "times_noise": float(times)}
 
     return solve
 

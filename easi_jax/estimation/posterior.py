@@ -27,7 +27,7 @@ _SHARP = 1.0 / 3.0  # of a value: its standard deviation where logarithms will d
 _FAR = 3.0  # standard deviations
 _KNOWN = 0.5  # of the initial range's top: a standard deviation that says something
 _HIDDEN = 0.1  # of what a model errs by, that a parameter takes up unseen
-_UNSTATED = 2.0  # times the noise, that a model errs by with all doubts
+UNSTATED = 2.0  # times the noise, that a model errs by with all doubts
 # Of a uniform initial range, unit coordinates.
 _MIDDLE, _INITIAL_VARIANCE = 0.5, 1.0 / 12.0
 
@@ -309,15 +309,20 @@ def widened(excess: jax.Array) -> jax.Array:
     return 1.0 / jnp.sqrt(_trusted(excess))
 
 
+def errs_by(found: Estimate) -> jax.Array:
+    """RMS error of an estimate's predictions in units of the noise, ``()``; pure."""
+    weight = step_weights(found.pieces, found.noise, found.misfit)
+    return times_noise(found.excess, weight)
+
+
 def no_region(found: Estimate) -> str:
     """Why no region can be stated of an estimate; empty where one can.
 
     With all that is likely in doubt the model still errs by so much more than the noise
     that what moves the parameters is nothing that anybody thought of.
     """
-    weight = step_weights(found.pieces, found.noise, found.misfit)
-    times = float(times_noise(found.excess, weight))
-    if times <= _UNSTATED:
+    times = float(errs_by(found))
+    if times <= UNSTATED:
         return ""
     return (
         f"no region is stated: the model errs by {times:.2g} times the noise, also "
