@@ -679,26 +679,33 @@ class Analysis:
         noise = self.held_out.floor(self._plain(base.fit.x))
         open_refit = open_after = openness(refit.square, noise, scale)
         found: list[Found] = []
+        undone = surely_better(before.square, refit.square, scale)
+        given = openness(before.square, noise, scale)
+        # What only makes up for a refit that went wrong is nothing that is missing.
+        fine = undone and not given.is_open.any()
         if model.places:
             after = self.held_out.look(self._plain(model.fit.x))
             noise = self.held_out.floor(self._plain(model.fit.x))
             # With one noise that all tell: the refit beside the better floor.
             open_refit = openness(refit.square, noise, scale)
             open_after = openness(after.square, noise, scale)
-            if surely_better(after.square, refit.square, scale):
+            least = before if undone else refit
+            if not fine and surely_better(after.square, least.square, scale):
                 found = self._found(base, model, rivals, after, noise)
             else:
-                names = ", ".join(p.key for p in model.places)
-                notes.append(
-                    f"{names}: seen in the fitting data, but the held-out data are "
-                    "predicted no better with it, so it is not named; the recordings "
-                    "differ, or are too few"
-                )
-                # Also of the noise nothing is kept that the effects made of it.
-                self.whiten(base.fit.x)
-                refit = after = self.held_out.look(self._plain(base.fit.x))
-                noise = self.held_out.floor(self._plain(base.fit.x))
-                open_refit = open_after = openness(refit.square, noise, scale)
+                notes.append(_not_named(model, fine))
+        if undone and not found:
+            notes.append(
+                "refitted to the fitting data, the model's own parameters predict the "
+                "held-out data worse than as given, so they are left as given"
+            )
+            base = self.refit([])
+        if not found and (undone or model.places):
+            # Also of the noise nothing is kept that they made of it.
+            self.whiten(base.fit.x)
+            refit = after = self.held_out.look(self._plain(base.fit.x))
+            noise = self.held_out.floor(self._plain(base.fit.x))
+            open_refit = open_after = openness(refit.square, noise, scale)
         last = model if found else base
         share = self._share(last.fit.x)
         fair = self.held_out.figures(self._plain(last.fit.x), share).gap
@@ -820,6 +827,21 @@ def _keys(model: Model) -> frozenset[str]:
 def _last(model: Model, place: Place) -> Model:
     """The model with one of its effects as the last."""
     return replace(model, places=[*[p for p in model.places if p is not place], place])
+
+
+def _not_named(model: Model, fine: bool) -> str:
+    """A note on effects of which the held-out data show nothing; ``fine``: nor that
+    anything is missing."""
+    names = ", ".join(p.key for p in model.places)
+    why = (
+        "the model as given predicts the held-out data as well as a perfect one"
+        if fine
+        else "the held-out data are predicted no better with it"
+    )
+    return (
+        f"{names}: seen in the fitting data, but {why}, so it is not named; the "
+        "recordings differ, or are too few"
+    )
 
 
 def _figures(model: Model) -> str:
