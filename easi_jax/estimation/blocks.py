@@ -60,5 +60,8 @@ def scattered(
     longer = (1.0 + 2.0 * jnp.maximum(alike, 0.0)) * free / (free - 2)
     ratio = jnp.where(more, ratio * longer, 1.0)
     shrunk = (vectors / jnp.sqrt(ratio)) @ vectors.T
-    back = size[:, None] * shrunk / size  # acts on unit coordinates from the left
-    return back @ information @ back.T
+    # Scaled throughout: rounding of a large entry would pass for what is known of a
+    # small one.
+    scaled = shrunk @ (information / size[:, None] / size) @ shrunk
+    left = 0.5 * (scaled + scaled.T) * size[:, None] * size
+    return jnp.where(more.any(), left, information)

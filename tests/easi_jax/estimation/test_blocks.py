@@ -44,6 +44,21 @@ def test_errors_that_hang_together_count_as_fewer(alike: float) -> None:
     assert np.median(ratios) == pytest.approx((1 + alike) / (1 - alike), rel=0.25)
 
 
+def test_weak_directions_are_not_known_by_rounding() -> None:
+    """Parameters of very different sizes, two of them nearly alike."""
+    rng = np.random.default_rng(5)
+    mix = np.array([[1.0, 0.999, 0.5], [0.0, 0.05, 0.3], [0.0, 0.0, 0.5]])
+    root = mix * np.array([1.0, 3e2, 3e4])
+    noise = rng.normal(size=(PIECES, 3))
+    for k in range(1, PIECES):  # the last direction hangs together
+        noise[k, 2] = 0.9 * noise[k - 1, 2] + 0.4 * noise[k, 2]
+    info = PIECES * root.T @ root
+    given = (jnp.asarray(x, jnp.float32) for x in (info, info, noise @ root))
+    found = np.asarray(scattered(*given), float)
+    before, after = (np.sqrt(np.diag(np.linalg.inv(x))) for x in (info, found))
+    assert (after > 0.98 * before).all() and after[2] > 1.5 * before[2]
+
+
 def test_few_pieces_are_left_as_they_are() -> None:
     info, gradients = (jnp.asarray(x) for x in score(0.8, 0))
     assert enough(PIECES) and not enough(79)
