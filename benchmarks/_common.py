@@ -107,8 +107,7 @@ def _without_home(value: Any) -> Any:
     """Paths without the places of one machine; anything else as it is."""
     if not isinstance(value, Path) or not value.is_absolute():
         return value
-    root = ROOT
-    return value.relative_to(root) if value.is_relative_to(root) else value.name
+    return value.relative_to(ROOT) if value.is_relative_to(ROOT) else value.name
 
 
 def write_result(

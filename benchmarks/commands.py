@@ -90,9 +90,9 @@ def run(config: Config) -> None:
     given += ["--engine", config.engine, "--limit", str(config.limit), "--worker"]
     words = [sys.executable, "-m", "benchmarks.commands", *given]
     env = {**os.environ, "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {_QUICK}"}
-    root, status = ROOT, _LATE_STATUS
+    status = _LATE_STATUS
     while status == _LATE_STATUS or -status in _CRASHES:
-        status = subprocess.run(words, cwd=root, env=env, check=False).returncode
+        status = subprocess.run(words, cwd=ROOT, env=env, check=False).returncode
         if -status in _CRASHES:
             add_row(config.out, _crashed(config, signal.Signals(-status).name))
     if status:

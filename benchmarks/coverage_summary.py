@@ -37,8 +37,9 @@ def _late(rows: list[dict[str, Any]]) -> list[str]:
         *("50 %, as stated", "90 %, as stated", "error / bound", "no region"),
     )
     return [
-        "The same Cartpoles with commands that come late (or in time), of which the "
-        "model knows nothing; the finish is that of measured logs, with late commands "
+        "`python -m benchmarks.coverage --late 0.005` (`--doubts` where they come in "
+        "time): the same Cartpoles with commands that come late, of which the model "
+        "knows nothing; the finish is that of measured logs, with late commands "
         f"in doubt; commits {commits_of(rows)}. Truths inside the regions of the "
         "data's information alone, and inside those that are stated; targets of which "
         "no region is stated, since the model errs by more than twice the noise.",

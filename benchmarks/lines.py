@@ -53,8 +53,7 @@ def counts(revision: str) -> Counter[str]:
     from easi_jax.errors import UserError
 
     words = ["git", "archive", "--format=tar", revision]
-    root = ROOT
-    done = subprocess.run(words, cwd=root, capture_output=True, timeout=60, check=False)
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, timeout=60, check=False)
     if done.returncode:
         raise UserError(f"{revision}: {done.stderr.decode().strip()}")
     found = Counter[str]()

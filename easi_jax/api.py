@@ -25,9 +25,9 @@ from easi_jax.estimation.from_runs import (
     replayed,
     search_data,
 )
-from easi_jax.estimation.identifiability import seed_result
-from easi_jax.estimation.posterior import diverged, no_region
+from easi_jax.estimation.posterior import diverged
 from easi_jax.estimation.problem import HORIZON, Problem, checked_horizon, problem_of
+from easi_jax.estimation.relative import result_of
 from easi_jax.export.mjcf import written_machine
 from easi_jax.export.policy import Interface, interface_of, policy_files
 from easi_jax.gap.analysis import Analysis
@@ -314,10 +314,9 @@ def _estimated(
     )
     (found,) = estimates
     space, unit = search.space, found.distribution.mean
-    root = np.asarray(found.distribution.factor, float)
     if why := diverged(found, space.names):
         raise UserError(f"the fit diverged ({why}): try another seed")
-    result = seed_result(space, unit, root @ root.T, found.hessian)
+    result = result_of(space, found)
     errors = ready_errors(problem, space)
     return Estimated(
         names=space.names,
@@ -326,7 +325,7 @@ def _estimated(
         std=np.array(result.std),
         flags=tuple(result.flags),
         undetermined=tuple(u.meaning for u in result.undetermined),
-        no_region=no_region(found),
+        no_region=result.no_region,
         held_out=held_out_errors(problem, space, [unit], errors),
         notes=(*problem.notes, *notes),
         space=space,

@@ -96,7 +96,7 @@ def seed_results(
             jnp.asarray(start[at], found.fit.dtype),
             *(found.pieces, found.noise, found.misfit, found.start),
         )
-        result = _result(rest, new)
+        result = result_of(rest, new)
         # Known closely, and not only to be known so by data of this kind.
         wide = np.sqrt(np.diag(result.unit_covariance)) * rest.log_width
         flags = np.array(result.flags)
@@ -112,10 +112,11 @@ def seed_results(
             gain=gain.tolist(),
         )
 
-    return [replace(_result(space, e), relative=relative(e)) for e in estimates]
+    return [replace(result_of(space, e), relative=relative(e)) for e in estimates]
 
 
-def _result(space: ParameterSpace, found: Estimate) -> SeedResult:
+def result_of(space: ParameterSpace, found: Estimate) -> SeedResult:
+    """What one fit says, without what an owner knows."""
     root = np.asarray(found.distribution.factor, np.float64)
     stated = found.distribution.mean, root @ root.T
     result = seed_result(space, *stated, found.hessian)

@@ -220,8 +220,7 @@ class Bench:
             scale: the largest that are tried, ``(nu,)``.
         """
         m = self.models[0]
-        joint = {a: j for j, many in driven(m).items() for a in many}
-        dofs = {a: int(m.jnt_dofadr[j]) for a, j in joint.items()}
+        dofs = {a: int(m.jnt_dofadr[j]) for j, many in driven(m).items() for a in many}
         swung, before, shrunk = np.zeros(m.nv, bool), np.zeros(m.nv), np.ones(m.nu)
         for k in range(_ROUNDS):
             motions, used = self.played(scale * test)

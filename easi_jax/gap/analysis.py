@@ -672,7 +672,7 @@ class Analysis:
         began: float,
         notes: Sequence[str] = (),
     ) -> Outcome:
-        """Looks at the held-out data, once."""
+        """What the held-out data say of the refit, and of the effects that joined."""
         notes, scale = list(notes), self.channels.scale
         before = self.held_out.look(self.predictor.neutral)
         refit = after = self.held_out.look(self._plain(base.fit.x))

@@ -1,6 +1,7 @@
 """Effects that a model may lack: commands that come late."""
 
 import copy
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -118,18 +119,28 @@ def test_what_is_said_of_parameters_whatever_the_effects_are() -> None:
     np.testing.assert_allclose(effects[:, 1] ** 2, np.diag(exact)[3:], rtol=2e-3)
 
 
+def _fits(
+    plain: Simulator, space: ParameterSpace, doubts: Doubts
+) -> Callable[[Segments], tuple[Estimate, Estimate]]:
+    """A fit that begins at the nominal values, without doubt and with it."""
+    noise, cov = jnp.asarray(_NOISE, jnp.float32), 0.01 * jnp.eye(3)
+    nominal = space.to_unit(jnp.asarray(space.nominal))
+
+    @jax.jit
+    def fit(pieces: Segments) -> tuple[Estimate, Estimate]:
+        given = PairedFit(plain, space, pieces, noise), nominal, cov
+        return polished(*given), polished(*given, doubts=doubts)
+
+    return fit
+
+
 def test_values_hold_where_commands_come_late(doubts: Doubts) -> None:
     """Without doubt they are wrong by ten of the standard deviations with it."""
     simulator = doubts.simulator
     m, space = simulator.mj_model, _space(simulator.mj_model)
     plain = Simulator(m, space, _DT, engine="mujoco")
-    noise, cov = jnp.asarray(_NOISE, jnp.float32), 0.01 * jnp.eye(3)
     truth = space.to_unit(jnp.asarray(space.nominal))
-
-    @jax.jit
-    def fit(pieces: Segments) -> tuple[Estimate, Estimate]:
-        given = PairedFit(plain, space, pieces, noise), truth, cov
-        return polished(*given), polished(*given, doubts=doubts)
+    fit = _fits(plain, space, doubts)
 
     def off(found: Estimate, stated: Estimate) -> float:
         std = np.sqrt(np.diag(covariance(stated.distribution)))
@@ -177,17 +188,12 @@ def test_values_hold_where_friction_is_missing() -> None:
     real.dof_frictionloss[:] = _FRICTION
     space = _space(m)
     simulator = Simulator(m, space, _DT, engine="mujoco")
-    pieces, run = _recorded(real, 0, simulator.past_steps, 3)
+    _, run = _recorded(real, 0, 0, 3)
     doubts = all_doubts(simulator, space, scales_of(m, [run]))
     assert doubts is not None
     pieces, _ = _recorded(real, 0, doubts.simulator.past_steps, 3)
-    noise, cov = jnp.asarray(_NOISE, jnp.float32), 0.01 * jnp.eye(3)
     truth = space.to_unit(jnp.asarray(space.nominal))
-
-    @jax.jit
-    def fit(pieces: Segments) -> tuple[Estimate, Estimate]:
-        given = PairedFit(simulator, space, pieces, noise), truth, cov
-        return polished(*given), polished(*given, doubts=doubts)
+    fit = _fits(simulator, space, doubts)
 
     alone, marginal = fit(pieces)
     std = np.sqrt(np.diag(covariance(marginal.distribution)))
@@ -207,16 +213,10 @@ def test_no_region_is_stated_where_nothing_likely_explains_the_error() -> None:
     doubts = doubts_of(simulator, space)
     assert doubts is not None
     past = doubts.simulator.past_steps
-    truth = space.to_unit(jnp.asarray(space.nominal))
-    noise, cov = jnp.asarray(_NOISE, jnp.float32), 0.01 * jnp.eye(3)
-
-    @jax.jit
-    def fit(pieces: Segments) -> Estimate:
-        given = PairedFit(simulator, space, pieces, noise), truth, cov
-        return polished(*given, doubts=doubts)
+    fit = _fits(simulator, space, doubts)
 
     right, _ = _recorded(m, 0, past, 4)
     wrong, _ = _recorded(mujoco.MjModel.from_xml_string(odd), 0, past, 4)
-    assert not no_region(fit(right))
-    why = no_region(fit(wrong))
+    assert not no_region(fit(right)[1])
+    why = no_region(fit(wrong)[1])
     assert why.startswith("no region is stated") and "times the noise" in why
