@@ -34,12 +34,13 @@ def scattered(
     """Information ``(n, n)`` that is left where blocks scatter surely more than noise
     makes them; pure. As it was where there are fewer than 20 blocks.
 
-    Along each principal direction of ``hessian``, scaled to a unit diagonal, it is
-    divided by the variance of the blocks' gradients over what it should be. Neighbours
+    Along each principal direction of ``hessian``, scaled to a unit diagonal, the variance
+    is multiplied by that of the blocks' gradients over what it should be. Neighbours
     that lean the same way count as one longer block (Newey and West 1987, one lag).
 
     Args:
-        information: what counts, ``(n, n)``.
+        information: what counts, ``(n, n)``; at another place than ``hessian`` where a
+            logarithm has no slope at the fit.
         hessian: of the same data where ``gradients (M, n)`` are from, pieces in order.
     """
     pieces = len(gradients)
@@ -48,7 +49,9 @@ def scattered(
     count = min(_MOST, pieces // _PIECES)
     block = jnp.arange(pieces) * count // pieces
     sums = jax.ops.segment_sum(gradients, block, count)
-    size = jnp.sqrt(jnp.maximum(jnp.diag(hessian), 1e-12))
+    # What has no slope at the fit has no direction of its own in this scale.
+    largest = jnp.maximum(jnp.diag(hessian), jnp.diag(information))
+    size = jnp.sqrt(jnp.maximum(largest, 1e-12))
     values, vectors = jnp.linalg.eigh(hessian / size[:, None] / size)
     along = ((sums - sums.mean(0)) / size) @ vectors  # (count, n)
     variance = (along**2).sum(0)
@@ -58,10 +61,12 @@ def scattered(
     more = (values > RESOLVED) & (ratio > float(stats.chi2.ppf(_SURE, free)) / free)
     # The variance of Student's t: a ratio from few blocks is itself not sure.
     longer = (1.0 + 2.0 * jnp.maximum(alike, 0.0)) * free / (free - 2)
-    ratio = jnp.where(more, ratio * longer, 1.0)
-    shrunk = (vectors / jnp.sqrt(ratio)) @ vectors.T
-    # Scaled throughout: rounding of a large entry would pass for what is known of a
-    # small one.
-    scaled = shrunk @ (information / size[:, None] / size) @ shrunk
-    left = 0.5 * (scaled + scaled.T) * size[:, None] * size
+    extra = jnp.where(more, jnp.maximum(ratio * longer - 1.0, 0.0), 0.0)
+    # Variance is added, so that information is never more than it was (Woodbury).
+    scaled = information / size[:, None] / size
+    own = jnp.maximum((vectors * (scaled @ vectors)).sum(0), RESOLVED)
+    root = vectors * jnp.sqrt(extra / own)
+    seen = scaled @ root
+    taken = seen @ jnp.linalg.solve(jnp.eye(len(size)) + root.T @ seen, seen.T)
+    left = (scaled - 0.5 * (taken + taken.T)) * size[:, None] * size
     return jnp.where(more.any(), left, information)

@@ -34,14 +34,19 @@ class Distribution:
 def gaussian(space: ParameterSpace, mean: Any, cov: Any) -> Distribution:
     """A Gaussian with unit-coordinate ``mean (n,)`` and ``cov (n, n)``.
 
-    Eigenvalues that rounding has made negative count as zero.
+    Eigenvalues that rounding has made negative count as zero. The root is that of the
+    correlations: beside a parameter of which nothing is known, one that is known to a
+    thousandth of it would otherwise get a spread that is rounding alone.
     """
     mean, cov = jnp.asarray(mean), jnp.asarray(cov)
-    values, vectors = jnp.linalg.eigh(0.5 * (cov + cov.T))
+    std = jnp.sqrt(jnp.maximum(jnp.diag(cov), 0.0))
+    size = jnp.where(std > 0, std, 1.0)
+    scaled = cov / size[:, None] / size
+    values, vectors = jnp.linalg.eigh(0.5 * (scaled + scaled.T))
     si = space.to_si(mean)
     return Distribution(
         mean=mean,
-        factor=vectors * jnp.sqrt(jnp.maximum(values, 0.0)),
+        factor=size[:, None] * vectors * jnp.sqrt(jnp.maximum(values, 0.0)),
         low=si,
         high=si,
         uniform=jnp.zeros(()),
@@ -77,5 +82,6 @@ def draw(space: ParameterSpace, dist: Distribution, key: jax.Array) -> jax.Array
 
 
 def covariance(dist: Distribution) -> np.ndarray:
-    """Covariance in unit coordinates, ``(n, n)``."""
-    return np.asarray(dist.factor @ dist.factor.T)
+    """Covariance in unit coordinates, ``(n, n)``, double precision."""
+    factor = np.asarray(dist.factor, float)
+    return factor @ factor.T

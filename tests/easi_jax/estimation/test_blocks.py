@@ -59,6 +59,20 @@ def test_weak_directions_are_not_known_by_rounding() -> None:
     assert (after > 0.98 * before).all() and after[2] > 1.5 * before[2]
 
 
+def test_no_slope_at_the_fit_is_not_told_by_others() -> None:
+    """Of a parameter far down its logarithm, whose information is that at the low end
+    of its range."""
+    info, gradients = score(0.8, 3)
+    flat = np.array([1e-4, 1.0, 1.0])
+    given = info, info * np.outer(flat, flat), gradients * flat
+    found = np.asarray(scattered(*(jnp.asarray(x, jnp.float32) for x in given)), float)
+    size = np.sqrt(np.diag(info))
+    lost = np.linalg.eigvalsh((info - found) / np.outer(size, size))
+    assert lost.min() > -1e-5, "information is never more than it was"
+    assert found[0, 0] == pytest.approx(info[0, 0], rel=0.5)
+    assert found[2, 2] < 0.5 * info[2, 2]
+
+
 def test_few_pieces_are_left_as_they_are() -> None:
     info, gradients = (jnp.asarray(x) for x in score(0.8, 0))
     assert enough(PIECES) and not enough(79)

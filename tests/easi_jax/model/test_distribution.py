@@ -37,6 +37,16 @@ def test_gaussian_moments_in_unit_coordinates(samples: Any) -> None:
     np.testing.assert_allclose(distribution.covariance(dist), cov, atol=1e-6)
 
 
+def test_what_is_sure_stays_sure_beside_what_is_not() -> None:
+    """Two parameters known to 1e-5 of the third's spread, correlated."""
+    three = ParameterSpace((*SPACE.parameters, SPACE.parameters[0]))
+    corr = np.array([[1.0, 0.95, 0.3], [0.95, 1.0, 0.2], [0.3, 0.2, 1.0]])
+    std = np.array([3e-6, 5e-6, 0.3])
+    dist = distribution.gaussian(three, np.full(3, 0.5), corr * np.outer(std, std))
+    found = distribution.covariance(dist) / np.outer(std, std)
+    np.testing.assert_allclose(found, corr, atol=1e-5)
+
+
 def test_a_wide_gaussian_stays_inside_the_bounds(samples: Any) -> None:
     x = samples(distribution.gaussian(SPACE, jnp.full(2, 0.5), 9.0 * jnp.eye(2)))
     low, high = SPACE.bounds
