@@ -34,9 +34,10 @@ def scattered(
     """Information ``(n, n)`` that is left where blocks scatter surely more than noise
     makes them; pure. As it was where there are fewer than 20 blocks.
 
-    Along each principal direction of ``hessian``, scaled to a unit diagonal, the variance
-    is multiplied by that of the blocks' gradients over what it should be. Neighbours
-    that lean the same way count as one longer block (Newey and West 1987, one lag).
+    Along each principal direction of ``hessian``, scaled to a unit diagonal, the
+    variance is multiplied by that of the blocks' gradients over what it should be.
+    Neighbours that lean the same way count as one longer block (Newey and West 1987,
+    one lag).
 
     Args:
         information: what counts, ``(n, n)``; at another place than ``hessian`` where a

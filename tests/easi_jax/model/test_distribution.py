@@ -39,7 +39,8 @@ def test_gaussian_moments_in_unit_coordinates(samples: Any) -> None:
 
 def test_what_is_sure_stays_sure_beside_what_is_not() -> None:
     """Two parameters known to 1e-5 of the third's spread, correlated."""
-    three = ParameterSpace((*SPACE.parameters, SPACE.parameters[0]))
+    other = Parameter("other", ("body.b.mass",), 1.0, (0.5, 2.0), (0.25, 4.0))
+    three = ParameterSpace((*SPACE.parameters, other))
     corr = np.array([[1.0, 0.95, 0.3], [0.95, 1.0, 0.2], [0.3, 0.2, 1.0]])
     std = np.array([3e-6, 5e-6, 0.3])
     dist = distribution.gaussian(three, np.full(3, 0.5), corr * np.outer(std, std))
