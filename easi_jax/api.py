@@ -18,13 +18,8 @@ from easi_jax.data.measured import measured_runs
 from easi_jax.data.recording import Log
 from easi_jax.devices.runtime import fast_loops, quick_compile
 from easi_jax.errors import UserError
-from easi_jax.estimation.from_runs import (
-    held_out_errors,
-    ready_errors,
-    ready_finish,
-    replayed,
-    search_data,
-)
+from easi_jax.estimation.from_runs import ready_finish, replayed, search_data
+from easi_jax.estimation.held_out import held_out_errors, ready_errors
 from easi_jax.estimation.posterior import diverged
 from easi_jax.estimation.problem import HORIZON, Problem, checked_horizon, problem_of
 from easi_jax.estimation.relative import result_of
@@ -317,7 +312,6 @@ def _estimated(
     if why := diverged(found, space.names):
         raise UserError(f"the fit diverged ({why}): try another seed")
     result = result_of(space, found)
-    errors = ready_errors(problem, space)
     return Estimated(
         names=space.names,
         units=space.units,
@@ -326,7 +320,7 @@ def _estimated(
         flags=tuple(result.flags),
         undetermined=tuple(u.meaning for u in result.undetermined),
         no_region=result.no_region,
-        held_out=held_out_errors(problem, space, [unit], errors),
+        held_out=held_out_errors(problem, space, [unit], ready_errors(problem, space)),
         notes=(*problem.notes, *notes),
         space=space,
         distribution=found.distribution,

@@ -28,7 +28,8 @@ def run(config: Any) -> None:
         overwrite=config.overwrite,
     ) as folder:
         from easi_jax.devices.distributed import started
-        from easi_jax.estimation.from_runs import ready_errors, ready_finish
+        from easi_jax.estimation.from_runs import ready_finish
+        from easi_jax.estimation.held_out import ready_errors
         from train._log_results import sound, write
 
         finish = started(
@@ -37,7 +38,8 @@ def run(config: Any) -> None:
             )
         )
         states = _search(folder, config, search, problem, seeds)
-        errors = started(lambda: ready_errors(problem, search.space))
+        several = len(seeds) > 1
+        errors = started(lambda: ready_errors(problem, search.space, several))
         estimates, outliers = finish()(states.result_mean, states.result_cov)
         good, lost = sound(seeds, estimates, search.space.names)
         problem.notes.extend(outliers)

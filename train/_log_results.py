@@ -1,8 +1,8 @@
 """What an identification from logs leaves in its folder."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from train._results import (
     distribution_json,
@@ -12,6 +12,7 @@ from train._results import (
 )
 
 if TYPE_CHECKING:
+    from easi_jax.estimation.held_out import WindowErrors
     from easi_jax.estimation.posterior import Estimate
     from easi_jax.estimation.problem import Problem
     from easi_jax.io.report.html import Report
@@ -49,24 +50,24 @@ def write(
     generations: int,
     estimates: Sequence["Estimate"],
     seeds: Sequence[int],
-    errors_of: Callable[[Any], Any],
+    ready: tuple["WindowErrors", "WindowErrors | None"],
     diverged: Mapping[int, str],
 ) -> "Report":
     """Writes distribution.json, figures and report.html; returns the report.
 
-    ``errors_of`` is of `easi_jax.estimation.from_runs.ready_errors`; ``diverged`` are
-    seeds without a result, and why.
+    ``ready`` is of `easi_jax.estimation.held_out.ready_errors`; ``diverged`` are seeds
+    without a result, and why.
     """
     import numpy as np
 
-    from easi_jax.estimation.from_runs import held_out_errors
+    from easi_jax.estimation.held_out import held_out_errors
     from easi_jax.estimation.relative import seed_results
     from easi_jax.io.report.logs_report import logs_report
     from easi_jax.io.runs.versions import versions
 
     results = seed_results(problem.sensing, space, estimates)
     means = [found.distribution.mean for found in estimates]
-    errors = held_out_errors(problem, space, means, errors_of)
+    errors = held_out_errors(problem, space, means, ready)
     best = errors.best
     seen = np.flatnonzero(np.isfinite(problem.noise))
     folder.write_json(

@@ -1,8 +1,7 @@
 """From measured runs to an estimate: the search's data, and its finish."""
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -13,12 +12,10 @@ import numpy as np
 
 from easi_jax.data import unmeasured
 from easi_jax.data.activations import activation_guess, activation_spread
-from easi_jax.data.noise import resolutions
 from easi_jax.data.recording import Run
 from easi_jax.data.scales import scales_of
 from easi_jax.data.segments import Segments, to_device
 from easi_jax.data.sensor_channels import NO_SENSORS
-from easi_jax.data.windows import lead_rows
 from easi_jax.devices import distributed
 from easi_jax.devices.mesh import make_mesh, placed, replicated
 from easi_jax.devices.runtime import quick_compile
@@ -38,21 +35,9 @@ from easi_jax.estimation.posterior import (
 from easi_jax.estimation.prediction_error import (
     misfit_of,
     outlier_weights,
-    rms_of_steps,
 )
 from easi_jax.estimation.problem import Problem
-from easi_jax.estimation.starts import (
-    DRAWS,
-    Simulate,
-    Starts,
-    better_noise,
-    floor,
-    known_noise,
-    starts_about,
-)
-from easi_jax.model.joint_space import tangent_units
 from easi_jax.model.parameters import ParameterSpace
-from easi_jax.model.results import HeldOutErrors
 from easi_jax.search.config import SearchConfig
 from easi_jax.search.easi import Search, SearchData
 from easi_jax.simulation import open_loop
@@ -61,12 +46,17 @@ from easi_jax.simulation.slopes import shift_start
 Tell = Callable[[str], None]
 
 _HELD_WINDOWS, _FIT_WINDOWS = 200, 96  # that errors are measured on, at most
-_STEPS = 500_000  # physics steps in a generation that are worth their time
+# Pieces of a generation at least, and physics steps that are worth their time; a piece
+# of a larger robot tells more, and each of its steps takes longer.
+_SEARCH, _WIDE_SEARCH = (16, 500_000), (4, 100_000)
 _PASSES = 3  # of the finish: the model's own error is learned from the one before
 _ENDINGS = 2  # on all pieces, with all doubts
 _ROBUST = 12  # rounds of the first pass; later ones know which pieces fit badly
 _LACKING = 1.5  # times wider spreads, that are worth a note
 _FINISH = 0.5  # s, of pieces in the least-squares finish
+# Quarters of a second that it begins with for larger robots, which are slow: enough to
+# find the valley, for the last steps take all.
+_FEW = 24
 _COMPARED = 8  # runs at most that are fitted alone as well
 _FAR, _DIFFERENT = 5.0, 0.1  # standard deviations, and log ratio, that contradict
 _OUTLIER = 2.5  # times the median error: windows beyond it weigh less
@@ -75,7 +65,9 @@ _OUTLIER = 2.5  # times the median error: windows beyond it weigh less
 def replayed(problem: Problem, config: SearchConfig) -> SearchConfig:
     """Settings that replay the problem's pieces, as many a generation as pay."""
     cost = config.population * problem.piece * problem.simulator.substeps
-    segments = max(16, min(config.segments, _STEPS // cost))
+    wide = problem.simulator.wide
+    least, steps = _WIDE_SEARCH if wide else _SEARCH
+    segments = max(least, min(config.segments, steps // cost))
     return replace(config, source="replay", horizon=problem.piece, segments=segments)
 
 
@@ -166,6 +158,22 @@ def ready_finish(
     return estimates
 
 
+@dataclass(frozen=True)
+class _Last:
+    """Where the last steps are.
+
+    Attributes:
+        found: so far.
+        weight: of each piece by how well it fits, ``(M,)``; ``weighed`` the pieces.
+        misfit: what the model errs by.
+    """
+
+    found: Estimate
+    weight: jax.Array
+    weighed: Segments
+    misfit: jax.Array
+
+
 class _Finish:
     """The programs of a finish and what they are given.
 
@@ -193,7 +201,7 @@ class _Finish:
         simulator = problem.sensing if refined else problem.simulator
         self.simulator = simulator
         self.doubts = doubts_of(simulator, search.space) if refined else None
-        self.endings: dict[bool, Any] = {}
+        self.endings: dict[Doubts | None, Any] = {}
         # With commands before each piece, where one that comes late needs them.
         cutting = self.doubts.simulator if self.doubts else simulator
         steps = max(problem.steps, round(_FINISH / simulator.dt))
@@ -205,7 +213,7 @@ class _Finish:
         self.whole = replace(whole, weight=whole.weight * every / self.steps)
         starts = [len(range(0, len(r) - self.steps, every)) for r in problem.fit]
         self.owner = np.repeat([r.recording for r in problem.fit], starts)
-        self.pieces = few(simulator, self.whole) if refined else self.whole
+        self.pieces = few(simulator, self.whole, _FEW) if refined else self.whole
         noise = np.concatenate([problem.noise, self.sensors.noise(problem.fit)[0]])
         self.noise = jnp.asarray(noise, jnp.result_type(float))
         # Velocities derived from the positions say nothing that those do not.
@@ -222,7 +230,7 @@ class _Finish:
         like = jnp.zeros(n), jnp.eye(n), self.pieces, self.hidden, _ROBUST, False
         self._fit = jax.jit(self.fit).lower(*placed(like)).compile(quick_compile())
         if self.refined:
-            self.ending(False)
+            self.ending(self.doubts)
 
     @cached_property
     def lacking(self) -> Doubts | None:
@@ -231,15 +239,14 @@ class _Finish:
         scales = scales_of(m, self.problem.fit)
         return all_doubts(self.simulator, self.search.space, scales)
 
-    def ending(self, lacking: bool) -> Any:
-        """The compiled last steps, with the doubts that are usual or with all."""
-        if lacking not in self.endings:
+    def ending(self, doubts: Doubts | None) -> Any:
+        """The compiled last steps with ``doubts``."""
+        if doubts not in self.endings:
             n = self.search.space.size
-            doubts = self.lacking if lacking else self.doubts
             like = placed((jnp.zeros(n), jnp.eye(n), self.whole, self.hidden))
             program = jax.jit(partial(self.end, doubts)).lower(*like)
-            self.endings[lacking] = program.compile(quick_compile())
-        return self.endings[lacking]
+            self.endings[doubts] = program.compile(quick_compile())
+        return self.endings[doubts]
 
     def paired(self, pieces: Any, misfit: Any) -> PairedFit:
         """What is fitted."""
@@ -289,34 +296,60 @@ class _Finish:
         motion = jnp.arange(len(self.hidden)) < len(self.problem.noise)
         misfit = jnp.where(motion, self.hidden, jnp.inf)
         weighed = pieces
-        for k in range(_PASSES):
+        # The last steps on all pieces learn it, too.
+        fewer = self.refined and pieces.count < self.whole.count
+        passes = _PASSES - 1 if fewer else _PASSES
+        for k in range(passes):
             given = center, cov, weighed, misfit, 0 if k else _ROBUST, k > 0
             found, error = distributed.local(self._fit(*placed(given)))
             misfit, weight = self.judged(error, weighed, pieces)
             weighed = replace(pieces, weight=pieces.weight * weight)
-            center = found.fit
-            self.tell(f"least-squares finish: pass {k + 1} of {_PASSES}")
-        if self.refined and self.pieces.count < self.whole.count:
+            center = jax.block_until_ready(found.fit)
+            self.tell(f"least-squares finish: pass {k + 1} of {passes}")
+        if not self.refined or self.lost(found):
+            return found.replace(search_mean=mean, search_cov=cov), weight
+        if fewer:
             weighed = self.whole
-        for lacking in (False, True):
-            if not self.refined or self.lost(found):
+        last = _Last(found, weight, weighed, misfit)
+        last = self.ended(last, cov, self.doubts, "", self.lacks)
+        if self.lacks(last.found):
+            more = ", with more in doubt"
+            last = self.ended(last, cov, self.lacking, more, self.beyond)
+        if self.beyond(last.found) and last.found.doubted:
+            # Nobody knows what it lacks: then what predicts best by itself.
+            last = self.ended(last, cov, None, ", as the model is", self.lost)
+        return replace(last.found, search_mean=mean, search_cov=cov), last.weight
+
+    def ended(
+        self,
+        last: _Last,
+        cov: Any,
+        doubts: Doubts | None,
+        what: str,
+        over: Callable[[Estimate], bool],
+    ) -> _Last:
+        """The last steps on all pieces with ``doubts``; fewer where they are ``over``,
+        since others follow."""
+        for k in range(_ENDINGS):
+            given = last.found.fit, cov, last.weighed, last.misfit
+            found, error = distributed.local(self.ending(doubts)(*placed(given)))
+            misfit, weight = self.judged(error, last.weighed, self.whole)
+            weighed = replace(self.whole, weight=self.whole.weight * weight)
+            last = _Last(jax.block_until_ready(found), weight, weighed, misfit)
+            self.tell(f"on all of the logs{what}: pass {k + 1} of {_ENDINGS}")
+            if self.lost(found) or over(found):
                 break
-            if lacking and not self.lacks(found):
-                break
-            what = ", with more in doubt" if lacking else ""
-            for k in range(_ENDINGS):
-                given = center, cov, weighed, misfit
-                found, error = distributed.local(self.ending(lacking)(*placed(given)))
-                misfit, weight = self.judged(error, weighed, self.whole)
-                weighed = replace(self.whole, weight=self.whole.weight * weight)
-                center = found.fit
-                self.tell(f"on all of the logs{what}: pass {k + 1} of {_ENDINGS}")
-        return found.replace(search_mean=mean, search_cov=cov), weight
+        return last
+
+    def beyond(self, found: Estimate) -> bool:
+        """Whether no region can be stated."""
+        return bool(no_region(found))
 
     def lacks(self, found: Estimate) -> bool:
         """Whether the model surely errs by more than the noise, and more can be in
         doubt than was."""
-        if float(widened(found.excess)) <= _LACKING or self.lacking is None:
+        errs = float(widened(found.excess)) > _LACKING
+        if not errs or self.lost(found) or self.lacking is None:
             return False
         return self.lacking.count > len(found.doubted)
 
@@ -374,8 +407,8 @@ class _Finish:
         names = list(dict.fromkeys(run.recording for run in self.problem.fit))
         if not (self.refined and 2 <= len(names) <= _COMPARED):
             return []
-        usual = self.doubts.count if self.doubts else 0
-        end, notes = self.ending(len(found.doubted) > usual), []
+        ways = {d.parameters if d else (): end for d, end in self.endings.items()}
+        end, notes = ways[found.doubted], []
         for name in names:
             mine = self.whole.weight * weight * (self.owner == name)
             if not np.any(mine > 0):
@@ -408,109 +441,3 @@ def _contradiction(
         f"{one:.3g} {space.units[i]}, all together {all_:.3g} (something was changed "
         "between them, or it moves the robot in a way that shows what the model lacks)"
     ]
-
-
-def ready_errors(
-    problem: Problem, space: ParameterSpace
-) -> Callable[[jax.Array], tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Compiles what takes SI parameters ``(n,)`` to RMS errors ``(nv,)`` of predicted
-    positions, held out and fitted, and what a perfect model would leave of the first.
-
-    By the measure of the log format: starts are fitted with the model's own dynamics,
-    and the floor goes through the same fit (`easi_jax.estimation.starts`). A window
-    whose prediction is not finite counts as an error of the largest motion.
-    """
-    simulator, nv = problem.simulator, problem.simulator.mj_model.nv
-    lead, every = lead_rows(simulator.dt), max(1, problem.steps // 2)
-    steps = lead + problem.steps
-
-    def cut(runs: Sequence[Run], most: int) -> Segments:
-        found = segments_from_runs(simulator, runs, steps, every, fitted=True)
-        return to_device(found.spread(most) if found.count > most else found)
-
-    held, fit = cut(problem.held, _HELD_WINDOWS), cut(problem.fit, _FIT_WINDOWS)
-    whole = jax.tree.map(lambda *x: jnp.concatenate(x), held, fit)
-    largest = np.asarray(jnp.abs(open_loop.motion(simulator, held)[..., :nv]))
-    largest = jnp.asarray(largest.max((0, 1)))
-
-    def errors(theta: Any, moved: Any) -> Any:
-        first = shift_start(simulator, whole, moved)
-        found = open_loop.errors_from(simulator, simulator.model(theta), first, whole)
-        return jnp.concatenate([moved[:, None, :nv], -found[..., :nv]], 1)
-
-    still = np.zeros((whole.count, 2 * nv + simulator.mj_model.na), np.float32)
-    like = placed((jnp.zeros(space.size), jnp.asarray(still)))
-    compiled = jax.jit(errors).lower(*like).compile(quick_compile())
-
-    def simulate(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
-        asked = [
-            placed((jnp.asarray(a, like[0].dtype), jnp.asarray(b, like[1].dtype)))
-            for a, b in zip(x, moved, strict=True)
-        ]
-        return np.stack([jax.device_get(compiled(*both)) for both in asked])
-
-    starts = _starts_of(problem, simulate)
-    rows = starts.noise
-    resolution = np.max([resolutions(r) for r in (*problem.fit, *problem.held)], 0)
-
-    def measured(theta: jax.Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        x = np.asarray(theta)
-        starts.noise = rows
-        moved, found = starts.solve(x, still)
-        starts.noise = better_noise(starts, found, rows, resolution / math.sqrt(12.0))
-        rng = np.random.default_rng(0)
-        least = floor(starts, x, moved, DRAWS, resolution, rng)
-        after = found[:, lead + 1 :]
-        return (
-            np.asarray(rms_of_steps(jnp.asarray(after[: held.count]), largest)),
-            np.asarray(rms_of_steps(jnp.asarray(after[held.count :]), largest)),
-            np.sqrt(least[: held.count, lead + 1 :].mean((0, 1))),
-        )
-
-    return measured
-
-
-def _starts_of(problem: Problem, simulate: Simulate) -> Starts:
-    """Of windows that begin `lead_rows` before they are measured from."""
-    m, runs = problem.simulator.mj_model, [*problem.fit, *problem.held]
-    moved = [r.configuration.difference(r.qpos[:1], r.qpos) for r in runs]
-    size = np.maximum(np.concatenate(moved).std(0), 1e-9)
-    given = jnp.asarray(problem.noise), np.zeros(m.nv, bool)
-    wide = np.asarray(spread_of_starts(m, runs, *given))
-    return starts_about(
-        simulate,
-        known_noise(problem.noise, size),
-        size,
-        np.maximum(wide[m.nv : 2 * m.nv], 1e-9),
-        unmeasured.start_spread(m, runs, np.isinf(problem.noise[: m.nv])),
-        np.maximum(wide[2 * m.nv :], 1e-9),
-        runs[0].dt,
-    )
-
-
-def held_out_errors(
-    problem: Problem,
-    space: ParameterSpace,
-    means: Sequence[jax.Array],
-    errors_of: Callable[[jax.Array], tuple[np.ndarray, np.ndarray, np.ndarray]],
-) -> HeldOutErrors:
-    """Open-loop errors of the model as given and at each of ``means (n,)``, unit
-    coordinates, of the joints that were measured; ``errors_of`` is of `ready_errors`.
-    """
-    before, scale, _ = errors_of(jnp.asarray(space.nominal, jnp.result_type(float)))
-    scale = np.maximum(scale, 1e-12)
-    each = [errors_of(space.to_si(unit)) for unit in means]
-    simulator = problem.simulator
-    nv = simulator.mj_model.nv
-    seen = np.flatnonzero(np.isfinite(problem.noise[:nv]))
-    names, units = simulator.state_names[:nv], tangent_units(simulator.mj_model)
-    return HeldOutErrors(
-        what=problem.held_name,
-        horizon=problem.horizon,
-        channels=[names[i].removeprefix("qpos.") for i in seen],
-        units=[units[i] for i in seen],
-        before=before[seen].tolist(),
-        after=[after[seen].tolist() for after, _, _ in each],
-        floor=[floor[seen].tolist() for _, _, floor in each],
-        fit=[float(np.mean((own / scale)[seen] ** 2)) for _, own, _ in each],
-    )

@@ -237,8 +237,11 @@ class PairedFit:
     @property
     def points(self) -> int:
         """Simulations of each piece that `normal` takes, a derivative as one."""
-        derived = self.simulator.engine == "mjx" and not self.simulator.by_differences
-        return 1 + self._directions * (1 if derived else 2)
+        if self.simulator.engine == "mjx":
+            return 1 + self._directions * (1 + self.simulator.by_differences)
+        size = self._directions - self.space.size
+        turn = slopes.parts_and_turns(self.simulator, self.segments, size)[1]
+        return 1 + 2 * (self.space.size + int(turn.max(initial=-1)) + 1)
 
     @property
     def _directions(self) -> int:

@@ -119,10 +119,11 @@ def finish_pieces(
     return found.spread(most) if most < found.count else found
 
 
-def few(simulator: Simulator, pieces: Segments) -> Segments:
+def few(simulator: Simulator, pieces: Segments, count: int = _WIDE_PIECES) -> Segments:
     """Some of ``pieces``, with which the many trials of a fit do not take hours: all,
-    or of a larger robot's as many control steps as 64 of a quarter of a second have."""
-    most = max(1, _WIDE_PIECES * _usual(simulator) // pieces.horizon)
+    or of a larger robot's as many control steps as ``count`` of a quarter of a second
+    have."""
+    most = max(1, count * _usual(simulator) // pieces.horizon)
     return pieces.spread(most) if simulator.wide and most < pieces.count else pieces
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from easi_jax.data.windows import lead_rows, slope_noise
+from easi_jax.model.separate_trees import turns
 
 # Takes vectors (B, n) and offsets of starts (B, W, s); returns errors (B, W, T, c).
 Simulate = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -50,6 +51,8 @@ class Starts:
         known: how far they are by the noise of the rows alone, ``(s,)``.
         rows: so many first rows of a window decide on its start.
         step: sizes of differences, ``(s,)``.
+        parts: of the machine that each number of a start belongs to, ``(s,)``, the
+            first of them those of the channels; all one where None.
         slope: of errors with the start, ``(s, W, T, c)``, of the last `linearize`.
         bent: how far errors are from linear there, in the median window: the second
             differences beside the first.
@@ -61,6 +64,7 @@ class Starts:
     rows: int
     step: np.ndarray
     known: np.ndarray
+    parts: np.ndarray | None = None
     slope: np.ndarray = field(init=False)
     bent: float = field(init=False, default=0.0)
 
@@ -80,15 +84,21 @@ class Starts:
     def linearize(self, x: np.ndarray, begin: np.ndarray) -> None:
         """Takes slopes at a vector ``(n,)`` and offsets ``(W, s)``."""
         size, (count, _) = len(self.step), begin.shape
-        moved = np.broadcast_to(begin, (2 * size + 1, count, size)).copy()
+        parts = np.zeros(size, int) if self.parts is None else self.parts
+        turn = turns(parts)
+        most = int(turn.max(initial=-1)) + 1
+        moved = np.broadcast_to(begin, (2 * most + 1, count, size)).copy()
         at = np.arange(size)
-        moved[at, :, at] += self.step[:, None]
-        moved[size + at, :, at] -= self.step[:, None]
+        moved[turn, :, at] += self.step[:, None]
+        moved[most + turn, :, at] -= self.step[:, None]
         got = self.simulate(np.repeat(x[None], len(moved), 0), moved).astype(np.float64)
-        more, less, here = got[:size], got[size:-1], got[-1]
-        slope = (more - less) / (2 * self.step)[:, None, None, None]
+        more, less, here = got[:most], got[most:-1], got[-1]
+        slope = (more - less)[turn] / (2 * self.step)[:, None, None, None]
         # One prediction in thousands is not finite; it must not spoil all windows.
         self.slope = np.where(np.isfinite(slope), slope, 0.0)
+        if self.parts is not None:
+            own = parts[:, None] == parts[: self.slope.shape[-1]]
+            self.slope *= own[:, None, None, :]
         first, second = (
             np.sqrt(((np.nan_to_num(d) / self.noise) ** 2).sum((0, 2, 3)))
             for d in (0.5 * (more - less), 0.5 * (more + less) - here)
@@ -251,6 +261,7 @@ def starts_about(
     free: np.ndarray,
     act: np.ndarray,
     dt: float,
+    parts: np.ndarray | None = None,
 ) -> Starts:
     """Starts of windows that begin where a log says, `lead_rows` early.
 
@@ -262,6 +273,7 @@ def starts_about(
         free: how far what nobody measured may be off, ``(2 nv,)``; infinite elsewhere.
         act: how far activations may be off, ``(na,)``.
         dt: control step [s].
+        parts: as for `Starts`; not where channels are more than positions.
     """
     known = np.where(np.isfinite(noise), noise, 0.0)[: len(position)]
     small, part = _DIFFERENCE
@@ -279,6 +291,7 @@ def starts_about(
         2 * lead_rows(dt) + 1,
         np.concatenate([step, part * act]),
         np.concatenate([np.where(np.isfinite(free), free, by_rows), act]),
+        parts if len(noise) == len(position) else None,
     )
 
 

@@ -11,6 +11,7 @@ from easi_jax.data.unmeasured import start_spread
 from easi_jax.estimation.starts import Starts, starts_about
 from easi_jax.gap.predictor import Predictor
 from easi_jax.model.effect_catalog import Scales
+from easi_jax.model.separate_trees import start_parts
 
 
 def window_starts(
@@ -49,4 +50,5 @@ def window_starts(
         start_spread(m, runs),
         act,
         runs[0].dt,
+        start_parts(m),
     )

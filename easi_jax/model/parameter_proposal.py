@@ -29,6 +29,7 @@ _DIGITS = 4  # significant ones, of a proposed number
 # acceleration [rad/s2, m/s2] that such a weight must make: no log shows less.
 _FELT = 1e-3
 _INERTIA_DECIMALS = 9  # kg m2: rounding of what is said in a model
+_RANGE_DECIMALS = 4  # rad or m: as ends are written
 _AT_JOINTS = {
     int(mujoco.mjtTrn.mjTRN_JOINT),
     int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
@@ -166,15 +167,17 @@ def _look(m: mujoco.MjModel, kind: str, i: int) -> tuple[Any, ...]:
     """What places must have in common to be tied.
 
     Depth in the tree is part of it: joints of one serial chain differ in load and
-    gear, whatever their names and values are. Mirrored ranges are alike.
+    gear, whatever their names and values are. Ranges of equal width are alike: that of
+    a mirrored joint, and that of one that is mounted turned (thighs of front and rear
+    legs).
     """
     if kind == "joint":
-        return int(m.jnt_type[i]), _depth(m, i), _mirrored(m.jnt_range[i])
+        return int(m.jnt_type[i]), _depth(m, i), _width(m.jnt_range[i])
     if kind == "actuator":
         way, at = int(m.actuator_trntype[i]), int(m.actuator_trnid[i, 0])
         look = (
             way,
-            _mirrored(m.actuator_ctrlrange[i]),
+            _width(m.actuator_ctrlrange[i]),
             _mirrored(m.actuator_forcerange[i]),
             abs(float(m.actuator_gear[i, 0])),
         )
@@ -187,6 +190,11 @@ def _look(m: mujoco.MjModel, kind: str, i: int) -> tuple[Any, ...]:
 def _mirrored(ends: np.ndarray) -> tuple[float, ...]:
     """A range ``(2,)`` so that it equals that of its mirror image."""
     return tuple(sorted(np.abs(ends).tolist()))
+
+
+def _width(ends: np.ndarray) -> float:
+    """Of a range ``(2,)``, as it is written in files."""
+    return round(float(ends[1] - ends[0]), _RANGE_DECIMALS)
 
 
 def _depth(m: mujoco.MjModel, joint: int) -> int:

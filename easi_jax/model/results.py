@@ -360,7 +360,8 @@ class HeldOutErrors:
         before: of the model as given.
         after: of each seed's model.
         floor: of each seed's model, were it perfect.
-        fit: of each seed, the error on its own data, which chooses the seed shown.
+        fit: of each seed, the error on its own data, which chooses the seed shown;
+            empty of a single one.
     """
 
     what: str
@@ -375,7 +376,7 @@ class HeldOutErrors:
     @property
     def best(self) -> int:
         """Place of the seed that fits its own data best."""
-        return int(np.argmin(self.fit))
+        return int(np.argmin(self.fit)) if self.fit else 0
 
 
 # -- what to record ----------------------------------------------------------------

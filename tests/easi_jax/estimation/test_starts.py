@@ -96,6 +96,27 @@ def test_what_small_errors_become() -> None:
     np.testing.assert_allclose(starts.left(errors), errors, atol=0.03 * NOISE[0])
 
 
+def test_separate_parts_are_moved_at_once() -> None:
+    """Two masses that have nothing to do with each other: positions, then speeds."""
+    asked = []
+
+    def simulate(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        asked.append(len(x))
+        return np.concatenate(
+            [path(moved[..., i::2] * [1.0, i + 1]) for i in (0, 1)], -1
+        )
+
+    step = np.array([1e-3, 1e-3, 1e-2, 1e-2])
+    noise, wide, still = np.repeat(NOISE, 2), np.ones(4), np.zeros((W, 4))
+    given = simulate, noise, wide, ROWS, step, wide
+    alone, at_once = Starts(*given), Starts(*given, parts=np.array([0, 1, 0, 1]))
+    for starts in (alone, at_once):
+        starts.linearize(np.zeros(1), still)
+    assert asked == [9, 5]
+    np.testing.assert_allclose(at_once.slope, alone.slope, atol=1e-12)
+    assert at_once.bent == pytest.approx(alone.bent, abs=1e-9)
+
+
 def test_a_channel_without_readings_has_no_say() -> None:
     starts, _ = made(5)
     both = Starts(

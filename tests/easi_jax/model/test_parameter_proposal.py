@@ -34,16 +34,18 @@ def serial() -> str:
 
 
 def legged(odd: str = "") -> str:
-    """Four legs, the right ones mirrored; ``odd`` has another damping."""
+    """Four legs, hips of the right ones mirrored, calves of the rear ones mounted
+    turned; ``odd`` has another damping."""
     legs, drives = "", ""
     for n in LEGS:
         side = 1 if n[1] == "L" else -1
         ends = (-0.5, 0.9) if side > 0 else (-0.9, 0.5)
+        calf = (-0.4, 2.2) if n[0] == "F" else (0.647, 3.247)
         damping = 0.7 if n == odd else 0.2
         legs += f"""<body name="{n}_hip" pos="0 {side * 0.1} 0"><joint
 name="{n}_hip_joint" axis="1 0 0" damping="{damping}" range="{ends[0]} {ends[1]}"/>
 {LINK}<body name="{n}_calf" pos="0 0 -0.3"><joint name="{n}_calf_joint" axis="0 1 0"
-damping="0.2"/>{LINK}</body></body>"""
+damping="0.2" range="{calf[0]} {calf[1]}"/>{LINK}</body></body>"""
         for part in ("hip", "calf"):
             drives += (
                 f'<position name="{n}_{part}" joint="{n}_{part}_joint" kp="20" '

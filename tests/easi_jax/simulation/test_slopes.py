@@ -13,7 +13,7 @@ from easi_jax.data.segments import Segments
 from easi_jax.model.parameters import ParameterSpace, declare
 from easi_jax.simulation import open_loop
 from easi_jax.simulation.simulator import Simulator
-from easi_jax.simulation.slopes import linearized, residuals
+from easi_jax.simulation.slopes import linearized, parts_and_turns, residuals
 
 _H, _LENGTH, _STEPS = 0.01, 0.3, 20  # s, m, of one physics step each
 # A point at the end of a light rod, with a little inertia of its own.
@@ -153,3 +153,47 @@ def test_at_a_bound_the_slope_is_one_sided(native: Any) -> None:
     exact = _by_hand(edge, unit.astype(float), piece)[1]
     size = np.abs(exact[..., gear]).max()
     assert np.abs(slopes[..., gear] - exact[..., gear]).max() < 1e-3 * size
+
+
+def test_starts_of_separate_parts_are_moved_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two legs of two joints in a stand, one with a slow drive: the slopes are those
+    of one number after the other, from fewer simulations."""
+    leg = """<body pos="0 {y} 1"><joint name="{n}1" axis="1 0 0" damping="0.1"/>
+<geom size="0.05" mass="1" pos="0 0.1 -0.1"/><body pos="0 0 -0.3"><joint name="{n}2"
+axis="0 1 0" damping="0.1"/><geom size="0.05" mass="1" pos="0.05 0 -0.2"/></body>
+</body>"""
+    m = mujoco.MjModel.from_xml_string(f"""<mujoco>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>{leg.format(n="a", y=0)}{leg.format(n="b", y=1)}</worldbody>
+  <actuator><motor joint="a1"/><motor joint="a2"/><motor joint="b1"/>
+  <general joint="b2" dyntype="filter" dynprm="0.05"/></actuator></mujoco>""")
+    place = declare(m, "damping", "joint.*.damping", nominal=0.1, initial=(0.05, 0.2))
+    space = ParameterSpace((place,))
+    simulator = Simulator(m, space, _H, engine="mujoco")
+    rng = np.random.default_rng(1)
+    zero = jnp.zeros((_STEPS, 4))
+    piece = Segments(
+        qpos=jnp.asarray(rng.normal(size=4), jnp.float32),
+        qvel=jnp.asarray(rng.normal(size=4), jnp.float32),
+        ctrl=jnp.asarray(rng.normal(size=(_STEPS, 4)), jnp.float32),
+        next_qpos=zero,
+        next_qvel=zero,
+        weight=jnp.ones(()),
+        act=jnp.zeros(1),
+    )
+
+    def found() -> tuple[np.ndarray, int]:
+        given = space.to_unit(np.array([0.1])), jnp.zeros(9), piece
+        slopes = jax.jit(lambda *x: linearized(simulator, space, *x)[1])(*given)
+        return np.asarray(slopes), int(parts_and_turns(simulator, piece, 9)[1].max())
+
+    at_once, most = found()
+    monkeypatch.setattr(
+        "easi_jax.simulation.slopes.start_parts", lambda _: np.zeros(9, int)
+    )
+    alone, count = found()
+    assert (most, count) == (4, 8)
+    np.testing.assert_allclose(at_once, alone, atol=1e-5 * np.abs(alone).max())
+    assert np.abs(at_once[:, [2, 3]][..., 1]).max() == 0, "the other leg stays"

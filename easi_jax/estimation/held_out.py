@@ -1,0 +1,174 @@
+"""Open-loop errors of predicted positions on held-out logs, by the measure of the log
+format: starts are fitted with the model's own dynamics, and the floor goes through the
+same fit (`easi_jax.estimation.starts`)."""
+
+import math
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from easi_jax.data import unmeasured
+from easi_jax.data.noise import resolutions
+from easi_jax.data.recording import Run
+from easi_jax.data.segments import to_device
+from easi_jax.data.windows import lead_rows
+from easi_jax.devices.mesh import placed
+from easi_jax.devices.runtime import quick_compile
+from easi_jax.estimation.from_runs import spread_of_starts
+from easi_jax.estimation.pieces import segments_from_runs
+from easi_jax.estimation.prediction_error import rms_of_steps
+from easi_jax.estimation.problem import Problem
+from easi_jax.estimation.starts import (
+    DRAWS,
+    Simulate,
+    Starts,
+    better_noise,
+    floor,
+    known_noise,
+    starts_about,
+)
+from easi_jax.model.joint_space import tangent_units
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.model.results import HeldOutErrors
+from easi_jax.model.separate_trees import start_parts
+from easi_jax.simulation import open_loop
+from easi_jax.simulation.slopes import shift_start
+
+_HELD, _FIT = 200, 96  # windows that errors are measured on, at most
+
+
+class WindowErrors:
+    """RMS errors of predicted positions, ``(nv,)``, over windows of some runs.
+
+    A window whose prediction is not finite counts as an error of the largest motion.
+
+    Args:
+        problem: the measured runs.
+        space: the parameters of a prediction.
+        runs: some of them.
+        most: windows at most.
+    """
+
+    def __init__(
+        self, problem: Problem, space: ParameterSpace, runs: Sequence[Run], most: int
+    ) -> None:
+        simulator, nv = problem.simulator, problem.simulator.mj_model.nv
+        self.lead = lead_rows(simulator.dt)
+        every = max(1, problem.steps // 2)
+        given = simulator, runs, self.lead + problem.steps, every
+        cut = segments_from_runs(*given, fitted=True)
+        windows = to_device(cut.spread(most) if cut.count > most else cut)
+        largest = jnp.abs(open_loop.motion(simulator, windows)[..., :nv])
+        self.largest = jnp.asarray(np.asarray(largest).max((0, 1)))
+        self.resolution = np.max(
+            [resolutions(r) for r in (*problem.fit, *problem.held)], 0
+        )
+
+        def errors(theta: jax.Array, moved: jax.Array) -> jax.Array:
+            first = shift_start(simulator, windows, moved)
+            model = simulator.model(theta)
+            found = open_loop.errors_from(simulator, model, first, windows)
+            return jnp.concatenate([moved[:, None, :nv], -found[..., :nv]], 1)
+
+        still = np.zeros((windows.count, 2 * nv + simulator.mj_model.na), np.float32)
+        like = placed((jnp.zeros(space.size), jnp.asarray(still)))
+        compiled = jax.jit(errors).lower(*like).compile(quick_compile())
+
+        def simulate(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
+            asked = [
+                placed((jnp.asarray(a, like[0].dtype), jnp.asarray(b, like[1].dtype)))
+                for a, b in zip(x, moved, strict=True)
+            ]
+            return np.stack([jax.device_get(compiled(*both)) for both in asked])
+
+        self.still = still
+        self.starts = _starts_of(problem, simulate)
+        self.rows = self.starts.noise
+
+    def of(self, theta: jax.Array) -> np.ndarray:
+        """At SI parameters ``(n,)``."""
+        return self._rms(self._solved(np.asarray(theta))[1])
+
+    def with_floor(self, theta: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+        """`of`, and what a perfect model would leave."""
+        x = np.asarray(theta)
+        moved, found = self._solved(x)
+        rng = np.random.default_rng(0)
+        least = floor(self.starts, x, moved, DRAWS, self.resolution, rng)
+        return self._rms(found), np.sqrt(least[:, self.lead + 1 :].mean((0, 1)))
+
+    def _solved(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        starts = self.starts
+        starts.noise = self.rows
+        moved, found = starts.solve(x, self.still)
+        least = self.resolution / math.sqrt(12.0)
+        starts.noise = better_noise(starts, found, self.rows, least)
+        return moved, found
+
+    def _rms(self, found: np.ndarray) -> np.ndarray:
+        after = jnp.asarray(found[:, self.lead + 1 :])
+        return np.asarray(rms_of_steps(after, self.largest))
+
+
+def _starts_of(problem: Problem, simulate: Simulate) -> Starts:
+    """Of windows that begin `lead_rows` before they are measured from."""
+    m, runs = problem.simulator.mj_model, [*problem.fit, *problem.held]
+    moved = [r.configuration.difference(r.qpos[:1], r.qpos) for r in runs]
+    size = np.maximum(np.concatenate(moved).std(0), 1e-9)
+    given = jnp.asarray(problem.noise), np.zeros(m.nv, bool)
+    wide = np.asarray(spread_of_starts(m, runs, *given))
+    return starts_about(
+        simulate,
+        known_noise(problem.noise, size),
+        size,
+        np.maximum(wide[m.nv : 2 * m.nv], 1e-9),
+        unmeasured.start_spread(m, runs, np.isinf(problem.noise[: m.nv])),
+        np.maximum(wide[2 * m.nv :], 1e-9),
+        runs[0].dt,
+        start_parts(m),
+    )
+
+
+def ready_errors(
+    problem: Problem, space: ParameterSpace, several: bool = False
+) -> tuple[WindowErrors, WindowErrors | None]:
+    """Compiled: errors on held-out data and, with ``several`` results to choose from,
+    on fitted data."""
+    fit = WindowErrors(problem, space, problem.fit, _FIT) if several else None
+    return WindowErrors(problem, space, problem.held, _HELD), fit
+
+
+def held_out_errors(
+    problem: Problem,
+    space: ParameterSpace,
+    means: Sequence[jax.Array],
+    ready: tuple[WindowErrors, WindowErrors | None],
+) -> HeldOutErrors:
+    """Open-loop errors of the model as given and at each of ``means (n,)``, unit
+    coordinates, of the joints that were measured; ``ready`` is of `ready_errors`."""
+    nominal = jnp.asarray(space.nominal, jnp.result_type(float))
+    held, own = ready
+    before = held.of(nominal)
+    each = [held.with_floor(space.to_si(unit)) for unit in means]
+    simulator = problem.simulator
+    nv = simulator.mj_model.nv
+    seen = np.flatnonzero(np.isfinite(problem.noise[:nv]))
+    fit: list[float] = []
+    if own is not None:
+        scale = np.maximum(own.of(nominal), 1e-12)[seen]
+        for unit in means:
+            off = own.of(space.to_si(unit))[seen] / scale
+            fit.append(float(np.mean(off**2)))
+    names, units = simulator.state_names[:nv], tangent_units(simulator.mj_model)
+    return HeldOutErrors(
+        what=problem.held_name,
+        horizon=problem.horizon,
+        channels=[names[i].removeprefix("qpos.") for i in seen],
+        units=[units[i] for i in seen],
+        before=before[seen].tolist(),
+        after=[after[seen].tolist() for after, _ in each],
+        floor=[least[seen].tolist() for _, least in each],
+        fit=fit,
+    )
