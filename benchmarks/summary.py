@@ -22,6 +22,7 @@ from benchmarks import (
     floor,
     fresh_clone,
     gap_summary,
+    go2_in_air,
     lines,
     paper_tables,
     parity,
@@ -401,6 +402,10 @@ SECTIONS = (
     ),
     Section("", "transfer_kp_*_joint*.json", "transfer --joint 10", _joint),
     Section("## Real cart-pole", "real_cartpole.json", "real_cartpole", _real),
+    Section(
+        *("## Real Go2 in a stand", "go2_in_air.json", "go2_in_air"),
+        go2_in_air.paragraphs,
+    ),
     Section(*("## MuJoCo's features", "parity.json", "parity", parity.paragraphs)),
     *commands.SECTIONS,
     Section(
