@@ -146,7 +146,10 @@ def paragraphs(r: dict[str, Any]) -> list[str]:
     from benchmarks._page import met
 
     fits = [("all", r["whole"])]
-    fits += [(f"{name} blocks", x) for name, x in zip(("even", "odd"), r["halves"])]
+    fits += [
+        (f"{name} blocks", x)
+        for name, x in zip(("even", "odd"), r["halves"], strict=True)
+    ]
     rows = []
     for name, fit in fits:
         held = fit["held_out"]

@@ -8,7 +8,7 @@ from benchmarks.go2_in_air import BLOCK, blocks
 def test_blocks_are_dealt_out_in_turns(tmp_path: Path) -> None:
     """Every row is in one block; a last one that is too short is in none."""
     log = tmp_path / "log.csv"
-    rows = [f"{1 + 0.01 * k:.2f},{k}" for k in range(725)]  # 7.25 s
+    rows = [f"{1 + 0.01 * k:.2f},{k}" for k in range(625)]  # 6.25 s
     log.write_text("\n".join(["time,qpos.a", *rows]) + "\n")
     halves = blocks(log, tmp_path)
     assert [len(half) for half in halves] == [2, 1]
