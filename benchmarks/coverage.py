@@ -14,7 +14,8 @@ With ``--late`` the targets' commands come late, which the model knows nothing o
 finish is then made with doubts (`easi_jax.estimation.doubts`), as that of measured logs
 is, and what it says of the parameters has to hold. Lines are in
 ``coverage_late.jsonl``. ``--doubts`` shows what doubts cost where commands come in
-time.
+time. With ``--logs`` the demonstrations are written down as logs, and search and finish
+are those of ``train.easi --data``; lines are in ``coverage_logs.jsonl``.
 """
 
 import copy
@@ -27,7 +28,7 @@ from benchmarks._common import RESULTS
 from benchmarks.recovery import NOISE, WEIGHED, controller
 from train._command import main, progress, say
 
-WAYS = ("search, own spread", "search", "refined")
+WAYS: tuple[str, ...] = ("search, own spread", "search", "refined")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,11 +45,14 @@ class Config:
     """How late the targets' commands come [s]; fitted with doubts, as measured logs."""
     doubts: bool = False
     """Fit with doubts where commands come in time, too."""
+    logs: bool = False
+    """Search and fit as train.easi --data does, from logs."""
     shard: str = "1/1"
     """Which part of the targets this process runs."""
     out: Path | None = None
     """Where a line for each target is added; coverage.jsonl of the results,
-    coverage_late.jsonl or coverage_doubts.jsonl, where not given."""
+    coverage_late.jsonl, coverage_doubts.jsonl or coverage_logs.jsonl where not
+    given."""
 
 
 def run(config: Config) -> None:
@@ -62,6 +66,7 @@ def run(config: Config) -> None:
         raise UserError(f"--late {config.late}: seconds, 0 or more and below 1")
     part, parts = shard(config.shard)
     kind = "_late" if config.late > 0 else "_doubts" if config.doubts else ""
+    kind = "_logs" if config.logs else kind
     out = config.out or RESULTS / f"coverage{kind}.jsonl"
     mine = list(range(config.targets))[part - 1 :: parts]
     rows = read_rows(out, ("seed",))
@@ -114,17 +119,24 @@ def _solver(config: Config) -> Any:
     doubted = config.late > 0 or config.doubts
     doubts = doubts_of(simulator, space) if doubted else None
 
-    @functools.partial(jax.jit, compiler_options=fast_loops())
-    def find(key: jax.Array, truth: jax.Array) -> Any:
-        k_run, k_noise, k_search = jax.random.split(key, 3)
+    def recorded(key: jax.Array, truth: jax.Array) -> Any:
+        k_run, k_noise = jax.random.split(key)
         model = real.simulator.model(space.to_si(truth))
         runs = collect(
             *(real, model, controller, k_run, config.trajectories, env.episode_length)
         )
-        demos = measured(runs, noise, k_noise, env.simulator.configuration)
+        return measured(runs, noise, k_noise, env.simulator.configuration)
+
+    @functools.partial(jax.jit, compiler_options=fast_loops())
+    def find(key: jax.Array, demos: Any) -> Any:
         data = SearchData(windows(demos, 8, 4), noise, ())
-        state, info = search.run(search.init(k_search, data), data, config.generations)
-        return demos, state.result_mean, state.result_cov, info.non_finite.sum()
+        state, info = search.run(search.init(key, data), data, config.generations)
+        return state.result_mean, state.result_cov, info.non_finite.sum()
+
+    @jax.jit
+    def known(demos: Any, truth: jax.Array) -> jax.Array:
+        pieces = finish_pieces(simulator, demos)
+        return PairedFit(simulator, space, pieces, noise).information(truth)
 
     @jax.jit
     def judge(demos: Any, mean: jax.Array, cov: jax.Array, truth: jax.Array) -> Any:
@@ -145,17 +157,65 @@ def _solver(config: Config) -> Any:
     def solve(seed: int) -> dict[str, Any]:
         k_truth, k_rest = jax.random.split(jax.random.key(seed))
         truth = jax.random.uniform(k_truth, (space.size,))
-        demos, mean, cov, lost = find(k_rest, truth)
+        k_data, k_search = jax.random.split(k_rest)
+        demos = jax.jit(recorded)(k_data, truth)
+        if config.logs:
+            found = _from_logs(env.mj_model, space, demos, env.dt, config.generations)
+            ended = {WAYS[-1]: found.distribution}
+            row = _row(space, truth, ended, known(demos, truth))
+            return {**row, "no_region": found.no_region}
+        mean, cov, lost = find(k_search, demos)
         found, times, bound = judge(demos, mean, cov, truth)
-        row = _row(space, truth, found, bound, int(lost))
-        return {**row, "times_noise": float(times)}
+        ended = dict(zip(WAYS, found, strict=True))
+        row = _row(space, truth, ended, bound)
+        return {**row, "times_noise": float(times), "non_finite": int(lost)}
 
     return solve
 
 
-def _row(space: Any, truth: Any, found: Any, bound: Any, lost: int) -> dict[str, Any]:
-    """What was ``found`` of a target by each of the `WAYS`, beside the ``truth (n,)``
-    and its information ``bound (n, n)``, unit coordinates."""
+def _from_logs(model: Any, space: Any, demos: Any, dt: float, generations: int) -> Any:
+    """What the library says of demonstrations ``(B, T, 1, ...)`` as logs; the last one
+    is held out."""
+    import jax
+    import numpy as np
+
+    from easi_jax.api import estimate_parameters
+    from easi_jax.data.recording import Log, Run
+    from easi_jax.model.joint_space import Configuration
+
+    def whole(first: Any, following: Any) -> Any:
+        return np.concatenate([first[:1], following[:, 0]]).astype(float)
+
+    runs = []
+    for k in range(len(demos.qpos)):
+        one = jax.tree.map(lambda x, k=k: np.asarray(x[k]), demos)
+        alive = np.flatnonzero(one.weight > 0)
+        end = len(one.weight) if len(alive) == len(one.weight) else int(alive[-1]) + 1
+        qpos = whole(one.qpos[:end], one.next_qpos[:end])
+        qvel = whole(one.qvel[:end], one.next_qvel[:end])
+        ctrl = np.concatenate([one.ctrl[:end, 0], one.ctrl[end - 1 : end, 0]])
+        runs.append(
+            Run(
+                name=f"run{k}",
+                source=f"run{k}",
+                dt=dt,
+                time=dt * np.arange(len(qpos)),
+                qpos=qpos,
+                qvel=qvel,
+                qvel_measured=True,
+                ctrl=ctrl.astype(float),
+                configuration=Configuration.of(model),
+            )
+        )
+    log, held = Log(tuple(runs[:-1]), ()), Log(tuple(runs[-1:]), ())
+    return estimate_parameters(
+        model, space, log, held_out=held, generations=generations
+    )
+
+
+def _row(space: Any, truth: Any, found: dict[str, Any], bound: Any) -> dict[str, Any]:
+    """What was ``found`` of a target, a distribution for each of the `WAYS`, beside the
+    ``truth (n,)`` and its information ``bound (n, n)``, unit coordinates."""
     import numpy as np
 
     from easi_jax.estimation.identifiability import identifiability
@@ -166,9 +226,8 @@ def _row(space: Any, truth: Any, found: Any, bound: Any, lost: int) -> dict[str,
         "truth": np.asarray(space.to_si(truth), float).tolist(),
         "rank": known.rank,
         "determined": known.determined.tolist(),
-        "non_finite": lost,
     }
-    for way, d in zip(WAYS, found, strict=True):
+    for way, d in found.items():
         off = (np.asarray(d.mean, float) - np.asarray(truth, float)) * known.scale
         spread = distribution.covariance(d)
         cov_log = spread * np.outer(known.scale, known.scale)
