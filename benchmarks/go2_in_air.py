@@ -21,6 +21,7 @@ from train._command import main, say, show_table
 GOAL, BLOCK = 180.0, 2.0  # s
 _LIMIT = 1800  # s
 _FEWEST = 0.5  # s, of the last block
+_HEAD = ("parameter", "even blocks", "odd blocks", "apart", "in deviations")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +50,6 @@ def run(config: Config) -> None:
             _fitted(folder / name, model, parameters, halves[k], halves[1 - k])
             for k, name in enumerate(("first", "second"))
         ]
-    same = _same(*each)
     path = write_result(
         "go2_in_air",
         "python -m benchmarks.go2_in_air --data DATA",
@@ -57,10 +57,8 @@ def run(config: Config) -> None:
         whole=whole,
         halves=each,
         goal_s=GOAL,
-        same=same,
     )
-    rows = [(n, *(f"{x:.3g}" for x in r["values"])) for n, r in same.items()]
-    show_table("Values of the halves", ("parameter", "first", "second"), rows)
+    show_table("Values of the blocks", _HEAD, _beside(*each))
     say(f"written: {path}")
 
 
@@ -121,23 +119,19 @@ def _fitted(
     }
 
 
-def _same(first: dict[str, Any], second: dict[str, Any]) -> dict[str, Any]:
-    """Of each parameter that both halves determine: its values, and how far they are
-    apart in logarithms and, where both state a region, in deviations."""
-    out = {}
-    for name, one in first["parameters"].items():
-        other = second["parameters"][name]
-        if {one["flag"], other["flag"]} != {"determined"}:
-            continue
-        values = one["mean"], other["mean"]
-        stated = not (first["no_region"] or second["no_region"])
-        spread = math.hypot(one["std"], other["std"]) if stated else None
-        out[name] = {
-            "values": values,
-            "log_ratio": math.log(values[1] / values[0]) if min(values) > 0 else None,
-            "deviations": (values[1] - values[0]) / spread if spread else None,
-        }
-    return out
+def _beside(even: dict[str, Any], odd: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Each parameter's value in both fits, and how far these are apart in what both
+    state together."""
+    rows = []
+    for name, one in even["parameters"].items():
+        other = odd["parameters"][name]
+        off = other["mean"] - one["mean"]
+        apart = abs(off) / max(math.hypot(one["std"], other["std"]), 1e-300)
+        values = (f"{x['mean']:.3g} ± {x['std']:.2g}" for x in (one, other))
+        rows.append(
+            (name, *values, f"{100 * off / one['mean']:+.0f} %", f"{apart:.2f}")
+        )
+    return rows
 
 
 def paragraphs(r: dict[str, Any]) -> list[str]:
@@ -160,24 +154,17 @@ def paragraphs(r: dict[str, Any]) -> list[str]:
         rows.append((name, f"{fit['seconds']:.0f}", f"{middle:.2f}", region))
     error = "held-out error over that of the model as given, median joint"
     head = "fitted to", "seconds, first start", error, "region"
-    off = [
-        (name, *(f"{v:.3g}" for v in x["values"]), _apart(x))
-        for name, x in r["same"].items()
-    ]
+    rest = _beside(*r["halves"])
+    most = max(float(row[-1]) for row in rest)
     return [
         f"`{r['command']}`: a real Go2 in a stand, with all that `train.parameters` "
         f"proposes. Goal {r['goal_s']:.0f} s: "
         f"{met(r['whole']['seconds'] <= r['goal_s'])}.",
         markdown_table(head, rows),
-        "What the halves say of parameters that both determine:",
-        markdown_table(("parameter", "even blocks", "odd blocks", "apart"), off),
+        "Fitted to even and to odd blocks, with the deviations of `distribution.json`; "
+        f"at most {most:.2f} of them apart:",
+        markdown_table(_HEAD, rest),
     ]
-
-
-def _apart(x: dict[str, Any]) -> str:
-    if x["deviations"] is not None:
-        return f"{x['deviations']:+.1f} deviations"
-    return f"{100 * math.expm1(x['log_ratio']):+.0f} %" if x["log_ratio"] else ""
 
 
 if __name__ == "__main__":
