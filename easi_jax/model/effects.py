@@ -225,15 +225,15 @@ def with_effects(
         gain, bias = m.actuator_gainprm, m.actuator_biasprm
         # Not on the command itself, which MuJoCo clips to its range.
         gains, biases = drive_factors(bias, e.gain, e.kp, e.kv, e.strength, jnp)
-        new["actuator_gainprm"] = gain.at[:, :3].multiply(gains)
+        new["actuator_gainprm"] = _times(gain, 3, gains)
         if np.any(np.asarray(m.actuator_biastype) == mujoco.mjtBias.mjBIAS_AFFINE):
-            new["actuator_biasprm"] = bias.at[:, :3].multiply(biases)
+            new["actuator_biasprm"] = _times(bias, 3, biases)
     if on("tilt"):
         new["opt.gravity"] = tilted(m.opt.gravity, e.tilt)
     if on("friction"):
-        new["geom_friction"] = m.geom_friction.at[:, 0].multiply(e.friction)
+        new["geom_friction"] = _times(m.geom_friction, 1, e.friction)
         if m.npair:
-            new["pair_friction"] = m.pair_friction.at[:, :2].multiply(e.friction)
+            new["pair_friction"] = _times(m.pair_friction, 2, e.friction)
     if on("softness") and (native or m.opt.integrator == IntegratorType.RK4):
         new["geom_solref"] = _softened(m.geom_solref, e.softness)
         if m.npair:
@@ -264,6 +264,12 @@ def drive_factors(
 def _apart(e: Effects) -> jax.Array:
     """Inertia of drives with play, ``(nv,)``."""
     return jnp.where(e.width > 0, e.rotor, 0.0)
+
+
+def _times(leaf: jax.Array, columns: int, factors: jax.Array) -> jax.Array:
+    """``leaf (n, k)``, its first columns times ``factors``; as precise as either."""
+    leaf = leaf.astype(jnp.promote_types(leaf.dtype, factors.dtype))
+    return leaf.at[:, :columns].multiply(factors)
 
 
 def _softened(solref: jax.Array, factors: jax.Array) -> jax.Array:

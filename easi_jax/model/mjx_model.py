@@ -400,6 +400,12 @@ def _write(leaf: jax.Array, items: list[Any], theta: jax.Array) -> jax.Array:
     return leaf.at[index].set(values)
 
 
+def _put(leaf: jax.Array, index: Any, values: jax.Array) -> jax.Array:
+    """``leaf`` with ``values``, as precise as either."""
+    kind = jnp.promote_types(leaf.dtype, values.dtype)
+    return leaf.astype(kind).at[index].set(values)
+
+
 def _scale_inertia(writers: Iterable[Writer], old: mjx.Model, m: Any) -> Any:
     heavy = {w.id for w in writers if (w.kind, w.quantity) == ("body", "mass")}
     bodies = np.array(sorted(heavy), int)
@@ -407,13 +413,14 @@ def _scale_inertia(writers: Iterable[Writer], old: mjx.Model, m: Any) -> Any:
         return m
     ratio = m.body_mass[bodies] / old.body_mass[bodies]
     inertia = m.body_inertia[bodies] * ratio[:, None]
-    return m.replace(body_inertia=m.body_inertia.at[bodies].set(inertia))
+    return m.replace(body_inertia=_put(m.body_inertia, bodies, inertia))
 
 
 def _write_length(m: Any, w: Writer, axis: int, theta: jax.Array) -> Any:
     """A uniform solid of another length and the same mass, from the body's frame."""
     g, b, kind = w.id, m.geom_bodyid[w.id], int(m.geom_type[w.id])
     size, pos = m.geom_size[g], m.geom_pos[g]
+    size = size.astype(jnp.promote_types(size.dtype, theta.dtype))
     length = theta[w.parameter].astype(size.dtype)
     old = length_of(kind, axis, size)
     # The stored half length; a capsule's does not include its ends.
@@ -422,12 +429,12 @@ def _write_length(m: Any, w: Writer, axis: int, theta: jax.Array) -> Any:
     pos = pos + (length / old - 1) * jnp.dot(pos, along) * along
     inertia = m.body_mass[b] * unit_inertia(kind, changed, jnp)
     return m.replace(
-        geom_size=m.geom_size.at[g].set(changed),
-        geom_pos=m.geom_pos.at[g].set(pos),
-        geom_rbound=m.geom_rbound.at[g].set(_bound(kind, changed)),
-        geom_aabb=m.geom_aabb.at[g, 3 + axis].set(length / 2),
-        body_ipos=m.body_ipos.at[b].set(pos),
-        body_inertia=m.body_inertia.at[b].set(inertia),
+        geom_size=_put(m.geom_size, g, changed),
+        geom_pos=_put(m.geom_pos, g, pos),
+        geom_rbound=_put(m.geom_rbound, g, _bound(kind, changed)),
+        geom_aabb=_put(m.geom_aabb, (g, 3 + axis), length / 2),
+        body_ipos=_put(m.body_ipos, b, pos),
+        body_inertia=_put(m.body_inertia, b, inertia),
     )
 
 

@@ -388,7 +388,7 @@ def test_a_fit_on_some_of_the_logs_ends_where_all_have_it(files, capsys, monkeyp
     for some in (False, True):
         if some:
             name = "easi_jax.estimation.from_runs.few"
-            monkeypatch.setattr(name, lambda _, pieces: pieces.spread(6))
+            monkeypatch.setattr(name, lambda _, pieces, __: pieces.spread(6))
         call(*arguments(files, "--overwrite"))
         said = capsys.readouterr().out
         assert said.count("least-squares finish") == 3

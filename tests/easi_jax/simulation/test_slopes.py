@@ -119,6 +119,36 @@ def test_slopes_are_those_of_a_pendulum_by_hand(native: Any) -> None:
     assert (np.abs(rough - exact[..., :5]).max((0, 1)) / size[:5]).max() > 5e-5
 
 
+def test_a_value_that_is_fixed_leaves_the_others_in_doubles() -> None:
+    """Mass writes inertia, of which a fixed mass has left numbers in single precision."""
+    tip = """<body name="tip" pos="0 0 -0.3"><inertial pos="0 0 -0.1" mass="0.2"
+diaginertia="0.02 0.02 0.02"/></body></body></worldbody>"""
+    m = mujoco.MjModel.from_xml_string(
+        _XML.replace("1e-3 1e-3 1e-3", "0.1 0.1 0.1").replace(
+            "</body>\n  </worldbody>", tip
+        )
+    )
+    places = {"mass": "body.arm.mass", "gain": "effect.gain.motor"}
+    space = ParameterSpace(
+        tuple(
+            declare(m, n, at, nominal=v, initial=(v / 2, 2 * v))
+            for (n, at), v in zip(places.items(), (0.5, 0.8), strict=True)
+        )
+    )
+    given = space.to_unit(np.array([0.6, 0.9])), _piece()
+
+    def slopes(**fixed: Any) -> np.ndarray:
+        simulator = Simulator(m, space, _H, engine="mujoco", **fixed)
+        found = jax.jit(
+            lambda u, piece: linearized(simulator, space, u, jnp.zeros(2), piece)[1]
+        )(*given)
+        return np.asarray(found)
+
+    free, fixed = slopes(), slopes(fixed={"body.tip.mass": 0.2})
+    size = np.abs(free).max((0, 1))
+    assert (np.abs(fixed - free).max((0, 1)) < 1e-5 * size).all()
+
+
 def test_jax_is_in_single_precision_again(native: Any) -> None:
     simulator, space = native
     unit = space.to_unit(_TRUE)
