@@ -101,7 +101,6 @@ def _solver(config: Config) -> Any:
     from easi_jax.estimation.posterior import RESTARTS, errs_by, estimate
     from easi_jax.search.config import preset
     from easi_jax.search.easi import Search, SearchData
-    from easi_jax.simulation.rollout import collect, measured
     from easi_jax.simulation.simulator import Simulator
     from envs import make
 
@@ -119,13 +118,7 @@ def _solver(config: Config) -> Any:
     doubted = config.late > 0 or config.doubts
     doubts = doubts_of(simulator, space) if doubted else None
 
-    def recorded(key: jax.Array, truth: jax.Array) -> Any:
-        k_run, k_noise = jax.random.split(key)
-        model = real.simulator.model(space.to_si(truth))
-        runs = collect(
-            *(real, model, controller, k_run, config.trajectories, env.episode_length)
-        )
-        return measured(runs, noise, k_noise, env.simulator.configuration)
+    recorded = jax.jit(functools.partial(_recorded, real, config.trajectories))
 
     @functools.partial(jax.jit, compiler_options=fast_loops())
     def find(key: jax.Array, demos: Any) -> Any:
@@ -158,7 +151,7 @@ def _solver(config: Config) -> Any:
         k_truth, k_rest = jax.random.split(jax.random.key(seed))
         truth = jax.random.uniform(k_truth, (space.size,))
         k_data, k_search = jax.random.split(k_rest)
-        demos = jax.jit(recorded)(k_data, truth)
+        demos = recorded(k_data, truth)
         if config.logs:
             found = _from_logs(env.mj_model, space, demos, env.dt, config.generations)
             ended = {WAYS[-1]: found.distribution}
@@ -171,6 +164,20 @@ def _solver(config: Config) -> Any:
         return {**row, "times_noise": float(times), "non_finite": int(lost)}
 
     return solve
+
+
+def _recorded(real: Any, trajectories: int, key: Any, truth: Any) -> Any:
+    """Demonstrations of a machine with parameters ``truth (n,)``, read with noise."""
+    import jax
+    import jax.numpy as jnp
+
+    from easi_jax.simulation.rollout import collect, measured
+
+    k_run, k_noise = jax.random.split(key)
+    model = real.simulator.model(real.space.to_si(truth))
+    length, shape = real.episode_length, real.simulator.configuration
+    runs = collect(real, model, controller, k_run, trajectories, length)
+    return measured(runs, jnp.asarray(NOISE), k_noise, shape)
 
 
 def _from_logs(model: Any, space: Any, demos: Any, dt: float, generations: int) -> Any:

@@ -12,7 +12,6 @@ friction and constant forces are too (`all_doubts`).
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +26,6 @@ from easi_jax.model.effect_catalog import Scales
 from easi_jax.model.effect_numbers import EFFECT_TABLE
 from easi_jax.model.joint_space import joint_name, scalar_dofs
 from easi_jax.model.parameters import Parameter, ParameterSpace
-from easi_jax.model.quantities import actuator_name
 from easi_jax.simulation.simulator import Simulator
 
 LATE = "commands come late"
@@ -65,11 +63,6 @@ class Doubts:
         """Number of effects."""
         return len(self.parameters)
 
-    @cached_property
-    def deviations(self) -> np.ndarray:
-        """Of each effect before any data, SI, ``(k,)``."""
-        return np.array([p.initial[1] - p.initial[0] for p in self.parameters])
-
 
 def doubted(
     simulator: Simulator, space: ParameterSpace, parameters: Sequence[Parameter]
@@ -98,39 +91,32 @@ def all_doubts(
         scales: of the logs.
     """
     m = simulator.mj_model
-    asked = {a for p in space.parameters for a in p.addresses}
-    asked |= set(simulator.fixed)
-    found = list(_late(simulator))
-    drives = [
-        (m.actuator(a).name or str(a), f'"{actuator_name(m, a)}"') for a in range(m.nu)
-    ]
-    joints = [
-        (joint_name(m, j), f'"{joint_name(m, j)}"')
+    asked = {a for p in space.parameters for a in p.addresses} | set(simulator.fixed)
+    drives = {m.actuator(a).name or str(a): _STRENGTH for a in range(m.nu)}
+    joints = {
+        joint_name(m, j): _FORCE * float(scales.torque[d])
         for j, (_, d) in scalar_dofs(m).items()
         if not scales.hidden or not scales.hidden[d]
-    ]
-    push = {joint_name(m, j): scales.torque[d] for j, (_, d) in scalar_dofs(m).items()}
+    }
     kinds = (
         ("strength", "the strength of {} is another", drives, _SETS_FORCE),
         ("coulomb", "{} has more dry friction", joints, ("frictionloss", "coulomb")),
         ("constant", "a constant force acts on {}", joints, ("constant", "springref")),
     )
-    for field, text, places, same in kinds:
+    found = list(_late(simulator))
+    for field, text, sizes, same in kinds:
         free = [
-            (name, shown, f"effect.{field}.{name}")
-            for name, shown in places
+            name
+            for name in sizes
             if not any(_sets(address, name, same) for address in asked)
+            and _possible(m, f"effect.{field}.{name}")
         ]
-        free = [x for x in free if _possible(m, x[2])]
         together = len(free) > _EACH
         if together and field == "constant":
             continue  # of one sign and size in all joints: nobody's effect
-        groups = [free] if together else [[x] for x in free]
-        for group in (g for g in groups if g):
-            shown = "every joint or drive" if together else group[0][1]
-            size = _STRENGTH
-            if field != "strength":
-                size = _FORCE * float(np.median([push[x[0]] for x in group]))
+        for group in [free] if together else [[name] for name in free]:
+            shown = "every joint or drive" if together else f'"{group[0]}"'
+            size = float(np.median([sizes[name] for name in group]))
             found.append(_parameter(m, field, text.format(shown), group, size))
     return doubted(simulator, space, found)
 
@@ -155,14 +141,10 @@ def _late(simulator: Simulator) -> tuple[Parameter, ...]:
 
 
 def _parameter(
-    m: mujoco.MjModel,
-    field: str,
-    name: str,
-    group: Sequence[tuple[str, str, str]],
-    size: float,
+    m: mujoco.MjModel, field: str, name: str, group: Sequence[str], size: float
 ) -> Parameter:
     """An effect at the places of a ``group``, alike, of a deviation ``size``."""
-    places = tuple(address for _, _, address in group)
+    places = tuple(f"effect.{field}.{place}" for place in group)
     unit, (least, most) = describe(m, places)
     neutral = EFFECT_TABLE[field].neutral
     low, high = neutral - _ROOM * size, min(most, neutral + _ROOM * size)

@@ -149,7 +149,9 @@ def test_values_hold_where_commands_come_late(doubts: Doubts) -> None:
     late, _ = _recorded(m, 2, simulator.past_steps, 0)
     alone, marginal = fit(late)
     assert off(alone, marginal) > 10.0 and off(marginal, marginal) < 3.0
-    mean, std = np.asarray(marginal.doubts[0]) * float(doubts.deviations[0])
+    mean, std = np.asarray(marginal.doubts[0]) * float(
+        np.ptp(doubts.parameters[0].initial)
+    )
     assert abs(mean - _LATE) < 4.0 * std and std < 0.1 * _LATE
     (line,) = told(doubts.parameters, np.asarray(marginal.doubts), 0.002)
     assert line.startswith(LATE) and "0.004" in line

@@ -120,7 +120,7 @@ def test_slopes_are_those_of_a_pendulum_by_hand(native: Any) -> None:
 
 
 def test_a_value_that_is_fixed_leaves_the_others_in_doubles() -> None:
-    """Mass writes inertia, of which a fixed mass has left numbers in single precision."""
+    """Mass writes inertia, which a fixed mass has left in single precision."""
     tip = """<body name="tip" pos="0 0 -0.3"><inertial pos="0 0 -0.1" mass="0.2"
 diaginertia="0.02 0.02 0.02"/></body></body></worldbody>"""
     m = mujoco.MjModel.from_xml_string(
