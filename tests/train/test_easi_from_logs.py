@@ -391,7 +391,7 @@ def test_a_fit_on_some_of_the_logs_ends_where_all_have_it(files, capsys, monkeyp
             monkeypatch.setattr(name, lambda _, pieces, __: pieces.spread(6))
         call(*arguments(files, "--overwrite"))
         said = capsys.readouterr().out
-        assert said.count("least-squares finish") == 3
+        assert said.count("least-squares finish") == (2 if some else 3)
         assert said.count("on all of the logs") == 2
         found[some] = json.loads((files["out"] / "distribution.json").read_text())
         found[some] = found[some]["seeds"]["0"]
