@@ -225,12 +225,15 @@ class _Finish:
         self.mesh = search.mesh or make_mesh()
 
     def compile(self) -> None:
-        """Compiles both programs; the second only where it is needed."""
+        """Compiles both programs beside each other; the second where it is needed."""
+        ending = None
+        if self.refined:
+            ending = distributed.started(lambda: self.ending(self.doubts))
         n = self.search.space.size
         like = jnp.zeros(n), jnp.eye(n), self.pieces, self.hidden, _ROBUST, False
         self._fit = jax.jit(self.fit).lower(*placed(like)).compile(quick_compile())
-        if self.refined:
-            self.ending(self.doubts)
+        if ending is not None:
+            ending()
 
     @cached_property
     def lacking(self) -> Doubts | None:
