@@ -26,6 +26,7 @@ from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.pieces import effective_noise, few, segments_from_runs
 from easi_jax.estimation.posterior import (
     Estimate,
+    as_fitted,
     diverged,
     estimate,
     no_region,
@@ -313,15 +314,19 @@ class _Finish:
             return found.replace(search_mean=mean, search_cov=cov), weight
         if fewer:
             weighed = self.whole
-        last = _Last(found, weight, weighed, misfit)
-        last = self.ended(last, cov, self.doubts, "", self.lacks)
+        undoubted = _Last(found, weight, weighed, misfit)
+        last = self.ended(undoubted, cov, self.doubts, "", self.lacks)
         if self.lacks(last.found):
             more = ", with more in doubt"
             last = self.ended(last, cov, self.lacking, more, self.beyond)
         if self.beyond(last.found) and last.found.doubted:
-            # Nobody knows what it lacks: then what predicts best by itself.
-            last = self.ended(last, cov, None, ", as the model is", self.lost)
-        return replace(last.found, search_mean=mean, search_cov=cov), last.weight
+            # Nobody knows what it lacks: then what predicts best by itself, which is
+            # near where the fit was before anything else could take up errors.
+            last = self.ended(undoubted, cov, None, ", as the model is", self.lost)
+        found = last.found
+        if self.beyond(found) and not self.lost(found):
+            found = as_fitted(self.search.space, found)
+        return replace(found, search_mean=mean, search_cov=cov), last.weight
 
     def ended(
         self,

@@ -22,7 +22,7 @@ from easi_jax.estimation.doubts import (
 )
 from easi_jax.estimation.levenberg_marquardt import RefineResult
 from easi_jax.estimation.normal_equations import PairedFit
-from easi_jax.estimation.posterior import Estimate, no_region, polished
+from easi_jax.estimation.posterior import Estimate, as_fitted, no_region, polished
 from easi_jax.model.distribution import covariance
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace, declare
@@ -220,5 +220,11 @@ def test_no_region_is_stated_where_nothing_likely_explains_the_error() -> None:
     right, _ = _recorded(m, 0, past, 4)
     wrong, _ = _recorded(mujoco.MjModel.from_xml_string(odd), 0, past, 4)
     assert not no_region(fit(right)[1])
-    why = no_region(fit(wrong)[1])
+    found = fit(wrong)[1]
+    why = no_region(found)
     assert why.startswith("no region is stated") and "times the noise" in why
+    # Values are then those of the fit, whose predictions no prior has touched.
+    stated = as_fitted(space, found).distribution
+    np.testing.assert_array_equal(stated.mean, space.clip(found.fit))
+    spread = covariance(found.distribution)
+    np.testing.assert_allclose(covariance(stated), spread, atol=1e-5 * spread.max())
