@@ -20,7 +20,7 @@ from easi_jax.data.recording import Run
 from easi_jax.data.resampling import mean_held
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.errors import UserError
-from easi_jax.estimation.from_runs import ready_errors
+from easi_jax.estimation.held_out import ready_errors
 from easi_jax.estimation.pieces import segments_from_runs, visible_steps
 from easi_jax.estimation.prediction_error import (
     misfit_of,
@@ -277,11 +277,13 @@ def test_error_of_the_true_model_is_the_noise_floor(simulator):
         *("cart", simulator, [asked[0]], [asked[1]], "held", asked[2]),
         *(np.zeros(1, bool), 20, 20, 20 * simulator.dt, []),
     )
-    errors_of = ready_errors(problem, simulator.space)
-    first, second, least = errors_of(jnp.asarray(simulator.space.nominal))
+    held_out, fitted = ready_errors(problem, simulator.space, several=True)
+    assert fitted is not None
+    first, least = held_out.with_floor(jnp.asarray(simulator.space.nominal))
     np.testing.assert_allclose(first, least, rtol=0.1)
+    second = fitted.of(jnp.asarray(simulator.space.nominal))
     np.testing.assert_allclose(second, least, rtol=0.15)
-    wrong, _, noise = errors_of(jnp.asarray([5.0]))
+    wrong, noise = held_out.with_floor(jnp.asarray([5.0]))
     assert wrong[0] > 2 * first[0]
     assert noise[0] < 1.5 * least[0], "errors of a model are no noise"
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,8 @@ import pytest
 from easi_jax.data.measured import MeasuredRuns
 from easi_jax.data.recording import Run
 from easi_jax.data.unmeasured import start_spread
-from easi_jax.estimation.from_runs import held_out_errors, search_data, spread_of_starts
+from easi_jax.estimation.from_runs import search_data, spread_of_starts
+from easi_jax.estimation.held_out import held_out_errors
 from easi_jax.estimation.pieces import visible_steps
 from easi_jax.estimation.problem import Problem, problem_of
 from easi_jax.estimation.weights import step_weights
@@ -111,9 +113,14 @@ def test_the_discriminator_is_not_told(
 
 
 def test_held_out_errors_are_of_what_was_measured(problem: Problem) -> None:
-    def errors_of(theta: jax.Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return np.array([0.2, 9.0]), np.array([0.1, 9.0]), np.array([0.05, 9.0])
+    class Errors:
+        def of(self, theta: jax.Array) -> np.ndarray:
+            return np.array([0.2, 9.0])
 
-    found = held_out_errors(problem, problem.simulator.space, [jnp.ones(1)], errors_of)
+        def with_floor(self, theta: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+            return np.array([0.2, 9.0]), np.array([0.05, 9.0])
+
+    ready: Any = Errors(), Errors()
+    found = held_out_errors(problem, problem.simulator.space, [jnp.ones(1)], ready)
     assert found.channels == ["drive"] and found.units == ["rad"]
     assert found.before == [0.2] and found.floor == [[0.05]] and found.fit == [1.0]
