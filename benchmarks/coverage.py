@@ -65,8 +65,8 @@ def run(config: Config) -> None:
     if not 0 <= config.late < 1:
         raise UserError(f"--late {config.late}: seconds, 0 or more and below 1")
     part, parts = shard(config.shard)
-    kind = "_late" if config.late > 0 else "_doubts" if config.doubts else ""
-    kind = "_logs" if config.logs else kind
+    kinds = {"_logs": config.logs, "_late": config.late > 0, "_doubts": config.doubts}
+    kind = next((name for name, on in kinds.items() if on), "")
     out = config.out or RESULTS / f"coverage{kind}.jsonl"
     mine = list(range(config.targets))[part - 1 :: parts]
     rows = read_rows(out, ("seed",))
@@ -132,7 +132,7 @@ def _solver(config: Config) -> Any:
         return PairedFit(simulator, space, pieces, noise).information(truth)
 
     @jax.jit
-    def judge(demos: Any, mean: jax.Array, cov: jax.Array, truth: jax.Array) -> Any:
+    def judge(demos: Any, mean: jax.Array, cov: jax.Array) -> Any:
         pieces = finish_pieces(doubts.simulator if doubts else simulator, demos)
         fit = PairedFit(simulator, space, pieces, noise)
         found = [
@@ -144,21 +144,21 @@ def _solver(config: Config) -> Any:
             )
             for how in ((False, False), (False, True), (True, True))
         ]
-        told = [e.distribution for e in found], errs_by(found[-1])
-        return *told, fit.information(truth)
+        return [e.distribution for e in found], errs_by(found[-1])
 
     def solve(seed: int) -> dict[str, Any]:
         k_truth, k_rest = jax.random.split(jax.random.key(seed))
         truth = jax.random.uniform(k_truth, (space.size,))
         k_data, k_search = jax.random.split(k_rest)
         demos = recorded(k_data, truth)
+        bound = known(demos, truth)
         if config.logs:
             found = _from_logs(env.mj_model, space, demos, env.dt, config.generations)
             ended = {WAYS[-1]: found.distribution}
-            row = _row(space, truth, ended, known(demos, truth))
+            row = _row(space, truth, ended, bound)
             return {**row, "no_region": found.no_region}
         mean, cov, lost = find(k_search, demos)
-        found, times, bound = judge(demos, mean, cov, truth)
+        found, times = judge(demos, mean, cov)
         ended = dict(zip(WAYS, found, strict=True))
         row = _row(space, truth, ended, bound)
         return {**row, "times_noise": float(times), "non_finite": int(lost)}
@@ -196,8 +196,7 @@ def _from_logs(model: Any, space: Any, demos: Any, dt: float, generations: int) 
     runs = []
     for k in range(len(demos.qpos)):
         one = jax.tree.map(lambda x, k=k: np.asarray(x[k]), demos)
-        alive = np.flatnonzero(one.weight > 0)
-        end = len(one.weight) if len(alive) == len(one.weight) else int(alive[-1]) + 1
+        end = np.count_nonzero(one.weight)  # of the episode
         qpos = whole(one.qpos[:end], one.next_qpos[:end])
         qvel = whole(one.qvel[:end], one.next_qvel[:end])
         ctrl = np.concatenate([one.ctrl[:end, 0], one.ctrl[end - 1 : end, 0]])

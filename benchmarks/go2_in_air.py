@@ -4,7 +4,7 @@
     python -m benchmarks.go2_in_air --data ../shared/data/go2_in_air
 
 The whole recording is fitted from a first start, with a compilation cache of its own;
-its last fifth is held out. Then blocks of 2 s are dealt out in turns to two halves,
+parts of it are held out. Then blocks of 2 s are dealt out in turns to two halves,
 each fitted while the other is held out: what is said of a parameter should be the same.
 Results go to ``go2_in_air.json``.
 """

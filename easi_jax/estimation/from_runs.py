@@ -311,7 +311,7 @@ class _Finish:
             center = jax.block_until_ready(found.fit)
             self.tell(f"least-squares finish: pass {k + 1} of {passes}")
         if not self.refined or self.lost(found):
-            return found.replace(search_mean=mean, search_cov=cov), weight
+            return replace(found, search_mean=mean, search_cov=cov), weight
         if fewer:
             weighed = self.whole
         undoubted = _Last(found, weight, weighed, misfit)

@@ -31,7 +31,7 @@ from easi_jax.model.effect_numbers import (
     fields_that_act,
 )
 from easi_jax.model.joint_space import scalar_places
-from easi_jax.model.native_model import NativeModel
+from easi_jax.model.native_model import NativeModel, as_precise
 from easi_jax.model.set_const import set_const
 
 _TINY = 1e-9
@@ -268,8 +268,7 @@ def _apart(e: Effects) -> jax.Array:
 
 def _times(leaf: jax.Array, columns: int, factors: jax.Array) -> jax.Array:
     """``leaf (n, k)``, its first columns times ``factors``; as precise as either."""
-    leaf = leaf.astype(jnp.promote_types(leaf.dtype, factors.dtype))
-    return leaf.at[:, :columns].multiply(factors)
+    return as_precise(leaf, factors).at[:, :columns].multiply(factors)
 
 
 def _softened(solref: jax.Array, factors: jax.Array) -> jax.Array:

@@ -22,7 +22,7 @@ from easi_jax.model.contact_pairs import Pair, pair_ids, without_pairs
 from easi_jax.model.effect_numbers import direct_contacts
 from easi_jax.model.effects import Effects
 from easi_jax.model.mjx_data import make_data, without_idle_cone
-from easi_jax.model.native_model import NativeModel, Template
+from easi_jax.model.native_model import NativeModel, Template, as_precise
 from easi_jax.model.quantities import length_of, long_axis, unit_inertia
 from easi_jax.model.set_const import set_const
 from easi_jax.model.torque_speed import TorqueSpeed
@@ -392,7 +392,7 @@ def _leaf(m: mjx.Model, field: str) -> jax.Array:
 
 def _write(leaf: jax.Array, items: list[Any], theta: jax.Array) -> jax.Array:
     index = tuple(np.array(k) for k in zip(*(i for i, _, _ in items), strict=True))
-    leaf = leaf.astype(jnp.promote_types(leaf.dtype, theta.dtype))
+    leaf = as_precise(leaf, theta)
     sign = np.array([s for _, _, s in items], leaf.dtype)
     values = theta[np.array([p for _, p, _ in items])].astype(leaf.dtype) * sign
     if not index:  # a scalar
@@ -402,8 +402,7 @@ def _write(leaf: jax.Array, items: list[Any], theta: jax.Array) -> jax.Array:
 
 def _put(leaf: jax.Array, index: Any, values: jax.Array) -> jax.Array:
     """``leaf`` with ``values``, as precise as either."""
-    kind = jnp.promote_types(leaf.dtype, values.dtype)
-    return leaf.astype(kind).at[index].set(values)
+    return as_precise(leaf, values).at[index].set(values)
 
 
 def _scale_inertia(writers: Iterable[Writer], old: mjx.Model, m: Any) -> Any:
@@ -419,8 +418,7 @@ def _scale_inertia(writers: Iterable[Writer], old: mjx.Model, m: Any) -> Any:
 def _write_length(m: Any, w: Writer, axis: int, theta: jax.Array) -> Any:
     """A uniform solid of another length and the same mass, from the body's frame."""
     g, b, kind = w.id, m.geom_bodyid[w.id], int(m.geom_type[w.id])
-    size, pos = m.geom_size[g], m.geom_pos[g]
-    size = size.astype(jnp.promote_types(size.dtype, theta.dtype))
+    size, pos = as_precise(m.geom_size[g], theta), m.geom_pos[g]
     length = theta[w.parameter].astype(size.dtype)
     old = length_of(kind, axis, size)
     # The stored half length; a capsule's does not include its ends.

@@ -81,6 +81,11 @@ def _field(model: NativeModel, name: str) -> Any:
     return jnp.asarray(value, jnp.result_type(float)) if kind == "f" else value
 
 
+def as_precise(leaf: jax.Array, other: jax.Array) -> jax.Array:
+    """``leaf`` in doubles where ``other`` is, which is to be written into it."""
+    return leaf.astype(jnp.promote_types(leaf.dtype, other.dtype))
+
+
 def nominal_field(m: mujoco.MjModel, name: str) -> Any:
     """A field of a model by name, dots allowed."""
     value: Any = m

@@ -36,6 +36,7 @@ def start_parts(m: mujoco.MjModel) -> np.ndarray:
     for i in np.flatnonzero(m.actuator_actadr >= 0):
         first = int(m.actuator_actadr[i])
         joint = int(m.actuator_trnid[i, 0])
+        # Where an actuator is at something else, all is one part.
         part = parts[m.jnt_dofadr[joint]] if parts.any() else 0
         driven[first : first + int(m.actuator_actnum[i])] = part
     return np.concatenate([parts, parts, driven])
