@@ -25,7 +25,8 @@ class Config:
     """Runs train.gap on generated cases and grades its names."""
 
     kind: str = "single"
-    """single, pair, none, wrong_own or outside."""
+    """single, pair, none, wrong_own, outside (an effect that no table has), mixed (one
+    of the table beside one outside) or several (three to five)."""
     seeds: tuple[int, int] = (0, 10)
     """First seed, and the one after the last."""
     cheap: bool = False
@@ -116,7 +117,8 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
     first names have to be the truth's, in any order (``found``). ``listed``: what is
     among the names that the held-out data do not tell from one of those.
     """
-    truth = {f"{e['effect']}@{e['at']}": set(e["twins"]) for e in answer["effects"]}
+    known = [e for e in answer["effects"] if e["kind"] != "outside"]
+    truth = {f"{e['effect']}@{e['at']}": set(e["twins"]) for e in known}
     outside = answer["kind"] == "outside"
     named = [f"{e['effect']}@{e['at']}" for e in told["effects"]]
     first = named[: max(1, len(truth))]
@@ -138,6 +140,9 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
         "truth": list(truth),
         "named": named,
         "confidence": [e["confidence"] for e in told["effects"]],
+        "removal_cost": [e["removal_cost"] for e in told["effects"]],
+        "explains": [e["explains"] for e in told["effects"]],
+        "unexplained_share": told["unexplained_share"],
         "found": found,
         "listed": listed,
         "verdict": told["verdict"],
@@ -147,7 +152,7 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
         "parameters": [
             {k: v["value"] for k, v in e["parameters"].items()} for e in told["effects"]
         ],
-        "true_parameters": [e["parameters"] for e in answer["effects"]],
+        "true_parameters": [e["parameters"] for e in known],
         "gap": told["gap"],
         "true_floor": answer["gap"]["floor"],
     }

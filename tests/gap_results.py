@@ -39,6 +39,7 @@ def effect(
         (gaps[1],),
         {column: 0.01},
         {column: 0.001},
+        cost=0.7,
     )
 
 

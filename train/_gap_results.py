@@ -171,7 +171,7 @@ def _record_next(
     if not open_names:
         return ()
     say("looking for what to record next ...")
-    known = {p.key: p for p in (*analysis.places, *analysis.ripples)}
+    known = analysis.places.known
     # Rows cost time, whatever their rate.
     horizon, dt = outcome.horizon, problem.fit[0].dt
     seconds = max(10 * horizon, min(_LONGEST_TEST, _ROWS * dt))
@@ -187,7 +187,7 @@ def _record_next(
             f.place,
             [known[key] for key in f.indistinguishable[:_ASKED]],
             problem.fit,
-            analysis.noise[: problem.model.mj_model.nv],
+            analysis.data.noise[: problem.model.mj_model.nv],
             horizon,
             plan,
         )

@@ -54,9 +54,9 @@ def run(config: Config) -> None:
             return
         made_by = versions()
         key = key_of(analysis.key, made_by["commit"], made_by["packages"])
-        analysis.selector.journal = Journal(journal, key)
-        if analysis.selector.journal.kept:
-            say(f"going on after {analysis.selector.journal.kept} steps that are done")
+        analysis.journal = Journal(journal, key)
+        if analysis.journal.kept:
+            say(f"going on after {analysis.journal.kept} steps that are done")
         problem.notes.extend(analysis.predictor.simulator.notes)
         for note in problem.notes:
             say(f"note: {note}")
@@ -65,7 +65,7 @@ def run(config: Config) -> None:
             say(f"note: {note}")
         result, whole = write_all(folder, config, problem, analysis, outcome)
         if whole:
-            analysis.selector.journal.clear()
+            analysis.journal.clear()
         else:
             say("the same command with --resume tries again what was left out")
     show(result, config.out / REPORT)

@@ -11,6 +11,7 @@ from easi_jax.data.unmeasured import hidden_in_any, start_spread
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.model.contact_pairs import pair_ids, touching
 from easi_jax.model.effect_catalog import Scales
+from easi_jax.model.joint_space import scalar_places
 
 _ROWS = 400
 _LONGEST = 0.1  # s
@@ -56,12 +57,15 @@ def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
     def rms(x: np.ndarray) -> np.ndarray:
         return np.sqrt(np.mean(np.minimum(x**2, 1e12), 0))
 
+    low, high, home = got["q"].min(0), got["q"].max(0), np.zeros(m.nv)
+    at, dof = scalar_places(m).T
+    home[dof] = m.qpos0[at]
     forces = np.concatenate([drive_forces(m, run) for run in runs])
     inertia = got["inertia"].mean(0)
     speed = rms(got["v"])
     torque = np.median(np.abs(got["torque"]), 0)
     torque = np.maximum(torque, inertia * np.median(np.abs(got["a"]), 0))
-    position, span = got["q"].std(0), np.ptp(got["q"], 0)
+    position, span = got["q"].std(0), high - low
     hidden = hidden_in_any(runs)
     if hidden.any():
         far, fast = np.split(start_spread(m, runs), 2)
@@ -72,11 +76,13 @@ def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
         speed=np.maximum(speed, 1e-9),
         acceleration=rms(got["a"]),
         torque=np.maximum(torque, 1e-9),
+        most=np.abs(got["torque"]).max(0),
         inertia=inertia,
         command=np.maximum(rms(got["ctrl"]), 1e-9) if m.nu else np.zeros(0),
         force=np.maximum(rms(got["force"]), 1e-9) if m.nu else np.zeros(0),
         peak=np.percentile(np.abs(forces), _PEAK, axis=0) if m.nu else np.zeros(0),
         span=np.maximum(span, 1e-9),
+        middle=home + 0.5 * (low + high),
         touching=got["touching"].mean(0),
         dt=runs[0].dt,
         longest=max(_LONGEST, 3 * runs[0].dt),

@@ -84,6 +84,9 @@ def _at(row: Effect, o: _Object, cycles: float = np.nan) -> Iterator[Place]:
         for start in site.starts_at(o.spot)
     )
     what = (row.name, o.name, "model" if o.is_all else kind, columns)
+    if row.rests:
+        yield Place(*what, starts, rests=o.spot.range)
+        return
     if not site.parts[-1].number.is_shape:
         yield Place(*what, starts)
         return

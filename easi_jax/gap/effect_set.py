@@ -1,6 +1,6 @@
 """A candidate effect, and a set of effects with its fit."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -45,3 +45,13 @@ class Model:
     unlikely: int = 0
     windows: np.ndarray = field(default_factory=lambda: np.zeros((2, 0)))
     felt: dict[str, int] = field(default_factory=dict)
+
+
+def keys(model: Model) -> frozenset[str]:
+    """Of its effects, in whatever order."""
+    return frozenset(p.key for p in model.places)
+
+
+def last(model: Model, place: Place) -> Model:
+    """The model with one of its effects as the last."""
+    return replace(model, places=[*[p for p in model.places if p is not place], place])

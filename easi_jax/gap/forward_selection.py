@@ -6,7 +6,7 @@ fit (by the fit's own derivatives, which for least squares needs no fit anew), n
 the fitting error, and never by the held-out data.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -55,6 +55,7 @@ class Selector:
         group: block of cross-validation that each window is in, ``(count,)``.
         own: indices of the model's own parameters that may be refitted.
         progress: told how far long stages are.
+        rows: of a window that are compared; all where None.
     """
 
     def __init__(
@@ -66,8 +67,9 @@ class Selector:
         group: np.ndarray,
         own: Sequence[int],
         progress: Progress = silent,
+        rows: int | None = None,
     ) -> None:
-        self.predictor, self.progress = predictor, progress
+        self.predictor, self.progress, self.rows = predictor, progress, rows
         self.residuals: Residuals
         self.floor = 0.0
         self.journal = Journal()
@@ -97,7 +99,7 @@ class Selector:
         at = self.windows_of(every)
         moved = np.broadcast_to(self.moved[at], (len(x), len(at), self.moved.shape[1]))
         found = self.predictor.errors(self.plain(x), self.blocks[every], moved)
-        found = found[:, : len(at)]
+        found = found[:, : len(at), : self.rows]
         bounded, lost = finite(found, self.predictor.largest)
         few = lost.mean(1) <= _LOST
         found = np.where(few[:, None, None, None], bounded, found)
@@ -148,6 +150,8 @@ class Selector:
         """A fit with its cross-validated loss."""
         unlikely = sum(p.unlikely(fit.x[self.columns(p, fitted=False)]) for p in places)
         windows = self.cross_validated(fit)
+        if not all(p.possible(fit.x[self.columns(p, fitted=False)]) for p in places):
+            windows = np.full_like(windows, np.inf)
         loss, gap = self._of_blocks(windows)
         felt = {p.key: self._felt(p, fit) for p in places}
         return Model(places, fit, loss, gap, self.own, unlikely, windows, felt)
@@ -335,15 +339,18 @@ class Selector:
                 model = replace(best, places=order)
         return model
 
-    def needed(self, model: Model) -> Model:
-        """The model less the effects that it predicts as well without."""
+    def needed(self, model: Model, spared: Collection[str] = ()) -> Model:
+        """The model less the effects that it predicts as well without, but those that
+        are ``spared``."""
         while len(model.places) > 1:
             shorter = []
             for place in model.places:
+                if place.key in spared:
+                    continue
                 kept = [p for p in model.places if p is not place]
                 shorter.append(self.fit(kept, self.without(model.fit.x, place, kept)))
-            best = min(shorter, key=lambda m: m.loss.mean())
-            if better(model, best, self.floor):
+            best = min(shorter, key=lambda m: m.loss.mean(), default=None)
+            if best is None or better(model, best, self.floor):
                 break
             model = best
         return model

@@ -13,7 +13,6 @@ _SURE = 1.7  # standard errors by which an effect has to help
 _LIKELY = 1.0  # by either measure
 HELPS = 0.05  # share of the squared gap by which each of its numbers has to help
 _LARGE = 0.3
-_PLAIN = 2.0  # times as far above the floor: a gap beyond doubt
 _CLOSER = 3.0  # times as much has to be gained where it is
 _TINY = 1e-300
 _RARE = 0.1  # relative loss by which a rare effect has to be better than others
@@ -147,9 +146,9 @@ def probability(model: Model, rival: Model) -> float:
     """
     t = 0.0
     for mine, theirs in ((model.loss, rival.loss), (model.gap, rival.gap)):
-        d = theirs - mine
-        error = max(d.std(ddof=1) / sqrt(len(d)), _ALIKE * mine.mean())
-        t += 0.5 * float(d.mean()) / max(error, _TINY)
+        # Of numbers whose spread nobody knows, the log density is that of the spread.
+        d = np.log((theirs + _TINY) / (mine + _TINY))
+        t += 0.5 * float(d.mean()) / max(d.std(ddof=1) / sqrt(len(d)), _ALIKE)
     apart = _few(np.abs(model.windows - rival.windows).max(0, initial=0.0) > 1.0)
     if len(apart):
         mine, theirs = (np.log(x.windows[:, apart] + _TINY) for x in (model, rival))
@@ -162,17 +161,23 @@ def probability(model: Model, rival: Model) -> float:
     return 0.5 * (1 + erf(t / sqrt(2)))
 
 
-def explained(before: float, after: float, floor: float) -> float:
-    """How far to trust that an effect is what it seems, by the share that it and those
-    after it close of the gap ``before`` it: the rest may be of something that they
-    stand in for.
+def cost(model: Model, less: Model) -> float:
+    """What a model loses in cross-validated log density without an effect: nats for
+    each independent number that was read, whichever way blocks of time are
+    averaged: what acts seldom shows in few of them."""
+    mine, theirs = (x.loss + _TINY for x in (model, less))
+    each = np.mean(np.log(theirs / mine))
+    return 0.5 * float(max(each, np.log(theirs.mean() / mine.mean())))
 
-    Squared, which is what makes the confidence come true (`benchmarks.gap`). Where
-    little more than noise was left before it, it may mend what no effect is.
+
+def confidence(lost: float, odds: float) -> float:
+    """Probability that an effect of this name acts at this place.
+
+    What closes little beside what is left may mend a little of what no effect is.
+
+    Args:
+        lost: its `cost`.
+        odds: of all its rivals together.
     """
-    clear = (before - floor) / (_PLAIN * (GOAL - 1) * floor)
-    clear = min(max(clear, 0.0), 1.0)
-    if after <= GOAL * floor:
-        return clear
-    left = (after - floor) / max(before - floor, after - floor)
-    return clear * (1.0 - left) ** 2
+    closes = 1.0 - np.exp(-2.0 * max(lost, 0.0))
+    return float(closes / (1.0 + odds))

@@ -135,28 +135,20 @@ class Predictor:
         # Centers of mass move.
         base = self.simulator.base
         self.simulator.base = base.replace(mjx=for_every_effect(base.mjx))
-        self.layout, self.windows = layout, windows
+        self.layout = layout
         self.own = len(space.nominal)
         self.neutral = np.concatenate([np.asarray(space.nominal), layout.neutral])
         m, nv = mj_model, mj_model.nv
-        self.nv, self.steps = nv, windows.ctrl.shape[1]
-        self.size = 2 * nv + m.na
+        self.nv, self.size = nv, 2 * nv + m.na
         self.wrapped = np.zeros(nv, bool)
         for j in range(m.njnt):
             self.wrapped[dofs(m, j)] = turns_fully(m, j)
         self.channels = nv + len(self.sensors)
-        moved = np.abs(self._unwrapped(windows.read)).max((0, 1))
-        moved = np.where(self.wrapped, np.minimum(moved, np.pi), moved)
-        span = np.ptp(windows.sensed[..., self._sensed], axis=(0, 1))
-        self.largest = np.concatenate([moved, span])
         self._scalar = scalar_places(m).T
         self._mesh = make_mesh()
         engine = self.simulator.engine
         on_host = on_cpu() or engine == "mujoco"
         self._items = _ITEMS if on_host else _ACCELERATOR_ITEMS
-        # By powers of two, so that the program of one log often serves the next.
-        self._room = 1 << (self.blocks - 1).bit_length()
-        self._data = self._placed(windows)
         latest = sum(
             max((c.high for c in layout.columns if c.field == name), default=0.0)
             for name in ("delay", "late")
@@ -175,6 +167,18 @@ class Predictor:
             if not left_out or told:
                 self._without[left_out] = np.array(told, int)
         self._without = dict(reversed(self._without.items()))
+        self._take(windows)
+
+    def _take(self, windows: WindowSet) -> None:
+        """Predicts these windows, by programs of their own."""
+        self.windows, self.steps = windows, windows.ctrl.shape[1]
+        moved = np.abs(self._unwrapped(windows.read)).max((0, 1))
+        moved = np.where(self.wrapped, np.minimum(moved, np.pi), moved)
+        span = np.ptp(self._readings(windows), axis=(0, 1))
+        self.largest = np.concatenate([moved, span])[: self.channels]
+        # By powers of two, so that the program of one log often serves the next.
+        self._room = 1 << (self.blocks - 1).bit_length()
+        self._data = self._placed(windows)
         self._compiled: dict[tuple[str, ...], Callable[[], Any]] = {}
 
     @property
@@ -195,9 +199,7 @@ class Predictor:
         fill = np.minimum(np.arange(self._room * BLOCK), len(windows) - 1)
         padded = windows.take(fill)
         read = self._unwrapped(padded.read)
-        sensed = np.zeros((*read.shape[:2], len(self.sensors)))
-        if padded.sensed.shape[-1]:  # planned motion has no readings
-            sensed[:] = padded.sensed[..., self._sensed]
+        sensed = self._readings(padded)
         whole = NamedSharding(self._mesh, PartitionSpec())
 
         def blocks(x: np.ndarray) -> jax.Array:
@@ -221,6 +223,12 @@ class Predictor:
             )
         )
 
+    def _readings(self, windows: WindowSet) -> np.ndarray:
+        """Of the sensors that are predicted, ``(W, T, N)``; planned motion has none."""
+        if windows.sensed.shape[-1]:
+            return windows.sensed[..., self._sensed]
+        return np.zeros((*windows.sensed.shape[:2], len(self.sensors)))
+
     def _unwrapped(self, read: np.ndarray) -> np.ndarray:
         """``WindowSet.read`` with the turns of hinges without limits counted."""
         return np.where(self.wrapped, np.unwrap(read, axis=1), read)
@@ -241,23 +249,17 @@ class Predictor:
         return self._room * BLOCK
 
     def on(self, windows: WindowSet) -> "Predictor":
-        """The same predictions of other windows, by the program that is compiled.
-
-        Args:
-            windows: at most `capacity`, of the same length and with as much before
-                and after their starts.
-
-        Raises:
-            ValueError: windows of another shape, or too many.
-        """
+        """The same predictions of other windows: by the programs that are compiled
+        where those are as long, with as much before and after their starts, and no
+        more than `capacity`."""
         parts = ("ctrl", "past", "speed")
         mine = [getattr(self.windows, f).shape[1:] for f in parts]
         theirs = [getattr(windows, f).shape[1:] for f in parts]
+        other = copy.copy(self)
         if mine != theirs or len(windows) > self.capacity:
-            raise ValueError("windows of another shape, or more than there is room for")
-        other = copy.copy(self)  # the compiled programs are of both
-        other.windows = windows
-        other._data = other._placed(windows)
+            other._take(windows)
+        else:
+            other.windows, other._data = windows, other._placed(windows)
         return other
 
     def model(self, x: jax.Array, left_out: tuple[str, ...] = ()) -> Model:

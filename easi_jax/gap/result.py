@@ -41,6 +41,8 @@ class Found:
         fitted: value of each of the place's columns, by its number among them.
         deviations: standard deviations of those that the fit moved.
         parts: of a shared effect (`Place.shared`), the actuators that it is seen at.
+        cost: of taking it out, in cross-validated log density: nats for each
+            independent number that was read.
     """
 
     place: Place
@@ -51,6 +53,7 @@ class Found:
     fitted: dict[int, float] = field(default_factory=dict)
     deviations: dict[int, float] = field(default_factory=dict)
     parts: tuple[Part, ...] = ()
+    cost: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,11 @@ class Outcome:
     seconds: float = 0.0
     horizon: float = 0.0
     start: float = 0.0
+
+
+def last_figures(o: Outcome) -> Figures:
+    """Held-out figures of the model at the end."""
+    return o.after if o.found else o.refit
 
 
 class Numbers:

@@ -7,7 +7,7 @@ import numpy as np
 
 from easi_jax.data.recording import Run
 from easi_jax.gap.error_localization import condition_errors, where
-from easi_jax.gap.result import Figures, Found, Outcome
+from easi_jax.gap.result import Figures, Found, Outcome, last_figures
 from easi_jax.gap.sensor_faults import ReadingFault
 from easi_jax.gap.verdict import Openness
 from easi_jax.model.joint_space import scalar_dofs
@@ -74,11 +74,6 @@ def gap_result(
     )
 
 
-def last_figures(o: Outcome) -> Figures:
-    """Held-out figures of the model at the end."""
-    return o.after if o.found else o.refit
-
-
 def _not_finite(lost: int, of: int) -> list[str]:
     if not lost:
         return []
@@ -133,6 +128,7 @@ def _effect(f: Found, gap: float) -> NamedEffect:
         columns={columns[k].name: x for k, x in f.fitted.items()},
         std={columns[k].name: s for k, s in f.deviations.items()},
         shared=bool(f.parts),
+        cost=f.cost,
     )
 
 

@@ -60,6 +60,7 @@ class Place:
         columns: its numbers.
         starts: values of the columns that a fit starts from, in turn.
         fitted: which columns a fit moves.
+        rests: within what the second number over the first has to be.
     """
 
     effect: str
@@ -68,6 +69,7 @@ class Place:
     columns: tuple[Column, ...]
     starts: tuple[tuple[float, ...], ...]
     fitted: tuple[bool, ...] = field(default=())
+    rests: tuple[float, float] = (-np.inf, np.inf)
 
     def __post_init__(self) -> None:
         if not self.fitted:
@@ -87,6 +89,13 @@ class Place:
     def shared(self) -> bool:
         """Whether it is one of single actuators that all have alike."""
         return not self.at and self.row.is_shared
+
+    def possible(self, values: np.ndarray) -> bool:
+        """Whether a machine can have it with these values of its columns."""
+        low, high = self.rests
+        if not self.row.rests or not values[0] > 0:
+            return True
+        return bool(low <= values[1] / values[0] <= high)
 
     def unlikely(self, values: np.ndarray) -> int:
         """For how many reasons few machines have it with these values of its columns:

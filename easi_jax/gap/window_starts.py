@@ -22,6 +22,7 @@ def window_starts(
     noise: np.ndarray,
     blocks: np.ndarray | None = None,
     count: int | None = None,
+    rows: int | None = None,
 ) -> Starts:
     """Starts of the windows in some blocks.
 
@@ -33,6 +34,7 @@ def window_starts(
             for those that nobody measured.
         blocks: of the predictor's windows; all where None.
         count: of them that are no fillers; all where None.
+        rows: of a window that are compared; all where None.
     """
     act = np.zeros(m.na)
     if m.na:
@@ -40,7 +42,7 @@ def window_starts(
     own = len(predictor.neutral)
 
     def simulate(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
-        return predictor.errors(x[..., :own], blocks, moved)[:, :count]
+        return predictor.errors(x[..., :own], blocks, moved)[:, :count, :rows]
 
     return starts_about(
         simulate,

@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.model import effect_mjcf
+from easi_jax.model.body_extent import room_for_mass
 from easi_jax.model.contact_pairs import ContactPair
 from easi_jax.model.effect_numbers import NO_FORCE_LIMIT, NUMBERS, EffectNumber
 
@@ -27,12 +28,14 @@ class Scales:
 
     Attributes:
         position, speed, acceleration: RMS per degree of freedom, ``(nv,)``.
-        torque: RMS of what moves it, ``(nv,)``.
+        torque: median of what moves it, ``(nv,)``.
+        most: the most of that, ``(nv,)``.
         inertia: about each degree of freedom, ``(nv,)``.
         command: RMS, ``(nu,)``.
         force: RMS of an actuator's force, ``(nu,)``.
         peak: its largest, but for two rows in 1,000, ``(nu,)``.
         span: range of positions, ``(nv,)``.
+        middle: of that range, ``(nv,)``.
         touching: share of rows in which pairs of geoms touch, ``(P,)``
             (`easi_jax.model.contact_pairs`).
         dt: control step [s].
@@ -45,11 +48,13 @@ class Scales:
     speed: np.ndarray
     acceleration: np.ndarray
     torque: np.ndarray
+    most: np.ndarray
     inertia: np.ndarray
     command: np.ndarray
     force: np.ndarray
     peak: np.ndarray
     span: np.ndarray
+    middle: np.ndarray
     touching: np.ndarray
     dt: float
     longest: float
@@ -82,10 +87,27 @@ class Spot:
         return {"1": 1.0, "dt": self.s.dt, "longest": self.s.longest, **found}
 
     @property
+    def range(self) -> tuple[float, float]:
+        """Where a joint may be: its limits; or half a turn about the middle of where it
+        was in the data, or as far again as that."""
+        m, d = self.m, int(self.m.jnt_dofadr[self.i])
+        if m.jnt_limited[self.i]:
+            low, high = m.jnt_range[self.i].tolist()
+            return low, high
+        is_hinge = m.jnt_type[self.i] == mujoco.mjtJoint.mjJNT_HINGE
+        middle, span = float(self.s.middle[d]), float(self.s.span[d])
+        far = max(0.5 * span, math.pi) if is_hinge else 1.5 * span
+        return middle - far, middle + far
+
+    @property
     def is_read(self) -> bool:
         """Whether the joint's position is measured."""
         hidden = self.s.hidden
         return not (hidden and hidden[int(self.m.jnt_dofadr[self.i])])
+
+
+# What the model says of the forces in a log may be as far off.
+_OFF = 2.0
 
 
 def _of_joint(o: Spot) -> dict[str, float]:
@@ -99,6 +121,8 @@ def _of_joint(o: Spot) -> dict[str, float]:
         "speed": speed,
         "position": position,
         "inertia": inertia,
+        # Dry friction that the motion was not stopped by.
+        "holding": _OFF * max(float(s.most[d]), torque),
         "torque per speed": torque / speed,
         "torque per squared speed": torque / speed**2,
         "torque per position": torque / position,
@@ -125,7 +149,12 @@ def _of_body(o: Spot) -> dict[str, float]:
     mass = float(o.m.body_mass[o.i])
     radius = float(np.sqrt(o.m.body_inertia[o.i].max() / mass))
     reach = float(np.linalg.norm(o.m.body_ipos[o.i]))
-    return {"mass": mass, "size": max(radius + reach, 1e-3)}
+    size = max(radius + reach, 1e-3)
+    room = zip("xyz", *room_for_mass(o.m, o.i), strict=True)
+    inside = {
+        f"{k}{way}": x for k, *ends in room for way, x in zip("-+", ends, strict=True)
+    }
+    return {"mass": mass, "size": size, **inside}
 
 
 def _of_contacts(o: Spot) -> dict[str, float]:
@@ -243,6 +272,8 @@ class Effect:
             the same, and that a refit may move.
         is_shared: all actuators may have it alike, as one bus or one controller makes
             it.
+        rests: its second number over its first is where it rests, and lies within the
+            range of its joint.
         is_sine: its numbers are amplitude, cycles and phase of a sine; the cycles that
             a fit starts from come from a grid.
         told: parameters as people know them, from the numbers.
@@ -257,6 +288,7 @@ class Effect:
     contains: str = ""
     refits: tuple[str, str] = ("", "")
     is_shared: bool = False
+    rests: bool = False
     is_sine: bool = False
     told: Callable[[Told], Told] = lambda got: got
     mjcf: effect_mjcf.InMjcf | None = None
@@ -294,6 +326,10 @@ def _has(what: str) -> Callable[[Mapping[str, float]], float]:
     return lambda sizes: -sizes[what]
 
 
+def _holding(sizes: Mapping[str, float]) -> float:
+    return sizes["holding"]
+
+
 def _longest(sizes: Mapping[str, float]) -> float:
     return sizes["longest"]
 
@@ -312,6 +348,14 @@ def _alone(
     column: str, name: str, scale: str, low: Limit, high: Limit, size: float
 ) -> Site:
     return Site((Part(column, name, scale, low, high, size),))
+
+
+def _inside(sizes_of: str) -> tuple[Limit, Limit]:
+    """Lowest and highest shift of a center of mass along an axis."""
+    return (
+        lambda sizes: sizes[f"{sizes_of}-"],
+        lambda sizes: sizes[f"{sizes_of}+"],
+    )
 
 
 def _vector(
@@ -374,7 +418,15 @@ _ROWS = (
     Effect(
         "com_offset",
         'the mass of body "{at}" sits elsewhere',
-        {"body": _vector("com", "xyz", "size", 2, 0.02)},
+        {
+            "body": Site(
+                tuple(
+                    Part(f"com.{i}", axis, "size", *_inside(axis), 0.02)
+                    for i, axis in enumerate("xyz")
+                ),
+                ((0.0, 0.0, 0.0),),
+            )
+        },
         is_rare=True,
         mjcf=effect_mjcf.BODY,
     ),
@@ -383,7 +435,12 @@ _ROWS = (
         'joint "{at}" has about {torque} of dry friction',
         {
             "joint": Site(
-                (Part("coulomb", "torque", "torque", _has("frictionloss"), 20, 0.03),),
+                (
+                    Part(
+                        *("coulomb", "torque", "torque"),
+                        *(_has("frictionloss"), _holding, 0.03),
+                    ),
+                ),
                 ((0.0,), (0.1,)),
             )
         },
@@ -441,6 +498,7 @@ _ROWS = (
         },
         is_rare=True,
         contains="constant_force",
+        rests=True,
         refits=("joint", "stiffness"),
         told=_told_spring,
         mjcf=effect_mjcf.SPRING,
@@ -452,8 +510,8 @@ _ROWS = (
         {
             "joint": Site(
                 (
-                    Part("coulomb", "kinetic", "torque", 0.0, 20, 0.03),
-                    Part("static", "static", "torque", 0.0, 20, 0.03),
+                    Part("coulomb", "kinetic", "torque", 0.0, _holding, 0.03),
+                    Part("static", "static", "torque", 0.0, _holding, 0.03),
                     Part("stribeck", "velocity", "speed", 0.005, 3, 0.05),
                 ),
                 ((0.05, 0.05, 0.1), (0.05, 0.05, 0.4)),

@@ -37,6 +37,8 @@ class NamedEffect:
         columns: values of fields of `easi_jax.model.effects.Effects`, by name.
         std: their standard deviations, where known.
         shared: whether it was found as one of all actuators.
+        cost: of taking it out, in cross-validated log density: nats for each
+            independent number that was read; None where no prediction uses it.
     """
 
     effect: str
@@ -50,6 +52,7 @@ class NamedEffect:
     columns: Mapping[str, float]
     std: Mapping[str, float]
     shared: bool = False
+    cost: float | None = None
 
     @property
     def label(self) -> str:

@@ -67,11 +67,12 @@ def make_case(
     wrong_own: bool = False,
     kind: str = "",
     coarse: bool = False,
+    most: float = MOST,
 ) -> Case:
     """Write a case into `out_dir`.
 
     Effects that come with their main parameter keep it; the others are sized until the
-    gap is between `LEAST` and `MOST` times the floor. With `wrong_own` the model's own
+    gap is between `LEAST` and `most` times the floor. With `wrong_own` the model's own
     numbers are wrong instead. A `coarse` case is one whose model is off by its own
     timestep and velocity fits. Raises CaseError where this cannot be had.
     """
@@ -84,8 +85,8 @@ def make_case(
     trial = Trial(setting, seed)
     context = setting.context
     perfect = trial.gap(trial.logs(setting.plans, [], {}), quick=True).ratio
-    least, most = COARSE if coarse else (0.0, PERFECT)
-    if not least <= perfect <= most:
+    low, high = COARSE if coarse else (0.0, PERFECT)
+    if not low <= perfect <= high:
         raise CaseError(f"a perfect model is at {perfect:.2f} floors")
     chosen = [strengths.filled(effect, rngs[2], context) for effect in effects]
     own: dict[str, float] = {}
@@ -102,9 +103,9 @@ def make_case(
         own = alternative(trial.search(alternative, float(np.exp(target))))[1]
     logs = trial.logs(setting.plans, chosen, own)
     gap = trial.gap(logs, chosen, own)
-    if not chosen and not wrong_own and gap.ratio > most:
+    if not chosen and not wrong_own and gap.ratio > high:
         raise CaseError(f"a perfect model is at {gap.ratio:.2f} floors")
-    if (sizing or wrong_own) and not LEAST <= gap.ratio <= MOST:
+    if (sizing or wrong_own) and not LEAST <= gap.ratio <= most:
         raise CaseError(f"over all runs the gap is {gap.ratio:.2f} floors")
     velocities = bool(rngs[3].random() < 1 / 3)
     runs = _write(out_dir, setting, logs, velocities)

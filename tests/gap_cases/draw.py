@@ -1,5 +1,6 @@
 """Draws a case of a kind: mechanism, effects and places, visible ones only."""
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,8 +11,13 @@ from tests.gap_cases.effects import KINDS, ON_REQUEST, OUTSIDE, CaseError, Effec
 from tests.gap_cases.mechanisms import ON_GROUND, Mechanism, Stated
 from tests.gap_cases.places import places, twins
 from tests.gap_cases.robots import MECHANISMS
+from tests.gap_cases.search import MOST
 
-CASE_KINDS = ("single", "pair", "none", "wrong_own", "outside")
+CASE_KINDS = ("single", "pair", "none", "wrong_own", "outside", "mixed", "several")
+"""One effect of the table, two, none, none but the model's own numbers, one that no
+table has, one of each, three to five of the table."""
+LOUDEST = 100.0
+"""Gap in floors that several effects may have together."""
 CHEAP = ("slide", "pendulum", "cartpole", "arm2")
 FRICTIONS = {"coulomb_friction", "stribeck_friction"}
 TRIES = 25
@@ -36,8 +42,7 @@ def _effects(
         if not where:
             raise CaseError(f"{name} cannot be seen on {machine.name}")
         drawn.append(Effect(name, str(rng.choice(where))))
-    if len(drawn) == 2:
-        first, second = drawn
+    for first, second in itertools.combinations(drawn, 2):
         alike = f"{second.name}@{second.at}" in twins(machine, first)
         frictions = {first.name, second.name} <= FRICTIONS and first.at == second.at
         if alike or frictions or is_one_spring(machine, first, second):
@@ -60,12 +65,16 @@ def _recipe(
     """Mechanism and names of effects; `effect` fixes the first."""
     names: list[str] = []
     known = [name for name in KINDS if name not in ON_REQUEST]
-    if kind in ("single", "pair"):
+    if kind in ("single", "pair", "mixed"):
         names.append(effect or str(rng.choice(known)))
     if kind == "pair":
         names.append(str(rng.choice([name for name in known if name != names[0]])))
     if kind == "outside":
         names.append(effect or str(rng.choice(OUTSIDE)))
+    if kind == "mixed":
+        names.append(str(rng.choice(OUTSIDE)))
+    if kind == "several":
+        names += rng.choice(known, int(rng.integers(3, 6)), replace=False).tolist()
     return str(rng.choice(list(mechanisms))), names
 
 
@@ -107,6 +116,7 @@ def draw_case(
                 wrong_own=kind == "wrong_own",
                 kind=kind,
                 coarse=coarse,
+                most=LOUDEST if kind in ("mixed", "several") else MOST,
             )
         except CaseError as error:
             reason = f"{name} with {names}: {error}"

@@ -492,7 +492,15 @@ def test_names_are_checked(tmp_path: Path) -> None:
         draw_case(0, "triple", tmp_path)
     with pytest.raises(CaseError, match="cannot be seen"):
         draw_case(0, "single", tmp_path, effect="contact_softness", mechanism="slide")
-    assert len(CASE_KINDS) == 5
+    assert len(CASE_KINDS) == 7
+
+
+def test_a_mixed_case_has_one_effect_that_no_table_has(tmp_path: Path) -> None:
+    draw_case(1, "mixed", tmp_path, cheap=True)
+    answer = read_case(tmp_path)[2]
+    known, unknown = answer["effects"]
+    assert known["kind"] != "outside" == unknown["kind"]
+    assert answer["verdicts"][0] == "unexplained"
 
 
 def test_every_effect_has_a_place_and_a_strength() -> None:

@@ -9,7 +9,8 @@ import pytest
 
 from easi_jax.data.recording import Configuration, Run
 from easi_jax.data.windows import fitted_velocity
-from easi_jax.gap import analysis
+from easi_jax.gap import effect_search
+from easi_jax.gap.analysis import Analysis
 from easi_jax.gap.candidates import places
 from easi_jax.gap.result import Numbers
 from easi_jax.model.parameters import ParameterSpace
@@ -56,20 +57,22 @@ def test_a_fit_of_each_candidate_tells_them_apart(
 ) -> None:
     few = {*TRUTHS, "actuator_gain", "armature", "viscous_damping", "payload_mass"}
     monkeypatch.setattr(
-        *(analysis, "places"), lambda *a: [p for p in places(*a) if p.effect in few]
+        *(effect_search, "places"),
+        lambda *a: [p for p in places(*a) if p.effect in few],
     )
-    monkeypatch.setattr(analysis, "ripples", lambda *a: [])
+    monkeypatch.setattr(effect_search, "ripples", lambda *a: [])
     m = mujoco.MjModel.from_xml_string(MODEL.format(kp=KP, kv=KV))
     truth = TRUTHS["drive_stiffness"]
     fit, held = (run(str(k), m, recorded(*truth, k, 400)) for k in (0, 1))
     noise = np.array([NOISE])
     with engine.using("mujoco"):
-        a = analysis.Analysis(m, ParameterSpace(()), [fit], [held], noise, 0.2)
-        a.whiten(a.predictor.neutral)
-        found, _ = a.selector.expanded(a.refit([]), a.candidates([]))
+        a = Analysis(m, ParameterSpace(()), [fit], [held], noise, 0.2)
+        at = a.search.at
+        at.whiten(at.neutral)
+        found, _ = at.selector.expanded(at.refit([]), a.places.candidates([]))
     (place,) = found[0].places
     assert place.key == "drive_stiffness@servo"
-    value, _, unit = Numbers(a.selector, found[0]).values(place)["factor"]
+    value, _, unit = Numbers(at.selector, found[0]).values(place)["factor"]
     # Starts are still those of the model without it.
     assert value == pytest.approx(FACTOR, rel=0.05) and unit == "1"
     assert found[1].loss.mean() > 10 * found[0].loss.mean()

@@ -44,6 +44,7 @@ def gap_json(result: GapResult) -> dict[str, Any]:
                 },
                 "confidence": e.confidence,
                 "explains": r.share(before, gap),
+                "removal_cost": e.cost,
                 "indistinguishable": e.indistinguishable,
                 "gap_after": gap,
             }

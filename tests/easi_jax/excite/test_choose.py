@@ -16,7 +16,7 @@ def test_a_named_effect_is_no_parameter_of_the_model() -> None:
     assert "joint.cart.frictionloss" in own.names
     joint, drive, pairs = np.ones(m.nv), np.ones(m.nu), np.zeros(0)
     scales = Scales(
-        *(joint, joint, joint, joint, joint, drive, drive, drive, joint, pairs),
+        *([joint] * 6 + [drive] * 3 + [joint] * 2 + [pairs]),
         dt=0.02,
         longest=0.1,
     )

@@ -13,7 +13,7 @@ from easi_jax.estimation.prediction_error import rms_of_steps
 from easi_jax.estimation.starts import Starts
 from easi_jax.excite.propose import Proposal, quick_tests
 from easi_jax.gap import gap_metric as measure
-from easi_jax.gap.analysis import Analysis
+from easi_jax.gap.fitting import Fitting
 from easi_jax.gap.forward_selection import Selector
 from easi_jax.gap.gap_metric import Channels
 from easi_jax.gap.held_out import HeldOut
@@ -94,6 +94,7 @@ def test_the_floor_is_of_what_is_known(
 def test_fits_go_on_with_the_windows_that_are_left() -> None:
     chosen = object.__new__(Selector)
     chosen.blocks, chosen.count, chosen.steps = np.arange(1), W, None
+    chosen.rows = None
     chosen.moved = np.zeros((W, 2 * NV))
     chosen.predictor = predictor(lambda *_: blown(3))
     assert np.isfinite(chosen.errors(np.zeros((1, 1)))).all()
@@ -102,9 +103,10 @@ def test_fits_go_on_with_the_windows_that_are_left() -> None:
 
 
 def test_a_model_that_blows_up_is_told_in_one_line() -> None:
-    made = object.__new__(Analysis)
+    made = object.__new__(Fitting)
     lost = repeated(*range(8))
-    made.fit_starts, made.sticks = held_out(lost).starts, False
+    made.starts, made.sticks = held_out(lost).starts, False
+    made.data = None  # type: ignore[assignment]
     made.selector = SimpleNamespace(  # type: ignore[assignment]
         moved=np.zeros((W, 2 * NV)), errors=lost
     )

@@ -187,8 +187,8 @@ def noisy(run: Run, seed: int, gain: float = 1.0) -> Run:
 
 def ended(arm: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch, gain: float) -> Outcome:
     """The analysis without any effect to try; torques are read ``gain`` times."""
-    monkeypatch.setattr("easi_jax.gap.analysis.places", lambda *_: [])
-    monkeypatch.setattr("easi_jax.gap.analysis.ripples", lambda *_: [])
+    monkeypatch.setattr("easi_jax.gap.effect_search.places", lambda *_: [])
+    monkeypatch.setattr("easi_jax.gap.effect_search.ripples", lambda *_: [])
     runs = [noisy(recorded(arm, seed=k), k, gain) for k in range(3)]
     noise = np.array([3e-4, 1.0])
     with engine.using("mujoco"):

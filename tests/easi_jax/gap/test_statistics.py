@@ -28,7 +28,8 @@ from easi_jax.gap.forward_selection import Selector, as_sine, shortlist
 from easi_jax.gap.model_comparison import (
     advantage,
     better,
-    explained,
+    confidence,
+    cost,
     probability,
     rank,
     simplest,
@@ -505,13 +506,24 @@ def test_a_bias_may_be_as_large_as_the_motion(
             assert column.high == -column.low >= s.position[column.index[0]]
 
 
-def test_confidence_falls_with_what_is_left() -> None:
-    assert explained(1.0, 0.12, 0.1) == 1.0
-    assert explained(1.0, 0.5, 0.1) == pytest.approx((1 - 0.4 / 0.9) ** 2)
-    assert explained(0.1, 0.5, 0.1) == 0.0
-    # What little more than noise asked for may stand for anything.
-    assert explained(0.15, 0.1, 0.1) == pytest.approx(1.0)
-    assert explained(0.11, 0.1, 0.1) == pytest.approx(0.2)
+def of_loss(loss: np.ndarray) -> Model:
+    fit = Fitted(np.zeros(0), np.arange(0), np.zeros(1), np.zeros(1), 0.0)
+    return Model([], fit, loss, loss)
+
+
+def test_what_costs_much_to_take_out_is_sure() -> None:
+    sure = [confidence(cost, 0.0) for cost in (0.0, 0.05, 0.5, 3.0)]
+    assert sure == sorted(sure) and sure[0] < 0.3 and 0.9 < sure[-1] < 1.0
+    assert confidence(3.0, 1.0) == pytest.approx(0.5 * sure[-1])
+
+
+def test_the_cost_is_a_difference_of_log_densities() -> None:
+    """Of Gaussian numbers whose spread is twice as wide: log 2 each."""
+    loss = np.random.default_rng(0).uniform(1.0, 2.0, 10)
+    assert cost(of_loss(loss), of_loss(4 * loss)) == pytest.approx(np.log(2))
+    # A force limit that one block of ten meets costs as much as that one says.
+    met = np.where(np.arange(10) == 3, 1e4, loss)
+    assert cost(of_loss(loss), of_loss(met)) > 2.0
 
 
 def test_of_twins_the_one_of_a_usual_size_comes_first(

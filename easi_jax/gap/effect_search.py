@@ -1,0 +1,340 @@
+"""Which effects a model lacks: found in windows of several lengths, one after another.
+
+Short windows show large effects while errors are still nearly linear in them; long ones
+show small friction, light damping and drift. Effects are added at each length in turn,
+and none is given up because windows of another length say nothing of it. What one
+length says is never added to what another does: they share rows.
+"""
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+
+import mujoco
+import numpy as np
+
+from easi_jax.gap.candidates import places, ripples
+from easi_jax.gap.discretization_error import within_a_step
+from easi_jax.gap.effect_set import Candidate, Model, keys, last
+from easi_jax.gap.fitting import Fitting
+from easi_jax.gap.forward_selection import shortlist
+from easi_jax.gap.model_comparison import HELPS, better, probability, rank, simplest
+from easi_jax.gap.table import Place, covered, does
+from easi_jax.model.effect_catalog import Scales
+from easi_jax.model.joint_space import is_hinge, scalar_dofs
+from easi_jax.model.parameters import ParameterSpace
+
+MOST = 5  # effects
+RIVALS = 8  # names in the place of another that are followed up
+_STAGES = 8  # of adding one and taking out what has become needless
+_RIPPLES = [0.75 * k for k in range(3, 27)]  # cycles over the range of a joint
+_UNLIKELY = 0.3  # probability of an effect beside which a rival replaces it
+_BEAM = 3  # sets of effects that are followed
+_LIKELY = 60  # of a larger robot's names, that are tried beside all but the first
+_LOST = 0.25  # of the motion: errors of a model that does not follow it
+_NOTHING = 1e-3  # of the largest error: a change that shows nowhere
+
+Tell = Callable[[str], None]
+
+
+class Places:
+    """Where effects can be in a model.
+
+    Attributes:
+        everywhere: but for ripples.
+        offered: of these, what the refit of the model's own parameters does not do.
+        ripples: at all of their cycles.
+    """
+
+    def __init__(
+        self, m: mujoco.MjModel, space: ParameterSpace, scales: Scales
+    ) -> None:
+        self.m = m
+        self.everywhere = places(m, scales)
+        self.offered = [p for p in self.everywhere if not covered(p, space, m)]
+        self.ripples = [
+            p
+            for j in scalar_dofs(m)
+            for p in ripples(m, j, scales, _cycles(m, j, scales))
+        ]
+        self._dropped: set[str] = set()  # found, and then found to say nothing
+
+    @property
+    def known(self) -> dict[str, Place]:
+        """All that may be named, by key."""
+        return {p.key: p for p in (*self.offered, *self.ripples)}
+
+    def candidates(self, taken: Sequence[Place]) -> list[Candidate]:
+        """Every place that is not in a model yet, with its starts."""
+        no = {p.key for p in taken} | self._dropped
+        return [
+            Candidate(p, s)
+            for p in (*self.offered, *self.ripples)
+            if p.key not in no
+            for s in p.starts[: 1 if p.row.is_sine else None]
+        ]
+
+    def offer(self, addresses: Sequence[str]) -> None:
+        """Offers as effects what some of the model's own parameters would do."""
+        for address in addresses:
+            self.offered += [p for p in self.everywhere if does(p, address, self.m)]
+
+    def drop(self, gone: Sequence[Place]) -> None:
+        """No longer offers these."""
+        self._dropped |= {p.key for p in gone}
+
+    def singles(self, place: Place) -> list[Place]:
+        """Of each actuator what a shared effect is of all."""
+        return [
+            p
+            for p in self.everywhere
+            if (p.effect, p.kind) == (place.effect, "actuator")
+        ]
+
+
+def _cycles(m: mujoco.MjModel, j: int, scales: Scales) -> list[float]:
+    """Cycles per revolution that a ripple is looked for at."""
+    span = float(scales.span[int(m.jnt_dofadr[j])])
+    slow = 1 if is_hinge(m, j) else 2
+    return [slow * k * 2 * math.pi / span for k in _RIPPLES]
+
+
+class EffectSearch:
+    """Adds effects to a model while they help.
+
+    Args:
+        lengths: windows of several lengths, the shortest first.
+        settles: which of them decides on names where none found more than it.
+        offered: what may be added.
+        tell: takes a line on how far it is.
+
+    Attributes:
+        at: the windows that what was found is fitted to at the end.
+    """
+
+    def __init__(
+        self, lengths: Sequence[Fitting], settles: int, offered: Places, tell: Tell
+    ) -> None:
+        self.lengths, self.settles, self.offered = lengths, settles, offered
+        self.tell = tell
+        self.at = lengths[settles]
+
+    def select(self, start: Model) -> Model:
+        """A model of `at`'s windows with the effects that windows of any length show;
+        ``start`` is one of the windows that decide.
+
+        Shorter windows come first where the model does not follow longer ones at all:
+        what it does there is not linear in what it lacks. Longer ones are asked for
+        what shorter ones cannot show, once nothing is left open in those.
+        """
+        self.at, found = self.lengths[self.settles], start
+        fitted_to = self.at
+        homes: dict[str, Fitting] = {}
+        for k, length in enumerate(self.lengths):
+            if k < self.settles and self.at.gap < _LOST:
+                continue
+            if k > self.settles and not self.lengths[k - 1].closed_by(found):
+                break
+            known = {p.key for p in found.places}
+            seconds = (length.steps - length.data.lead) * length.data.dt
+            self.tell(f"windows of {seconds:.3g} s:")
+            found = found if length is fitted_to else length.again(found)
+            found, fitted_to = self._added(length, found, known), length
+            new = {p.key for p in found.places} - known
+            homes |= dict.fromkeys(new, length)
+            if new and k > self.settles:
+                self.at = length
+        if fitted_to is not self.at:
+            found = self.at.again(found)
+        return self._needed_anywhere(found, homes)
+
+    def _needed_anywhere(self, found: Model, homes: Mapping[str, Fitting]) -> Model:
+        """The model less what neither its windows nor those that found it need."""
+        for place in list(found.places):
+            home = homes.get(place.key, self.at)
+            if home is self.at or len(found.places) == 1:
+                continue
+            for length in (self.at, home):
+                whole = found if length is self.at else length.again(found)
+                if better(whole, length.without(whole, [place]), length.floor):
+                    break
+            else:
+                self.tell(f"- {place.key}: windows of no length need it")
+                found = self.at.without(found, [place])
+        return found
+
+    def _added(self, at: Fitting, start: Model, spared: Collection[str]) -> Model:
+        """A model with the effects that some windows show, none of the ``spared`` taken
+        out.
+
+        The few best sets of effects go on side by side: two effects together may be
+        what one alone, and wrong, does nearly as well.
+        """
+        chosen, model, beam = at.selector, start, [start]
+        for _ in range(_STAGES):
+            if len(model.places) >= MOST:
+                break
+            model = at.weighed(model)
+            if at.closed(model.fit.x):
+                break
+            found: dict[frozenset[str], Model] = {}
+            # What was taken out of the best may still be in the others.
+            beam = [b for b in beam if len(b.places) <= len(model.places)]
+            most = _LIKELY if at.predictor.simulator.wide else None
+            likely: set[str] = set()  # to be tried beside all sets but the first
+            for parent in beam:
+                if parent is not beam[0]:
+                    parent = chosen.fit(parent.places, parent.fit.x)
+                more = [
+                    c
+                    for c in self.offered.candidates(parent.places)
+                    if not likely or c.place.key in likely
+                ]
+                models, names = chosen.expanded(parent, more)
+                likely = likely or {*names[:most], *(p.key for p in model.places)}
+                for m in models:
+                    key = keys(m)
+                    if key not in found or m.loss.mean() < found[key].loss.mean():
+                        found[key] = m
+            tried = sorted(found.values(), key=rank)
+            for m in tried[:4]:
+                self.tell(f"  {_named(m)} (without {_figures(model)})")
+            good = [m for m in tried if better(m, model, at.floor)]
+            if not good:
+                break
+            best = simplest(good, model)
+            self.tell(f"+ {' + '.join(p.key for p in best.places)}")
+            beam = [best, *[m for m in good if m is not best][: _BEAM - 1]]
+            model = best
+            if len(model.places) > 1:
+                at.whiten(model.fit.x)
+                model = chosen.fit(model.places, model.fit.x)
+                model = chosen.needed(model, spared)
+                beam[0] = model
+        if model.places:
+            at.whiten(model.fit.x)
+            model = chosen.fit(model.places, model.fit.x)
+            model = chosen.richer(model, self.offered.candidates(model.places))
+        return model
+
+    def rivals(self, model: Model, place: Place) -> list[Model]:
+        """Other names refitted in the place of one effect, best first."""
+        chosen = self.at.selector
+        without = self.at.without(model, [place])
+        others = self.offered.candidates(model.places)
+        others = [c for c in others if c.place.key != place.key]
+        short = shortlist(chosen.screened(without, others))
+        out = chosen.fitted(without.places, without.fit.x, short)
+        return sorted(out, key=lambda m: m.loss.mean())
+
+    def exchanged(self, model: Model) -> tuple[Model, dict[str, list[Model]]]:
+        """The model with effects replaced by what does better in their place, and the
+        rivals of each effect, best first.
+
+        What was the best alone may not be the best beside what came later.
+        """
+        seen = {keys(model)}
+        while True:
+            rivals = {p.key: self.rivals(model, p) for p in model.places}
+            swaps = []
+            for place in model.places:
+                mine = last(model, place)
+                for rival in rivals[place.key][:RIVALS]:
+                    p = probability(mine, rival)
+                    most = 1 + HELPS
+                    if _body_for_joint(place, rival.places[-1]):
+                        # Its three numbers do what one does, where there is one joint.
+                        most = 1 / most
+                    close = rank(rival) <= most * rank(mine)
+                    if p < _UNLIKELY and close and keys(rival) not in seen:
+                        swaps.append((p, place, rival))
+            if not swaps:
+                return model, rivals
+            _, place, rival = min(swaps, key=lambda swap: swap[0])
+            new = rival.places[-1]
+            order = [new if p is place else p for p in model.places]
+            self.tell(f"{place.key} -> {new.key}: {_figures(rival)}")
+            self.at.whiten(rival.fit.x)
+            model = self.at.selector.fit(order, rival.fit.x)
+            seen.add(keys(model))
+
+    def needful(
+        self, model: Model, step: float
+    ) -> tuple[Model, dict[str, list[Model]], list[str]]:
+        """The model less what says nothing of the machine, with the rivals of what is
+        left, and notes; ``step`` is that of the physics [s]."""
+        model, rivals = self.exchanged(model)
+        notes: list[str] = []
+        for _ in range(MOST):
+            brief = [p for p in model.places if self._brief(model, p, step)]
+            idle = [p for p in model.places if p not in brief and self._idle(model, p)]
+            if not (brief or idle):
+                break
+            for place in (*brief, *idle):
+                why = "less than a physics step" if place in brief else "does nothing"
+                self.tell(f"- {place.key}: {why}")
+            notes += [_of_a_step(p, step) for p in brief]
+            self.offered.drop(brief)
+            less = self.at.without(model, [*brief, *idle])
+            self.at.whiten(less.fit.x)
+            less = self.at.selector.fit(less.places, less.fit.x)
+            model, rivals = self.exchanged(less)
+        return *self._apart(model, rivals), notes
+
+    def _brief(self, model: Model, place: Place, step: float) -> bool:
+        first = self.at.selector.columns(place, fitted=False)[0]
+        return within_a_step(place, float(model.fit.x[first]), step)
+
+    def _idle(self, model: Model, place: Place) -> bool:
+        """Whether an effect was fitted to nothing: predictions are as without it."""
+        chosen, kept = self.at.selector, [p for p in model.places if p is not place]
+        x = chosen.without(model.fit.x, place, kept)
+        mine, other = chosen.errors(np.stack([model.fit.x, x])).astype(float)
+        return float(np.abs(mine - other).max()) < _NOTHING * np.abs(mine).max()
+
+    def _apart(
+        self, model: Model, rivals: dict[str, list[Model]]
+    ) -> tuple[Model, dict[str, list[Model]]]:
+        """The model with what each actuator has in place of what all have, where one of
+        them differs."""
+        named = {p.key for p in model.places}
+        for place in [p for p in model.places if p.shared]:
+            singles = self.offered.singles(place)
+            new = [p for p in singles if p.key not in named]
+            if len(new) == len(singles):
+                continue
+            x = self.each(model.fit.x, place, singles)
+            order = [q for p in model.places for q in (new if p is place else [p])]
+            model = self.at.selector.fit(order, x)
+            rivals = rivals | {p.key: rivals[place.key] for p in new}
+        return model, rivals
+
+    def each(self, x: np.ndarray, place: Place, singles: Sequence[Place]) -> np.ndarray:
+        """A vector in which these actuators have by themselves what all had."""
+        out, columns = x.copy(), self.at.selector.columns
+        shared = columns(place)
+        out[shared] = self.at.neutral[shared]
+        for single in singles:
+            out[columns(single)] += x[shared] - out[shared]
+        return out
+
+
+def _of_a_step(place: Place, step: float) -> str:
+    return (
+        f"{place.key}: what looked like it is shorter than the model's physics "
+        f"step of {1000 * step:.3g} ms, which shifts commands by half of "
+        "itself; not named. With a smaller timestep in the model the data could "
+        "tell."
+    )
+
+
+def _body_for_joint(old: Place, new: Place) -> bool:
+    """Whether one effect would move from a joint to a body."""
+    return old.effect == new.effect and (old.kind, new.kind) == ("joint", "body")
+
+
+def _figures(model: Model) -> str:
+    return f"loss {model.loss.mean():.4g}, gap {model.gap.mean() ** 0.5:.3g}"
+
+
+def _named(model: Model) -> str:
+    return f"{' + '.join(p.key for p in model.places)}: {_figures(model)}"

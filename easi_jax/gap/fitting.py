@@ -1,0 +1,263 @@
+"""Windows of one length, to which sets of effects are fitted."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from easi_jax.errors import UserError
+from easi_jax.estimation.least_squares import AT_BOUND
+from easi_jax.estimation.starts import DRAWS, better_noise, floor, known_noise
+from easi_jax.gap import gap_metric as measure
+from easi_jax.gap.batched_least_squares import Bounds, window_weights
+from easi_jax.gap.discretization_error import error_of_steps
+from easi_jax.gap.effect_set import Model
+from easi_jax.gap.forward_selection import Selector
+from easi_jax.gap.gap_metric import Channels
+from easi_jax.gap.predictor import BLOCK, Predictor
+from easi_jax.gap.recorded import Recorded
+from easi_jax.gap.table import Place
+from easi_jax.gap.verdict import openness
+from easi_jax.gap.whitening import make_residuals
+from easi_jax.gap.window_set import WindowSet
+from easi_jax.gap.window_starts import window_starts
+from easi_jax.progress import Progress, silent
+
+_BLOCKS = 10  # of time, for cross-validation
+_CLOSED = 1.05  # times the floor: nothing left to explain, where not surely more
+_STEPS_SEEN = 0.75  # of the floor: less is lost in noise
+_WHOLE = 1.15  # of the error of steps; a finer simulation leaves some of it
+_BENT = 0.1  # second beside first differences of errors with a start: not linear
+_LET_PASS = 0.05  # of what the model errs by, that no fit hangs on
+
+
+class Fitting:
+    """Windows of one length, to which sets of effects are fitted.
+
+    Args:
+        data: the model and its recordings.
+        predictor: of the windows, in its first blocks.
+        windows: without fillers.
+        steps: control steps of a window that are compared, those before its start
+            counted; the predictor's may be more.
+        ignored: channels that nothing can be compared of, with the reason.
+        own: indices of the model's own parameters that may be refitted.
+        progress: told how far long stages are.
+
+    Attributes:
+        selector: fits sets of effects.
+        starts: of the windows.
+        channels: that are compared.
+        sticks: whether errors bend with starts: see `whiten`.
+        gap, floor: of the windows where they were last whitened.
+        own_steps: error of the model's own steps, in floors; 0 where it does not show.
+
+    Raises:
+        UserError: nothing moves.
+    """
+
+    def __init__(
+        self,
+        data: Recorded,
+        predictor: Predictor,
+        windows: WindowSet,
+        steps: int,
+        ignored: Mapping[str, str],
+        own: Sequence[int],
+        progress: Progress = silent,
+    ) -> None:
+        self.data, self.predictor, self.windows = data, predictor, windows
+        self.steps, count = steps, len(windows)
+        blocks = np.arange(-(-count // BLOCK))
+        group = np.arange(count) * min(_BLOCKS, count) // count
+        self.selector = Selector(
+            predictor, blocks, count, data.bounds, group, own, progress, steps + 1
+        )
+        given = data.m, predictor, data.fit, data.scales, data.noise
+        self.starts = window_starts(*given, blocks, count, steps + 1)
+        self.channels = self._channels(ignored)
+        self.sticks = self._begun = False
+        self.gap = self.floor = self.own_steps = 0.0
+
+    def _channels(self, ignored: Mapping[str, str]) -> Channels:
+        data, after = self.data, self.steps - self.data.lead
+        names = self.predictor.simulator.state_names[: data.m.nv]
+        found = measure.channels(
+            data.m,
+            [n.removeprefix("qpos.") for n in names],
+            data.fit,
+            data.noise,
+            after,
+            data.sensors,
+        )
+        found.ignored.update({**ignored, **self.predictor.unpredicted})
+        if not np.isfinite(found.scale).any():
+            raise UserError(
+                "nothing moves by more than five times its noise within "
+                f"{after * data.dt:g} s: record larger or faster motion, or lengthen "
+                "--horizon"
+            )
+        return found
+
+    @property
+    def neutral(self) -> np.ndarray:
+        """The vector of the model as given."""
+        return self.selector.neutral
+
+    def plain(self, x: np.ndarray) -> np.ndarray:
+        """Vectors without the share of the own steps' error."""
+        return x[..., : len(self.predictor.neutral)]
+
+    def share(self, x: np.ndarray) -> float:
+        """Of the own steps' error, as a fit has it."""
+        return float(sum(x[len(self.predictor.neutral) :]))
+
+    def vector(self, x: np.ndarray) -> np.ndarray:
+        """A vector of windows of another length, as one of these."""
+        out = self.neutral.copy()
+        out[: len(self.predictor.neutral)] = self.plain(x)
+        return out
+
+    def whiten(self, x: np.ndarray) -> None:
+        """Renews the noise model of the fit at a vector.
+
+        Starts are integrated out about those that are fitted at the vector. Where feet
+        stick and slip, errors are not linear in the start over more than its noise, and
+        what is fitted for one model is no start for another: there starts are as rows
+        tell.
+
+        Raises:
+            UserError: most predictions are not finite.
+        """
+        chosen, starts, data = self.selector, self.starts, self.data
+        still = np.zeros_like(chosen.moved)
+        chosen.moved, _ = starts.solve(x, still if self.sticks else chosen.moved)
+        errors = chosen.errors(x[None])[0]
+        if not np.isfinite(errors).all():
+            raise UserError(
+                "most predictions of the fitting data are not finite: the model blows "
+                "up from the measured states; check its timestep, masses and contacts, "
+                "or shorten --horizon"
+            )
+        least = known_noise(data.resolution / math.sqrt(12), data.motion)
+        starts.noise = better_noise(starts, errors, data.noise, least)
+        self.sticks |= starts.bent > _BENT
+        if self.sticks:
+            chosen.moved = still
+            starts.linearize(x, still)
+            starts, errors = starts.as_read, chosen.errors(x[None])[0]
+        rms = np.sqrt(np.mean(errors.astype(float) ** 2, (0, 1)))
+        chosen.residuals = make_residuals(
+            starts, data.lead, _LET_PASS * rms, self.channels.scale
+        )
+        r = chosen.residuals
+        self.gap = r.gap(r.whitened(r.grouped(errors[None]))[0])
+        self.floor = chosen.floor = float(np.sqrt(r.floor.mean()))
+
+    def closed(self, x: np.ndarray) -> bool:
+        """Whether nothing is left to explain, whitened at ``x``."""
+        errors = self.selector.errors(x[None])[0]
+        rng, after, moved = np.random.default_rng(1), self.data.lead + 1, self.moved
+        noise = floor(self.starts, x, moved, DRAWS, self.data.resolution, rng)
+        square, due = measure.squares(errors[:, after:]), noise[:, after:].mean((0, 1))
+        low = openness(square, due, self.channels.scale).low
+        return bool(np.nanmax(low) <= _CLOSED)
+
+    def closed_by(self, model: Model) -> bool:
+        """Whether a model of these windows leaves nothing to explain."""
+        self.whiten(model.fit.x)
+        return self.closed(model.fit.x)
+
+    @property
+    def moved(self) -> np.ndarray:
+        """Offsets of the starts, ``(W, s)``."""
+        return self.selector.moved
+
+    def moves_in_the_model(self) -> bool:
+        """Takes channels in that stand still in the log, but not in the model, and
+        sensors whose noise turns out to be small enough for what they read."""
+        nv = self.data.m.nv
+        noise = self.data.noise.copy()
+        noise[nv:] = self.starts.noise[nv:]
+        errors = self.selector.errors(self.neutral[None])[0].astype(float)
+        moved = errors[:, -1] - errors[:, self.data.lead]
+        changed = measure.with_moving(self.channels, moved, noise)
+        more = changed is not self.channels
+        self.channels = changed
+        return more
+
+    def begin(self) -> None:
+        """Whitens at the model as given, with what is to be compared there."""
+        self._begun = True
+        self.whiten(self.neutral)
+        if self.moves_in_the_model():
+            self.whiten(self.neutral)
+        self._watch_steps()
+
+    def _watch_steps(self) -> None:
+        """Lets fits see what the model's own steps do, where that can be seen.
+
+        Data of a machine have no such error and those of a simulation of the same step
+        have all of it, so its share is fitted like the model's own parameters. Where
+        feet stick and slip, the error is another from each start, and no share helps.
+        """
+        if self.sticks:
+            return
+        error = steps_error(self.predictor, self.data)
+        error = error[: len(self.windows), : self.steps + 1]
+        mine = self.starts.left(error)[:, self.data.lead + 1 :]
+        size = float(measure.gap(measure.squares(mine).mean(0), self.channels.scale))
+        if size < _STEPS_SEEN * self.floor:
+            return
+        self.selector.steps = error
+        b = self.selector.bounds
+        self.selector.bounds = Bounds(
+            np.r_[b.low, 0.0], np.r_[b.high, _WHOLE], np.r_[b.size, 0.1]
+        )
+        self.own_steps = size / self.floor
+
+    def refit(self, own: Sequence[int]) -> Model:
+        """The model as given, whitened there, with some of its own parameters
+        refitted."""
+        self.selector.own = tuple(own)
+        model = self.selector.fit([], self.neutral)
+        return self.weighed(model) if own else model
+
+    def weighed(self, model: Model) -> Model:
+        """A model of these windows fitted once more, whitened and weighed where it
+        is."""
+        self.whiten(model.fit.x)
+        self.selector.weight = window_weights(
+            self.selector.fit(model.places, model.fit.x).fit.residual
+        )
+        return self.selector.fit(model.places, model.fit.x)
+
+    def again(self, model: Model) -> Model:
+        """A model of windows of another length, fitted to these."""
+        if not self._begun:
+            self.begin()
+        x = self.vector(model.fit.x)
+        self.selector.own = model.own
+        self.whiten(x)
+        return self.weighed(self.selector.fit(model.places, x))
+
+    def without(self, model: Model, gone: Sequence[Place]) -> Model:
+        """A model of these windows fitted without some of its effects."""
+        kept = [p for p in model.places if p not in gone]
+        x = model.fit.x
+        for place in gone:
+            x = self.selector.without(x, place, kept)
+        return self.selector.fit(kept, x)
+
+    def stuck(self, model: Model) -> list[int]:
+        """The model's own parameters that a refit moved to a bound."""
+        codes = model.fit.codes(self.selector.bounds)
+        stuck = model.fit.active[codes == AT_BOUND]
+        return [i for i in model.own if i in stuck]
+
+
+def steps_error(predictor: Predictor, data: Recorded) -> np.ndarray:
+    """`easi_jax.gap.discretization_error.error_of_steps` of all its windows,
+    ``(W, H + 1, c)``; what sensors read of it is not told apart."""
+    error = error_of_steps(data.m, predictor.windows, predictor.simulator.dt)
+    return np.pad(error, [(0, 0), (0, 0), (0, len(data.sensors))])

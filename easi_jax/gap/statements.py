@@ -1,0 +1,235 @@
+"""What is said of a model and of the effects that joined, by the held-out data."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from easi_jax.gap import gap_metric as measure
+from easi_jax.gap.effect_search import RIVALS, EffectSearch
+from easi_jax.gap.effect_set import Model, last
+from easi_jax.gap.fitting import Fitting
+from easi_jax.gap.held_out import HeldOut
+from easi_jax.gap.model_comparison import confidence, cost, probability
+from easi_jax.gap.result import Figures, Found, Numbers, Outcome, Part
+from easi_jax.gap.table import Place
+from easi_jax.gap.verdict import Openness, openness, surely_better, verdict_of
+from easi_jax.model.parameters import ParameterSpace
+
+_ROUNDING = 0.005  # of the gap
+_TOLD = 0.8  # of the gap without the own steps' error: worth a note
+
+
+@dataclass
+class _Look:
+    """Held-out figures of a model beside those of a perfect one.
+
+    Attributes:
+        model: that was looked at.
+        figures: of it.
+        noise: mean squares of a perfect model, ``(c,)``.
+        open: the one beside the other.
+    """
+
+    model: Model
+    figures: Figures
+    noise: np.ndarray
+    open: Openness
+
+
+def stated(
+    search: EffectSearch,
+    held_out: HeldOut,
+    space: ParameterSpace,
+    base: Model,
+    model: Model,
+    rivals: Mapping[str, Sequence[Model]],
+    step: float,
+) -> Outcome:
+    """What the held-out data say of the refit, and of the effects that joined.
+
+    Args:
+        base: the refit of the model's own parameters.
+        model: with the effects.
+        rivals: of each effect, best first.
+        step: of the physics [s].
+    """
+    at, scale = search.at, held_out.channels.scale
+    notes: list[str] = []
+    held_out.starts.noise = at.starts.noise
+    before = held_out.look(at.plain(at.neutral))
+    refit = end = _looked(at, held_out, base)
+    undone = surely_better(before.square, refit.figures.square, scale)
+    given = openness(before.square, refit.noise, scale)
+    # What only makes up for a refit that went wrong is nothing that is missing.
+    fine = undone and not given.is_open.any()
+    found: list[Found] = []
+    if model.places:
+        end = _looked(at, held_out, model)
+        # With one noise that all tell: the refit beside the better floor.
+        refit.open = openness(refit.figures.square, end.noise, scale)
+        least = before if undone else refit.figures
+        if not fine and surely_better(end.figures.square, least.square, scale):
+            found = _Judge(search, held_out, base, end).found(rivals)
+        else:
+            notes.append(_not_named(model, fine))
+    if undone and not found:
+        notes.append(
+            "refitted to the fitting data, the model's own parameters predict the "
+            "held-out data worse than as given, so they are left as given"
+        )
+        base = at.refit([])
+    if not found and (undone or model.places):
+        # Also of the noise nothing is kept that they made of it.
+        at.whiten(base.fit.x)
+        held_out.starts.noise = at.starts.noise
+        refit = end = _looked(at, held_out, base)
+    x = end.model.fit.x
+    fair = held_out.figures(at.plain(x), at.share(x)).gap
+    if fair < _TOLD * end.figures.gap:
+        notes.append(
+            f"the model's physics step of {1000 * step:.3g} ms makes much of "
+            f"the gap itself: {end.figures.gap:.3g} would be {fair:.3g} without "
+            "its error; a smaller timestep in the model takes it away"
+        )
+    data, x = at.data, at.plain(x)
+    steps = held_out.predictor.steps - data.lead
+    return Outcome(
+        verdict=verdict_of(bool(found), refit.open, end.open),
+        found=found,
+        refitted=Numbers(at.selector, end.model).refitted(space),
+        before=before,
+        refit=refit.figures,
+        after=end.figures,
+        floor=float(measure.gap(end.noise, scale)),
+        floor_si=np.sqrt(end.noise),
+        floor_is_bound=data.noise_is_bound & (at.starts.noise >= data.noise),
+        open_refit=refit.open,
+        open_after=end.open,
+        channels=held_out.channels,
+        held=held_out.windows,
+        x=x,
+        active=[i for i in model.fit.active.tolist() if i < len(x)],
+        notes=notes,
+        horizon=steps * data.dt,
+        start=data.lead * data.dt,
+    )
+
+
+def _looked(at: Fitting, held_out: HeldOut, model: Model) -> _Look:
+    x, scale = at.plain(model.fit.x), held_out.channels.scale
+    figures, noise = held_out.look(x), held_out.floor(x)
+    return _Look(model, figures, noise, openness(figures.square, noise, scale))
+
+
+class _Judge:
+    """Says of each effect how sure it is, and what else it may be; without the error
+    of own steps.
+
+    Args:
+        base: the model without effects.
+        end: with all of them.
+    """
+
+    def __init__(
+        self, search: EffectSearch, held_out: HeldOut, base: Model, end: _Look
+    ) -> None:
+        self.search, self.held_out = search, held_out
+        self.at, self.model, self.end = search.at, end.model, end
+        self.whole, self.base = self._fair(end.model), self._fair(base)
+
+    def _fair(self, model: Model) -> Figures:
+        x = model.fit.x
+        return self.held_out.figures(self.at.plain(x), self.at.share(x))
+
+    def found(self, rivals: Mapping[str, Sequence[Model]]) -> list[Found]:
+        """All effects, what it costs most to take out first."""
+        numbers = Numbers(self.at.selector, self.model)
+        without = {p.key: self.at.without(self.model, [p]) for p in self.model.places}
+        costs = {k: cost(self.model, less) for k, less in without.items()}
+        places = sorted(self.model.places, key=lambda p: -costs[p.key])
+        found = []
+        for k, place in enumerate(places):
+            model = self.model
+            if k + 1 < len(places):
+                model = self.at.without(self.model, places[k + 1 :])
+            figures = self.held_out.figures(self.at.plain(model.fit.x))
+            odds, same = self._odds(last(self.model, place), rivals[place.key])
+            parts = self._parts(model.fit.x, place, figures) if place.shared else ()
+            mine = {place.key, *(p.place.key for p in parts)}
+            found.append(
+                Found(
+                    place,
+                    numbers.values(place),
+                    confidence(costs[place.key], odds),
+                    [k for k in dict.fromkeys(p.key for p in same) if k not in mine],
+                    figures.gap if k + 1 < len(places) else self.end.figures.gap,
+                    numbers.fitted(place),
+                    numbers.deviations(place),
+                    parts,
+                    costs[place.key],
+                )
+            )
+        return found
+
+    def _odds(self, mine: Model, rivals: Sequence[Model]) -> tuple[float, list[Place]]:
+        """Odds of an effect's rivals, and those that predict held-out data as well."""
+        odds, same = 0.0, []
+        for rival in rivals[:RIVALS]:
+            p = probability(mine, rival)
+            odds += (1 - p) / max(p, 1e-6)
+            if self._as_good(self.whole.square, self._fair(rival).square):
+                other = rival.places[-1]
+                singles = self.search.offered.singles(other)
+                same += singles if other.shared else [other]
+        return odds, same
+
+    def _parts(self, x: np.ndarray, place: Place, whole: Figures) -> tuple[Part, ...]:
+        """The actuators that a shared effect is seen at: without it at one of them the
+        held-out data are predicted worse. What moves them most comes first.
+
+        Args:
+            x: vector with the effect.
+            whole: its figures.
+        """
+        singles = self.search.offered.singles(place)
+        each = self.search.each
+        without = [[p for p in singles if p is not one] for one in singles]
+        squares = self._squares([each(x, place, kept) for kept in without])
+        (mine,) = self._squares([x])
+        scale = self.held_out.channels.scale
+        order = np.argsort(-np.asarray(measure.gap(squares.mean(1), scale)))
+        seen = [singles[i] for i in order if not self._as_good(mine, squares[i])]
+        seen = seen or [singles[i] for i in order]
+        some = [each(x, place, seen[:k]) for k in range(1, len(seen))]
+        gaps = [float(measure.gap(s.mean(0), scale)) for s in self._squares(some)]
+        return tuple(map(Part, seen, [*gaps, whole.gap]))
+
+    def _squares(self, vectors: Sequence[np.ndarray]) -> np.ndarray:
+        """Mean squares of each held-out window, ``(B, W, c)``."""
+        return self.held_out.squares(np.array([self.at.plain(x) for x in vectors]))
+
+    def _as_good(self, mine: np.ndarray, theirs: np.ndarray) -> bool:
+        """Whether the difference of two held-out gaps may be none, or is in favor;
+        from mean squares of each window, ``(W, c)``."""
+        scale = self.held_out.channels.scale
+        weights = measure.resampled(len(mine), 1)
+        d = measure.gap(weights @ theirs, scale) - measure.gap(weights @ mine, scale)
+        # Twins differ by rounding alone.
+        gap = measure.gap(mine.mean(0), scale)
+        return bool(np.quantile(d, 0.025) <= _ROUNDING * gap)
+
+
+def _not_named(model: Model, fine: bool) -> str:
+    """A note on effects of which the held-out data show nothing; ``fine``: nor that
+    anything is missing."""
+    names = ", ".join(p.key for p in model.places)
+    why = (
+        "the model as given predicts the held-out data as well as a perfect one"
+        if fine
+        else "the held-out data are predicted no better with it"
+    )
+    return (
+        f"{names}: seen in the fitting data, but {why}, so it is not named; the "
+        "recordings differ, or are too few"
+    )
