@@ -32,7 +32,8 @@ class Config(EngineOptions, BaseOptions):
     held_out: tuple[Path, ...] = ()
     """Logs kept out of every fit; not given: a quarter of the data."""
     horizon: float = _HORIZON
-    """Length of a prediction [s]; at least 10 control steps are predicted."""
+    """Over what the gap is reported [s], at least 10 control steps; which effects are
+    named does not depend on it."""
     parameters: Path | None = None
     """What may be refitted in the model (see train.parameters); not given: damping,
     friction and stiffness that the model states, each within a factor of 5."""

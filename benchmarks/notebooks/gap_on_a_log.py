@@ -139,9 +139,9 @@ told = json.loads((OUT / "gap" / "gap.json").read_text())
 # %% [markdown]
 # ## The answer
 #
-# The confidence is the probability of a name against its rivals, times the share of the
-# squared gap that all effects together close: behind the rest an unknown effect may
-# hide. Names listed as indistinguishable predict the held-out log as well; more
+# The confidence is the probability of a name against its rivals, less where taking the
+# effect out costs little: what closes little may mend a little of what no effect is.
+# Names listed as indistinguishable predict the held-out log as well; more
 # excitation, not more thought, decides between them (`train.excite` proposes which).
 # The verdict is `explained` only where what is left lies, with its 95 % interval,
 # within 1.25 times the noise floor; short logs and joints that stick often miss that.

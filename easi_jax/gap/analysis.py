@@ -236,7 +236,7 @@ class Analysis:
         notes = self._read_early()
         at = search.at
         for f in dict.fromkeys([self.reported, at]):
-            f.begin()
+            f.begin(f.neutral)
         self.held_out.channels = self.reported.channels
         if at.own_steps:
             self.tell(

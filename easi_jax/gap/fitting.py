@@ -186,12 +186,12 @@ class Fitting:
         self.channels = changed
         return more
 
-    def begin(self) -> None:
-        """Whitens at the model as given, with what is to be compared there."""
+    def begin(self, x: np.ndarray) -> None:
+        """Whitens at a vector without a share, with what is to be compared there."""
         self._begun = True
-        self.whiten(self.neutral)
+        self.whiten(x)
         if self.moves_in_the_model():
-            self.whiten(self.neutral)
+            self.whiten(x)
         self._watch_steps()
 
     def _watch_steps(self) -> None:
@@ -233,13 +233,14 @@ class Fitting:
         return self.selector.fit(model.places, model.fit.x)
 
     def again(self, model: Model) -> Model:
-        """A model of windows of another length, fitted to these."""
-        if not self._begun:
-            self.begin()
-        x = self.vector(model.fit.x)
+        """A model of windows of another length, fitted to these, whitened where it
+        was."""
         self.selector.own = model.own
-        self.whiten(x)
-        return self.weighed(self.selector.fit(model.places, x))
+        if self._begun:
+            self.whiten(self.vector(model.fit.x))
+        else:
+            self.begin(self.plain(model.fit.x))
+        return self.selector.fit(model.places, self.vector(model.fit.x))
 
     def without(self, model: Model, gone: Sequence[Place]) -> Model:
         """A model of these windows fitted without some of its effects."""

@@ -296,7 +296,8 @@ class Selector:
     def fitted(
         self, places: list[Place], x: np.ndarray, chosen: Sequence[Candidate]
     ) -> list[Model]:
-        """Each candidate beside ``places``, the best of its starts, by name."""
+        """Each candidate beside ``places``, the best of its starts, by name; but what
+        no machine can have."""
         problems = [
             least_squares(
                 np.array([self.started(x, c), *([c.ends] if c.ends else [])]),
@@ -312,7 +313,8 @@ class Selector:
             key = c.place.key
             if key not in best or f.cost < best[key][0]:
                 best[key] = (f.cost, c.place, f)
-        return [self.model([*places, p], f) for _, p, f in best.values()]
+        models = [self.model([*places, p], f) for _, p, f in best.values()]
+        return [m for m in models if np.isfinite(m.loss).all()]
 
     def expanded(
         self, base: Model, candidates: Sequence[Candidate]
@@ -332,6 +334,8 @@ class Selector:
                 continue
             kept = [p for p in model.places if p is not place]
             found = self.fitted(kept, model.fit.x, more)
+            if not found:
+                continue
             best = min(found, key=lambda m: m.loss.mean())
             # Of one nature at one place: also a small gain says which.
             if better(best, model, 0.0):

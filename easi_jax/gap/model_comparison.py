@@ -15,8 +15,12 @@ HELPS = 0.05  # share of the squared gap by which each of its numbers has to hel
 _LARGE = 0.3
 _CLOSER = 3.0  # times as much has to be gained where it is
 _TINY = 1e-300
+# Nats for each number: what is as often named wrongly as rightly, and how fast that
+# changes with the logarithm (fitted by `benchmarks.gap_confidence`).
+_EVEN, _STEEP = 0.83, 2.6
+_SAME = 0.1  # of the noise: predictions that differ by less are one
 _RARE = 0.1  # relative loss by which a rare effect has to be better than others
-_ALIKE = 0.02  # relative difference of losses that says nothing
+_ALIKE = 0.02  # difference of logarithms of losses that says nothing
 _AS_GOOD = 1.5  # standard errors within which the simpler of two candidates wins
 _NEARLY = 0.7  # share of what the best explains
 _FEW = 0.25  # share of the windows
@@ -25,9 +29,16 @@ _LEAST = 3  # windows that can tell
 
 def advantage(a: np.ndarray, b: np.ndarray) -> float:
     """By how many standard errors losses ``a`` are below ``b``, block by block."""
-    d = b - a
-    error = d.std(ddof=1) / sqrt(len(d)) if len(d) > 1 else np.inf
-    return float(d.mean() / max(error, 1e-12 * max(abs(b.mean()), 1e-30)))
+    return _in_errors(b - a, 1e-12 * max(abs(b.mean()), 1e-30))
+
+
+def _in_errors(d: np.ndarray, least: float) -> float:
+    """A mean in standard errors, which are at ``least`` so large; of what is infinite,
+    infinite."""
+    mean = float(d.mean())
+    if not np.isfinite(mean) or len(d) < 2:
+        return mean * np.inf if mean else 0.0
+    return mean / max(float(d.std(ddof=1)) / sqrt(len(d)), least)
 
 
 def rank(model: Model) -> float:
@@ -147,8 +158,8 @@ def probability(model: Model, rival: Model) -> float:
     t = 0.0
     for mine, theirs in ((model.loss, rival.loss), (model.gap, rival.gap)):
         # Of numbers whose spread nobody knows, the log density is that of the spread.
-        d = np.log((theirs + _TINY) / (mine + _TINY))
-        t += 0.5 * float(d.mean()) / max(d.std(ddof=1) / sqrt(len(d)), _ALIKE)
+        d = np.log(theirs + _TINY) - np.log(mine + _TINY)
+        t += 0.5 * _in_errors(d, _ALIKE)
     apart = _few(np.abs(model.windows - rival.windows).max(0, initial=0.0) > 1.0)
     if len(apart):
         mine, theirs = (np.log(x.windows[:, apart] + _TINY) for x in (model, rival))
@@ -173,11 +184,20 @@ def cost(model: Model, less: Model) -> float:
 def confidence(lost: float, odds: float) -> float:
     """Probability that an effect of this name acts at this place.
 
-    What closes little beside what is left may mend a little of what no effect is.
+    What closes little beside what is left may mend a little of what no effect is: so it
+    was in generated machines, known effects beside unknown ones among them
+    (`benchmarks.gap_confidence`).
 
     Args:
         lost: its `cost`.
-        odds: of all its rivals together.
+        odds: of all its rivals together, but its twins.
     """
-    closes = 1.0 - np.exp(-2.0 * max(lost, 0.0))
-    return float(closes / (1.0 + odds))
+    if lost <= 0:
+        return 0.0
+    return 1.0 / (1.0 + (_EVEN / lost) ** _STEEP) / (1.0 + odds)
+
+
+def are_twins(model: Model, rival: Model) -> bool:
+    """Whether two models predict the same, so that no such data tell them apart."""
+    mine, theirs = model.fit.residual, rival.fit.residual
+    return bool(np.sqrt(np.mean((mine - theirs) ** 2)) < _SAME)

@@ -10,7 +10,12 @@ from easi_jax.gap.effect_search import RIVALS, EffectSearch
 from easi_jax.gap.effect_set import Model, last
 from easi_jax.gap.fitting import Fitting
 from easi_jax.gap.held_out import HeldOut
-from easi_jax.gap.model_comparison import confidence, cost, probability
+from easi_jax.gap.model_comparison import (
+    are_twins,
+    confidence,
+    cost,
+    probability,
+)
 from easi_jax.gap.result import Figures, Found, Numbers, Outcome, Part
 from easi_jax.gap.table import Place
 from easi_jax.gap.verdict import Openness, openness, surely_better, verdict_of
@@ -173,11 +178,13 @@ class _Judge:
         return found
 
     def _odds(self, mine: Model, rivals: Sequence[Model]) -> tuple[float, list[Place]]:
-        """Odds of an effect's rivals, and those that predict held-out data as well."""
+        """Odds of an effect's rivals but its twins, and those that predict held-out
+        data as well."""
         odds, same = 0.0, []
         for rival in rivals[:RIVALS]:
-            p = probability(mine, rival)
-            odds += (1 - p) / max(p, 1e-6)
+            if not are_twins(mine, rival):
+                p = probability(mine, rival)
+                odds += (1 - p) / max(p, 1e-6)
             if self._as_good(self.whole.square, self._fair(rival).square):
                 other = rival.places[-1]
                 singles = self.search.offered.singles(other)

@@ -27,6 +27,7 @@ from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.forward_selection import Selector, as_sine, shortlist
 from easi_jax.gap.model_comparison import (
     advantage,
+    are_twins,
     better,
     confidence,
     cost,
@@ -512,9 +513,21 @@ def of_loss(loss: np.ndarray) -> Model:
 
 
 def test_what_costs_much_to_take_out_is_sure() -> None:
-    sure = [confidence(cost, 0.0) for cost in (0.0, 0.05, 0.5, 3.0)]
-    assert sure == sorted(sure) and sure[0] < 0.3 and 0.9 < sure[-1] < 1.0
+    sure = [confidence(lost, 0.0) for lost in (0.0, 0.1, 0.5, 1.0, 3.0)]
+    assert sure == sorted(sure) and sure[0] == 0.0
+    assert sure[1] < 0.05 and sure[2] < 0.5 < sure[3] and 0.9 < sure[-1] < 1.0
     assert confidence(3.0, 1.0) == pytest.approx(0.5 * sure[-1])
+
+
+def test_twins_predict_the_same() -> None:
+    rng = np.random.default_rng(0)
+    one = of_loss(np.ones(10))
+    one.fit = replace(one.fit, residual=rng.normal(size=(20, 30)))
+    for size, same in ((0.05, True), (0.2, False)):
+        moved = one.fit.residual + size * rng.normal(size=(20, 30))
+        other = of_loss(np.ones(10))
+        other.fit = replace(other.fit, residual=moved)
+        assert are_twins(one, other) == same
 
 
 def test_the_cost_is_a_difference_of_log_densities() -> None:

@@ -1,0 +1,110 @@
+"""Names do not depend on the horizon, nor on what no machine can have."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from easi_jax.data.recording import Configuration, Run
+from easi_jax.data.scales import scales_of
+from easi_jax.data.windows import fitted_velocity
+from easi_jax.gap import effect_search
+from easi_jax.gap.analysis import Analysis
+from easi_jax.gap.candidates import places
+from easi_jax.gap.result import Outcome
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation import engine
+
+MODEL = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+<body name="rod"><joint name="hinge" axis="0 1 0" {more}/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.02" mass="0.8"/></body></worldbody>
+<actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
+DT, NOISE = 0.01, 3e-4
+FEW = ("coulomb_friction", "viscous_damping", "armature", "joint_stiffness")
+
+
+def recorded(seed: int, more: str = "", rows: int = 300) -> Run:
+    """A pendulum with what the owner's model has not."""
+    m = mujoco.MjModel.from_xml_string(MODEL.format(more=more))
+    d, rng, time = mujoco.MjData(m), np.random.default_rng(seed), np.arange(rows) * DT
+    rate, phase = rng.uniform(2, 12, 5), rng.uniform(0, 6, 5)
+    ctrl = 0.5 * np.sin(np.outer(time, rate) + phase).sum(1)[:, None]
+    q = np.zeros((rows, 1))
+    for i, u in enumerate(ctrl):
+        q[i], d.ctrl[:] = d.qpos + NOISE * rng.normal(), u
+        mujoco.mj_step(m, d, 5)
+    c = Configuration.of(m)
+    v = fitted_velocity(q, DT, c)
+    return Run(str(seed), "made", DT, time, q, v, False, ctrl, c)
+
+
+@pytest.fixture
+def analysed(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], Outcome]:
+    """What is found in a machine with dry friction, by the horizon; of few names."""
+    monkeypatch.setattr(
+        *(effect_search, "places"),
+        lambda *a: [p for p in places(*a) if p.effect in FEW],
+    )
+    monkeypatch.setattr(effect_search, "ripples", lambda *a: [])
+    m = mujoco.MjModel.from_xml_string(MODEL.format(more=""))
+    fit, held = (recorded(k, 'frictionloss="0.05"') for k in (0, 1))
+
+    def found(horizon: float) -> Outcome:
+        given = m, ParameterSpace(()), [fit], [held], np.array([NOISE]), horizon
+        with engine.using("mujoco"):
+            return Analysis(*given).run()
+
+    return found
+
+
+def test_fits_see_the_same_windows_whatever_the_horizon() -> None:
+    m = mujoco.MjModel.from_xml_string(MODEL.format(more=""))
+    runs = [recorded(k) for k in (0, 1)]
+    seen = []
+    for horizon in (0.1, 0.2, 0.6):
+        given = m, ParameterSpace(()), runs[:1], runs[1:], np.array([NOISE]), horizon
+        with engine.using("mujoco"):
+            search = Analysis(*given).search
+        assert search.at.steps * DT == pytest.approx(0.25)
+        lengths = [(f.steps, f.windows.row.tolist()) for f in search.lengths]
+        seen.append(lengths)
+    assert seen[0] == seen[1] == seen[2]
+    assert [steps - 5 for steps, _ in seen[0]] == [10, 20, 100]
+
+
+@pytest.mark.slow
+def test_what_is_named_does_not_depend_on_the_horizon(
+    analysed: Callable[[float], Outcome],
+) -> None:
+    short, long = analysed(0.2), analysed(0.6)
+    assert [f.place.key for f in short.found] == ["coulomb_friction@hinge"]
+    assert [f.place.key for f in long.found] == ["coulomb_friction@hinge"]
+    a, b = (o.found[0].values["torque"] for o in (short, long))
+    assert a[0] == pytest.approx(0.05, rel=0.05)
+    assert b[:2] == pytest.approx(a[:2], rel=1e-4)
+    assert long.horizon == pytest.approx(0.6) and short.horizon == pytest.approx(0.2)
+    assert long.before.gap > 2 * short.before.gap
+    assert short.verdict == long.verdict == "explained"
+
+
+def test_a_spring_rests_where_its_joint_can_be() -> None:
+    free = mujoco.MjModel.from_xml_string(MODEL.format(more=""))
+    held = mujoco.MjModel.from_xml_string(MODEL.format(more='range="-60 60"'))
+    run = recorded(0, rows=100)
+    for m, most in ((free, np.pi + 1), (held, np.pi / 3)):
+        s = scales_of(m, [run])
+        (spring,) = [p for p in places(m, s) if p.effect == "joint_stiffness"]
+        low, high = spring.rests
+        assert -most - 1e-9 <= low < high <= most + 1e-9
+        assert spring.possible(np.array([2.0, 2.0 * 0.9 * high]))
+        assert not spring.possible(np.array([2.0, 2.0 * 1.1 * high]))
+        assert spring.possible(np.array([0.0, 100.0])), "without a spring"
+
+
+def test_friction_that_stops_all_motion_is_out_of_bounds() -> None:
+    m = mujoco.MjModel.from_xml_string(MODEL.format(more=""))
+    s = replace(scales_of(m, [recorded(0, rows=100)]), most=np.array([3.0]))
+    (dry,) = [p for p in places(m, s) if p.effect == "coulomb_friction"]
+    assert dry.columns[0].high == pytest.approx(6.0)
