@@ -139,6 +139,7 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
         "mechanism": answer["mechanism"],
         "truth": list(truth),
         "named": named,
+        "there": [any(n in {k, *twins} for k, twins in truth.items()) for n in named],
         "confidence": [e["confidence"] for e in told["effects"]],
         "removal_cost": [e["removal_cost"] for e in told["effects"]],
         "explains": [e["explains"] for e in told["effects"]],
