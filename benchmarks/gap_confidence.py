@@ -1,0 +1,148 @@
+"""Whether the confidence of ``train.gap`` comes true, and the curve that it follows.
+
+    python -m benchmarks.gap --kind mixed --seeds 61000 61010 --cheap --engine mujoco \
+        --out benchmarks/results/gap_confidence.jsonl
+    python -m benchmarks.gap_confidence
+
+Reads the lines that the first command adds (kinds ``single``, ``pair``, ``several``:
+known effects; ``mixed``: one beside one that no table has; ``outside``: that alone) and
+counts how often what was stated is there. The curve of
+`easi_jax.gap.model_comparison.confidence` is fitted to them anew by maximum likelihood,
+for comparison with the one in the code, which was fitted to older seeds.
+"""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from train._command import main, say, show_table
+
+RESULTS = Path(__file__).parent / "results"
+LINES = RESULTS / "gap_confidence.jsonl"
+FAMILIES = {"outside": "unknown", "mixed": "mixed"}  # all other kinds: known
+_BINS = 5
+_SURE = 0.8
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Counts how often what train.gap names is there, by the confidence stated."""
+
+    lines: Path = LINES
+    """Lines of benchmarks.gap."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Said:
+    """Effects that were named, n of them.
+
+    Attributes:
+        confidence: stated, ``(n,)``.
+        cost: of taking them out [nats], ``(n,)``.
+        there: whether they, or a twin, are in the machine, ``(n,)`` bool.
+        family: known, mixed or unknown, ``(n,)``.
+    """
+
+    confidence: np.ndarray
+    cost: np.ndarray
+    there: np.ndarray
+    family: np.ndarray
+
+    def some(self, which: np.ndarray) -> "Said":
+        """Those of a mask."""
+        fields = dataclasses.fields(self)
+        return Said(*(getattr(self, f.name)[which] for f in fields))
+
+
+def said(rows: Sequence[dict[str, Any]]) -> Said:
+    """All that was named in some lines."""
+    of = [FAMILIES.get(r["kind"], "known") for r in rows for _ in r["named"]]
+
+    def every(key: str) -> np.ndarray:
+        return np.array([x for r in rows for x in r[key]])
+
+    there = every("there").astype(bool)
+    return Said(every("confidence"), every("removal_cost"), there, np.array(of))
+
+
+def figures(stated: np.ndarray, there: np.ndarray) -> dict[str, float]:
+    """How true statements ``(n,)`` came: Brier score, mean distance of bins from what
+    was the case less what chance makes of it, and how many were sure and wrong."""
+    bins = np.minimum((stated * _BINS).astype(int), _BINS - 1)
+    off = 0.0
+    for k in np.unique(bins):
+        mine, right = stated[bins == k], there[bins == k]
+        # The variance of a share is taken off its squared distance.
+        by_chance = float(np.mean(mine * (1 - mine))) / len(mine)
+        square = max((mine.mean() - right.mean()) ** 2 - by_chance, 0.0)
+        off += len(mine) / len(stated) * float(np.sqrt(square))
+    return {
+        "names": len(stated),
+        "there": int(there.sum()),
+        "mean confidence": float(stated.mean()),
+        "Brier score": float(np.mean((stated - there) ** 2)),
+        "calibration error": off,
+        "wrong above 0.8": int(((stated > _SURE) & ~there).sum()),
+    }
+
+
+def curve(cost: np.ndarray, odds: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Confidence at parameters ``at (2,)``: logarithms of what is even, and how
+    steep."""
+    even, steep = np.exp(at)
+    return 1.0 / (1.0 + (even / np.maximum(cost, 1e-6)) ** steep) / (1.0 + odds)
+
+
+def fitted(part: Said) -> np.ndarray:
+    """Parameters of `curve` that make what was the case most likely, ``(2,)``."""
+    from scipy.optimize import minimize
+
+    from easi_jax.gap.model_comparison import confidence
+
+    alone = np.array([confidence(c, 0.0) for c in part.cost])
+    odds = np.maximum(alone / np.maximum(part.confidence, 1e-9) - 1.0, 0.0)
+
+    def unlikely(at: np.ndarray) -> float:
+        p = np.clip(curve(part.cost, odds, at), 1e-3, 1 - 1e-3)
+        return -float(np.sum(np.where(part.there, np.log(p), np.log(1 - p))))
+
+    return minimize(unlikely, np.zeros(2), method="Nelder-Mead").x
+
+
+def run(config: Config) -> None:
+    """Counts, and fits the curve again."""
+    from benchmarks._common import command_of, write_result
+    from easi_jax.errors import UserError
+
+    if not config.lines.is_file():
+        raise UserError(f"{config.lines} is not there; python -m benchmarks.gap --help")
+    rows = [json.loads(line) for line in config.lines.read_text().splitlines()]
+    every = said(rows)
+    parts = {"all": every}
+    for family in ("known", "mixed", "unknown"):
+        if (every.family == family).any():
+            parts[family] = every.some(every.family == family)
+    told = {k: figures(p.confidence, p.there) for k, p in parts.items()}
+    even, steep = np.exp(fitted(every))
+    show_table(
+        "Confidence of train.gap",
+        ("family", *next(iter(told.values()))),
+        [(k, *(f"{x:.3g}" for x in f.values())) for k, f in told.items()],
+    )
+    path = write_result(
+        "gap_confidence",
+        command_of("benchmarks.gap_confidence", config),
+        {"lines": len(rows), "commits": sorted({r["commit"] for r in rows})},
+        families=told,
+        curve={"even [nats]": float(even), "steep": float(steep)},
+    )
+    say(f"fitted anew: even at {even:.2f} nats, steepness {steep:.2g}")
+    say(f"written: {path}")
+
+
+if __name__ == "__main__":
+    main(Config, run, name="benchmarks.gap_confidence")

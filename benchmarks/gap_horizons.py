@@ -1,0 +1,115 @@
+"""Whether ``train.gap`` names the same at every horizon of its report.
+
+    python -m benchmarks.gap_horizons --data ../shared/data
+
+On recordings of real machines: names and values at horizons of 0.05 to 1 s, beside
+those at the first.
+"""
+
+import dataclasses
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from benchmarks.gap_real import MACHINES, Simulator
+from train._command import main, say, show_table
+
+DOUBLE = Simulator(
+    "dfki_double_pendulum",
+    tuple(f"trajectory_0{k}.csv" for k in (0, 2, 4, 6)),
+    tuple(f"trajectory_0{k}.csv" for k in (1, 3, 5)),
+    0.2,
+    (
+        *("armature@elbow", "armature@shoulder"),
+        *("coulomb_friction@elbow", "coulomb_friction@shoulder"),
+    ),
+)
+MADE = {
+    "double_pendulum": DOUBLE,
+    **{k: MACHINES[k] for k in ("emps", "cartpole", "pendulum")},
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Asks train.gap about the same recordings at several horizons."""
+
+    data: Path = Path("../shared/data")
+    """Folder of the recordings."""
+    machines: tuple[str, ...] = tuple(MADE)
+    """Which of them."""
+    horizons: tuple[float, ...] = (0.2, 0.05, 0.5, 1.0)
+    """Of the report [s]."""
+    engine: str = "auto"
+    """Which engine simulates: auto, mjx or mujoco."""
+
+
+def run(config: Config) -> None:
+    """Asks, compares and writes, machine by machine."""
+    from benchmarks._common import command_of, write_result
+    from benchmarks.gap_real import analysed
+    from easi_jax.errors import UserError, nearest
+
+    for name in config.machines:
+        if name not in MADE:
+            raise UserError(f'unknown machine "{name}"{nearest(name, MADE)}')
+        if not (config.data / MADE[name].folder / "model.xml").is_file():
+            raise UserError(f"{config.data} does not hold the recordings; give --data")
+    for name in config.machines:
+        found = []
+        for horizon in config.horizons:
+            machine = dataclasses.replace(MADE[name], horizon=horizon)
+            with tempfile.TemporaryDirectory() as folder:
+                told = analysed(machine, config.data, Path(folder) / "gap")
+            found.append({"horizon": horizon, **told})
+            say(f"{name}, {horizon:g} s: {', '.join(names(told)) or 'nothing'}")
+        chosen = dataclasses.replace(config, machines=(name,))
+        path = write_result(
+            f"gap_horizons_{name}",
+            command_of("benchmarks.gap_horizons", chosen),
+            {"machine": name, "folder": MADE[name].folder},
+            same_names=len({tuple(sorted(names(f))) for f in found}) == 1,
+            farthest_value=farthest(found),
+            horizons=found,
+        )
+        show_table(name, ("horizon [s]", "verdict", "gap", "names"), table(found))
+        say(f"written: {path}")
+
+
+def names(told: dict[str, Any]) -> list[str]:
+    """``effect@at`` of all that was named."""
+    return [f"{e['effect']}@{e['at']}" for e in told["effects"]]
+
+
+def farthest(found: list[dict[str, Any]]) -> float:
+    """The largest relative difference of a value from that at the first horizon, of
+    effects that both name."""
+    first = {
+        (f"{e['effect']}@{e['at']}", k): p["value"]
+        for e in found[0]["effects"]
+        for k, p in e["parameters"].items()
+    }
+    off = [0.0]
+    for told in found[1:]:
+        for e in told["effects"]:
+            for k, p in e["parameters"].items():
+                before = first.get((f"{e['effect']}@{e['at']}", k))
+                if before:
+                    off.append(abs(p["value"] / before - 1.0))
+    return max(off)
+
+
+def table(found: list[dict[str, Any]]) -> list[tuple[str, ...]]:
+    """A row for each horizon."""
+    rows = []
+    for told in found:
+        gap = told["gap"]
+        figures = f"{gap['before']:.3g} to {gap['after']:.3g}, floor {gap['floor']:.2g}"
+        rows.append(
+            (f"{told['horizon']:g}", told["verdict"], figures, ", ".join(names(told)))
+        )
+    return rows
+
+
+if __name__ == "__main__":
+    main(Config, run, name="benchmarks.gap_horizons")
