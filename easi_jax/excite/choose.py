@@ -87,7 +87,8 @@ def effects_wanted(
     kept = [
         p
         for p in found
-        if (not names or p.effect in names) and not (p.shared or covered(p, space, m))
+        if (not names or p.effect in names)
+        and not (p.shared or p.tied or covered(p, space, m))
     ]
     if not kept:
         raise UserError(

@@ -39,7 +39,8 @@ from easi_jax.simulation.logged import Logged
 
 # Windows that fits see [s]: the first part of the second alone, the second, and longer.
 _SHORT, _MIDDLE, _LONG = 0.05, 0.2, 1.0
-_FITTED = (20, 96)  # windows of one length that fits see
+_FITTED = (32, 96)  # windows of one length that fits see
+_LONGEST = 10  # windows at least, of the longest
 _STEPS = 9_600  # physics steps in them
 
 Tell = Callable[[str], None]
@@ -125,12 +126,12 @@ class Analysis:
         """Windows that fits see, the shortest first; of the lengths that no run has
         windows of, none."""
         dt, lead, found = fit[0].dt, self.data.lead, {}
-        for seconds in (_MIDDLE, _LONG):
+        for seconds, few in ((_MIDDLE, _FITTED[0]), (_LONG, _LONGEST)):
             steps = window_steps(dt, seconds) + lead
             if steps == reported:
                 found[steps] = self.reported
                 continue
-            windows = cut.some(fit, seconds)
+            windows = cut.some(fit, seconds, few)
             if windows is not None:
                 predictor = self.predictor.on(filled(windows))
                 found[steps] = self._fitting(predictor, windows, steps)
@@ -309,11 +310,13 @@ class WindowsOf:
         """All windows of a length; None where no run is that long."""
         return window_set(self.m, runs, seconds, self.longest, first, self.sensors)
 
-    def some(self, runs: Sequence[Run], seconds: float) -> WindowSet | None:
+    def some(
+        self, runs: Sequence[Run], seconds: float, least: int = _FITTED[0]
+    ) -> WindowSet | None:
         """As many windows of a length as fits see; None where no run is that long."""
         found = self.all(runs, seconds)
         if found is None:
             return None
         steps = found.ctrl.shape[1] * physics_steps(runs[0].dt, self.m.opt.timestep)
-        most = min(max(_STEPS // steps, _FITTED[0]), _FITTED[1])
+        most = min(max(_STEPS // steps, least), _FITTED[1])
         return found.take(spread(found, most, reach(self.m, runs, found)))

@@ -9,8 +9,9 @@ import numpy as np
 from easi_jax.gap.table import Column, Place, name_of
 from easi_jax.model.contact_pairs import contact_pairs
 from easi_jax.model.effect_catalog import CATALOG, Effect, Part, Scales, Spot
-from easi_jax.model.effect_numbers import field_of
+from easi_jax.model.effect_numbers import NO_FORCE_LIMIT, field_of
 from easi_jax.model.joint_space import scalar_dofs
+from easi_jax.model.parameter_proposal import like_places
 
 _SELDOM = 0.02  # of the rows: a pair of geoms that touches less says nothing
 _PAIRS = 12  # at most, that are looked at one by one
@@ -24,12 +25,16 @@ class _Object(NamedTuple):
         index: where its numbers are in fields of `Effects`.
         spot: the same for the catalog.
         is_all: it stands for all of its kind.
+        tied: names of the like places that it stands for, and ``among`` where their
+            numbers are.
     """
 
     name: str
     index: tuple[int, ...]
     spot: Spot
     is_all: bool = False
+    tied: tuple[str, ...] = ()
+    among: tuple[tuple[int, ...], ...] = ()
 
 
 def places(m: mujoco.MjModel, s: Scales) -> list[Place]:
@@ -61,6 +66,8 @@ def _objects(m: mujoco.MjModel, s: Scales) -> Iterator[_Object]:
     if m.nu > 1:
         # A number of each drive would be one of dozens, and hardly help alone.
         yield _Object("", (), Spot(m, "actuator", 0, s), is_all=True)
+    for kind in ("joint", "actuator"):
+        yield from _like(m, kind, s)
     for b in range(1, m.nbody):
         if m.body_mass[b] > 0:
             yield _Object(name_of(m, "body", b), (b,), Spot(m, "body", b, s))
@@ -72,6 +79,18 @@ def _objects(m: mujoco.MjModel, s: Scales) -> Iterator[_Object]:
             yield _Object(pairs[k].name, (k,), Spot(m, "geom", k, s, (pairs[k],)))
 
 
+def _like(m: mujoco.MjModel, kind: str, s: Scales) -> Iterator[_Object]:
+    """Groups of like joints or actuators, but all actuators together."""
+    id_of = {"joint": m.joint, "actuator": m.actuator}[kind]
+    for pattern, names in like_places(m, kind).items():
+        if kind == "actuator" and len(names) == m.nu:
+            continue
+        ids = [int(id_of(name).id) for name in names]
+        at = m.jnt_dofadr[ids].tolist() if kind == "joint" else ids
+        among = tuple((k,) for k in at)
+        yield _Object(pattern, (), Spot(m, kind, ids[0], s), tied=names, among=among)
+
+
 def _at(row: Effect, o: _Object, cycles: float = np.nan) -> Iterator[Place]:
     """An effect at an object, if it can be there: a place for each of its shapes."""
     kind = o.spot.kind
@@ -79,31 +98,41 @@ def _at(row: Effect, o: _Object, cycles: float = np.nan) -> Iterator[Place]:
     if site is None or not site.offered(o.spot) or (o.is_all and not row.is_shared):
         return
     columns = tuple(_column(part, o) for part in site.parts)
+    if o.tied and not all(map(_adds, site.parts, columns)):
+        return
     starts = tuple(
         tuple(cycles if np.isnan(x) else float(x) for x in start)
         for start in site.starts_at(o.spot)
     )
     what = (row.name, o.name, "model" if o.is_all else kind, columns)
     if row.rests:
-        yield Place(*what, starts, rests=o.spot.range)
+        yield Place(*what, starts, rests=o.spot.range, tied=o.tied)
         return
     if not site.parts[-1].number.is_shape:
-        yield Place(*what, starts)
+        yield Place(*what, starts, tied=o.tied)
         return
     fitted = (True,) * (len(columns) - 1) + (False,)
     for shape in (columns[-1].low, columns[-1].high):
-        yield Place(*what, tuple((*start, shape) for start in starts), fitted)
+        shaped = tuple((*start, shape) for start in starts)
+        yield Place(*what, shaped, fitted, tied=o.tied)
+
+
+def _adds(part: Part, c: Column) -> bool:
+    """Whether a number can be given to several places on top of their own."""
+    return not part.number.is_shape and abs(c.neutral) < NO_FORCE_LIMIT
 
 
 def _column(part: Part, o: _Object) -> Column:
     spot, (_, _, entry) = o.spot, part.column.partition(".")
+    last = (int(entry),) if entry else ()
     return Column(
         field_of(part.column),
-        (*o.index, *([int(entry)] if entry else [])),
+        (*o.index, *last) if not o.tied else (),
         part.name,
         part.unit or part.number.unit(spot.m, spot.i),
         part.neutral(spot),
         *part.bounds(spot),
         part.size * spot.sizes[part.scale],
         spot.sizes[part.of],
+        tuple((*index, *last) for index in o.among),
     )

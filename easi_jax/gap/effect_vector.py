@@ -17,10 +17,10 @@ class Layout:
 
     def __init__(self, m: mujoco.MjModel, found: Sequence[Place]) -> None:
         self.columns: list[Column] = []
-        self._index: dict[tuple[str, tuple[int, ...]], int] = {}
+        self._index: dict[object, int] = {}
         for place in found:
             for c in place.columns:
-                key = (c.field, c.index)
+                key = _key(c)
                 if key not in self._index:
                     self._index[key] = len(self.columns)
                     self.columns.append(c)
@@ -32,13 +32,13 @@ class Layout:
 
     def where(self, place: Place) -> np.ndarray:
         """Indices of a place's columns in the vector."""
-        return np.array([self._index[(c.field, c.index)] for c in place.columns], int)
+        return np.array([self._index[_key(c)] for c in place.columns], int)
 
     def effects(self, x: jax.Array) -> Effects:
         """The effects of a vector ``(n,)``; pure.
 
-        A number without an index in a field of several is what all of them have on top
-        of their own.
+        A number without an index in a field of several is what all of them, or those
+        that it is among, have on top of their own.
         """
         changed = {}
         by_field: dict[str, list[int]] = {}
@@ -53,7 +53,15 @@ class Layout:
                 index = tuple(np.array(k) for k in zip(*of_each, strict=True))
                 leaf = leaf.at[index].set(values[np.array(own)])
             for k in {*range(len(rows))} - {*own}:
-                same = values[k] - self.columns[rows[k]].neutral
-                leaf = leaf + same if leaf.ndim else values[k]
+                column = self.columns[rows[k]]
+                same = values[k] - column.neutral
+                if column.among:
+                    leaf = leaf.at[tuple(np.array(column.among).T)].add(same)
+                else:
+                    leaf = leaf + same if leaf.ndim else values[k]
             changed[name] = leaf
         return self._none.replace(**changed)  # type: ignore[attr-defined]
+
+
+def _key(c: Column) -> object:
+    return c.field, c.index, c.among

@@ -129,7 +129,8 @@ def _within(a: Model, b: Model) -> bool:
 
 
 def simplest(models: Sequence[Model], base: Model) -> Model:
-    """The best of models sorted by loss, or a simpler one that is as good.
+    """The best of models sorted by loss, or a simpler one that is as good: with fewer
+    numbers, or with what like places have alike in place of what one has.
 
     One that the best contains as a special case comes first also where it is only
     nearly as good: the rest is asked for once other effects are in (`Selector.richer`).
@@ -140,11 +141,16 @@ def simplest(models: Sequence[Model], base: Model) -> Model:
             whole = base.loss.mean() - best.loss.mean()
             if base.loss.mean() - m.loss.mean() > _NEARLY * whole:
                 best = m
-        elif len(m.fit.active) < len(best.fit.active):
+        elif len(m.fit.active) < len(best.fit.active) or _tied(m) > _tied(best):
             close = m.loss.mean() < (1 + HELPS) * best.loss.mean()
             if close and advantage(best.loss, m.loss) < _AS_GOOD:
                 best = m
     return best
+
+
+def _tied(model: Model) -> int:
+    """Effects that like places have alike."""
+    return sum(bool(p.tied) for p in model.places)
 
 
 def probability(model: Model, rival: Model) -> float:

@@ -114,6 +114,7 @@ def _effects(o: Outcome) -> tuple[NamedEffect, ...]:
 
 def _effect(f: Found, gap: float) -> NamedEffect:
     parts = [(p.place.at, p.gap_after) for p in f.parts]
+    parts = parts or [(name, f.gap_after) for name in f.place.tied]
     at, gaps = zip(*(parts or [(f.place.at, f.gap_after)]), strict=True)
     columns = f.place.columns
     return NamedEffect(
@@ -129,6 +130,7 @@ def _effect(f: Found, gap: float) -> NamedEffect:
         std={columns[k].name: s for k, s in f.deviations.items()},
         shared=bool(f.parts),
         cost=f.cost,
+        pattern=f.place.at if f.place.tied else "",
     )
 
 

@@ -29,6 +29,8 @@ class Column:
         low, high: bounds.
         size: a small but visible change, for finite differences.
         of: what people are told is the value times this.
+        among: places in the field that all have it on top of their own; the empty
+            ``index`` of a column without them means all places.
     """
 
     field: str
@@ -40,11 +42,13 @@ class Column:
     high: float
     size: float
     of: float = 1.0
+    among: tuple[tuple[int, ...], ...] = ()
 
     @property
     def name(self) -> str:
         """In an effects file: ``com.0`` for one entry of a vector."""
-        entry = f".{self.index[-1]}" if self.field in VECTORS else ""
+        index = self.among[0] if self.among else self.index
+        entry = f".{index[-1]}" if self.field in VECTORS else ""
         return self.field + entry
 
 
@@ -55,12 +59,13 @@ class Place:
     Attributes:
         effect: its name.
         at: the joint, actuator, body or pair of geoms; "" for the whole model, or for
-            what all actuators have alike (`shared`).
+            what all actuators have alike (`shared`); a pattern of like places.
         kind: what ``at`` is.
         columns: its numbers.
         starts: values of the columns that a fit starts from, in turn.
         fitted: which columns a fit moves.
         rests: within what the second number over the first has to be.
+        tied: names of like places that have it alike; empty where it is at one place.
     """
 
     effect: str
@@ -70,6 +75,7 @@ class Place:
     starts: tuple[tuple[float, ...], ...]
     fitted: tuple[bool, ...] = field(default=())
     rests: tuple[float, float] = (-np.inf, np.inf)
+    tied: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.fitted:
@@ -120,6 +126,7 @@ def covered(place: Place, space: ParameterSpace, m: mujoco.MjModel) -> bool:
 def does(place: Place, address: str, m: mujoco.MjModel) -> bool:
     """Whether an address of the model's own parameters is what an effect changes."""
     return any(
-        place.row.refits == (kind, quantity) and place.at in ("", name_of(m, kind, i))
+        place.row.refits == (kind, quantity)
+        and (not place.at or name_of(m, kind, i) in (place.at, *place.tied))
         for kind, quantity, i in language.places(m, address)
     )

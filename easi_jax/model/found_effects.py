@@ -13,7 +13,6 @@ import numpy as np
 
 from easi_jax.errors import UserError
 from easi_jax.model import addresses as language
-from easi_jax.model.effect_catalog import SHARED
 from easi_jax.model.effect_numbers import EFFECT_TABLE, EffectEntry
 from easi_jax.model.parameters import Parameter, ParameterSpace
 
@@ -48,12 +47,11 @@ def joined(
 ) -> tuple[ParameterSpace, dict[str, float]]:
     """Parameters of a model with effects, and values that stay, by address.
 
-    A number of an effect becomes a parameter, named ``EFFECT@PLACE.NUMBER``. Delays and
-    lags that several actuators have alike, deviations included, are one parameter, for
-    they have one cause. A parameter's search
-    starts within three standard deviations of what was found, a tenth of the value at
-    least; its bounds are those of physics. Parameters of ``space`` whose own values
-    were refitted start about the new ones.
+    A number of an effect becomes a parameter, named ``EFFECT@PLACE.NUMBER``. What
+    several places have alike, deviations included, is one parameter, for it has one
+    cause. A parameter's search starts within three standard deviations of what was
+    found, a tenth of the value at least; its bounds are those of physics. Parameters of
+    ``space`` whose own values were refitted start about the new ones.
 
     Effects in the readings change no motion: they are left out here, and measured logs
     are mended by `easi_jax.data.cleaning.true_readings`.
@@ -79,12 +77,14 @@ def joined(
 
 
 def _alike(entries: Iterable[EffectEntry]) -> list[list[EffectEntry]]:
-    """Entries of one cause together, in the order of the first of each."""
+    """Entries of one cause together, in the order of the first of each: the same to the
+    last digit, at several places."""
     groups: dict[object, list[EffectEntry]] = {}
     for k, e in enumerate(entries):
         numbers = (*sorted(e.columns.items()), *sorted(e.std.items()))
-        tied = e.effect in SHARED and e.kind == "actuator"
-        groups.setdefault((e.effect, numbers) if tied else k, []).append(e)
+        cause = (e.effect, e.kind, numbers)
+        again = any(e.at == other.at for other in groups.get(cause, ()))
+        groups.setdefault(k if again or not e.std else cause, []).append(e)
     return [*groups.values()]
 
 

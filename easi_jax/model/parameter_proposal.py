@@ -8,7 +8,7 @@ drives or its weight can do, and from its inertia. What moves nothing is left ou
 
 import copy
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -146,8 +146,21 @@ def _tied(
             )
         except UserError:  # cannot vary here, or the model states no value
             continue
-    every = list(objects)
-    out, left = [], dict(traits)
+    out = []
+    for pattern, members in _groups(traits, list(objects), tie):
+        value, unit = traits[members[0]][:2]
+        made = _proposal(m, kind, quantity, pattern, members[0], value, unit)
+        if made is not None:
+            tied = tuple(members) if len(members) > 1 else ()
+            out.append(replace(made, tied=tied))
+    return out
+
+
+def _groups(
+    traits: Mapping[str, tuple[Any, ...]], every: list[str], tie: bool
+) -> Iterator[tuple[str, list[str]]]:
+    """Places of the same traits by a pattern that matches them alone, or one by one."""
+    left = dict(traits)
     for name in traits:
         if name not in left:
             continue
@@ -155,12 +168,30 @@ def _tied(
         members = language.matching(pattern, left)
         for member in members:
             del left[member]
-        value, unit = traits[name][:2]
-        made = _proposal(m, kind, quantity, pattern, name, value, unit)
-        if made is not None:
-            tied = tuple(members) if len(members) > 1 else ()
-            out.append(replace(made, tied=tied))
-    return out
+        yield pattern, members
+
+
+def like_places(m: mujoco.MjModel, kind: str) -> dict[str, tuple[str, ...]]:
+    """Groups of joints or actuators that are alike in type, depth in the tree and what
+    the model states, up to mirroring: names by the pattern of each group."""
+    objects = language.names(m, kind)
+    traits = {
+        name: (*_look(m, kind, i), *_stated(m, kind, i))
+        for name, i in objects.items()
+        if kind != "joint" or is_scalar(m, i)
+    }
+    groups = _groups(traits, list(objects), True)
+    return {k: tuple(members) for k, members in groups if len(members) > 1}
+
+
+def _stated(m: mujoco.MjModel, kind: str, i: int) -> tuple[float, ...]:
+    """Numbers of a joint or an actuator."""
+    if kind == "joint":
+        d = int(m.jnt_dofadr[i])
+        own = (m.dof_damping[d], m.dof_frictionloss[d], m.dof_armature[d])
+        return (*map(float, own), float(m.jnt_stiffness[i]))
+    gains = np.concatenate([m.actuator_gainprm[i, :3], m.actuator_biasprm[i, :3]])
+    return tuple(gains.tolist())
 
 
 def _look(m: mujoco.MjModel, kind: str, i: int) -> tuple[Any, ...]:

@@ -37,6 +37,7 @@ class NamedEffect:
         columns: values of fields of `easi_jax.model.effects.Effects`, by name.
         std: their standard deviations, where known.
         shared: whether it was found as one of all actuators.
+        pattern: of its places, where it was found as one of like places.
         cost: of taking it out, in cross-validated log density: nats for each
             independent number that was read; None where no prediction uses it.
     """
@@ -53,11 +54,13 @@ class NamedEffect:
     std: Mapping[str, float]
     shared: bool = False
     cost: float | None = None
+    pattern: str = ""
 
     @property
     def label(self) -> str:
-        """``effect@at``, or ``effect@all``."""
-        return f"{self.effect}@{'all' if self.shared else self.at[0]}"
+        """``effect@at``, ``effect@all``, or ``effect@PATTERN``."""
+        one = self.pattern or self.at[0]
+        return f"{self.effect}@{'all' if self.shared else one}"
 
     @property
     def gap_after(self) -> float:

@@ -1,6 +1,6 @@
 """What the gap workflow found, as ``gap.json`` and as a report for people."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from statistics import median
 from typing import Any
 
@@ -34,24 +34,7 @@ def gap_json(result: GapResult) -> dict[str, Any]:
         "schema": 1,
         "verdict": r.verdict,
         "effects": [
-            {
-                "effect": e.effect,
-                "at": at,
-                "kind": e.kind,
-                "parameters": {
-                    k: {"value": v, "std": s, "unit": u}
-                    for k, (v, s, u) in e.values.items()
-                },
-                "confidence": e.confidence,
-                "explains": r.share(before, gap),
-                "removal_cost": e.cost,
-                "indistinguishable": e.indistinguishable,
-                "gap_after": gap,
-            }
-            for e in (*r.effects, *r.readings)
-            for at, before, gap in zip(
-                e.at, (e.gap_before, *e.gaps), e.gaps, strict=False
-            )
+            told for e in (*r.effects, *r.readings) for told in _effect_json(r, e)
         ],
         "refitted": [
             {"address": p.address, "from": p.nominal, "to": p.value, "std": p.std}
@@ -89,6 +72,29 @@ def gap_json(result: GapResult) -> dict[str, Any]:
             "with": r.retrained.with_effects,
         }
     return out
+
+
+def _effect_json(r: GapResult, e: NamedEffect) -> Iterator[dict[str, Any]]:
+    """One entry, or one for each actuator that has alike what all may have."""
+    each = zip(e.at, (e.gap_before, *e.gaps), e.gaps, strict=False)
+    if e.pattern:
+        each = [(e.pattern, e.gap_before, e.gap_after)]
+    for at, before, gap in each:
+        yield {
+            "effect": e.effect,
+            "at": at,
+            **({"places": e.at} if e.pattern else {}),
+            "kind": e.kind,
+            "parameters": {
+                k: {"value": v, "std": s, "unit": u}
+                for k, (v, s, u) in e.values.items()
+            },
+            "confidence": e.confidence,
+            "explains": r.share(before, gap),
+            "removal_cost": e.cost,
+            "indistinguishable": e.indistinguishable,
+            "gap_after": gap,
+        }
 
 
 def gap_report(
@@ -176,6 +182,9 @@ def sentence(e: NamedEffect) -> str:
     if e.shared:
         words = words.replace('actuator "{at}"', "{at}")
         at = f"{len(e.at)} actuators alike ({', '.join(e.at)})"
+    elif e.pattern:
+        at = e.pattern
+        words += f" (alike at {', '.join(e.at)})"
     return words.format(at=at, kind=e.kind, pair=pair, **shown)
 
 
@@ -235,7 +244,7 @@ def effect_rows(r: GapResult, between: str, none: str) -> list[tuple[str, ...]]:
     return [
         (
             e.effect,
-            ", ".join(e.at) if any(e.at) else "whole model",
+            e.pattern or ", ".join(e.at) or "whole model",
             parameters_text(e.values, between),
             f"{e.confidence:.2f}",
             _change(e, none),

@@ -27,13 +27,19 @@ FEW = ("coulomb_friction", "viscous_damping", "armature", "joint_stiffness")
 
 def recorded(seed: int, more: str = "", rows: int = 300) -> Run:
     """A pendulum with what the owner's model has not."""
-    m = mujoco.MjModel.from_xml_string(MODEL.format(more=more))
+    return recorded_of(
+        mujoco.MjModel.from_xml_string(MODEL.format(more=more)), seed, rows
+    )
+
+
+def recorded_of(m: mujoco.MjModel, seed: int, rows: int = 100) -> Run:
+    """What hinges of a machine do under motors."""
     d, rng, time = mujoco.MjData(m), np.random.default_rng(seed), np.arange(rows) * DT
-    rate, phase = rng.uniform(2, 12, 5), rng.uniform(0, 6, 5)
-    ctrl = 0.5 * np.sin(np.outer(time, rate) + phase).sum(1)[:, None]
-    q = np.zeros((rows, 1))
+    rate, phase = rng.uniform(2, 12, (5, m.nu)), rng.uniform(0, 6, (5, m.nu))
+    ctrl = 0.5 * np.sin(time[:, None, None] * rate + phase).sum(1)
+    q = np.zeros((rows, m.nq))
     for i, u in enumerate(ctrl):
-        q[i], d.ctrl[:] = d.qpos + NOISE * rng.normal(), u
+        q[i], d.ctrl[:] = d.qpos + NOISE * rng.normal(size=m.nq), u
         mujoco.mj_step(m, d, 5)
     c = Configuration.of(m)
     v = fitted_velocity(q, DT, c)
