@@ -256,6 +256,51 @@ def _unnamed(r: Any) -> str:
     return ", ".join(missing) or "none"
 
 
+def _confidence(r: dict[str, Any]) -> list[str]:
+    """How often what was named is there, on machines the curve has not seen."""
+    families = {"all": "all", "known": "effects of the table"}
+    families |= {"mixed": "one of the table beside one that no table has"}
+    families |= {"unknown": "one that no table has, alone"}
+    lines = [
+        (
+            *(families[k], f["names"], f["there"], f"{f['mean confidence']:.2f}"),
+            *(f"{f['Brier score']:.3f}", f"{f['calibration error']:.3f}"),
+            f["wrong above 0.8"],
+        )
+        for k, f in r["families"].items()
+    ]
+    head = ("hidden", "named", "there", "mean confidence", "Brier", "calibration error")
+    return [
+        f"`python -m benchmarks.gap_confidence`: {r['config']['lines']} generated "
+        "machines of one or two joints, by seeds that the curve was not fitted to "
+        "(goals: Brier below 0.08; calibration error below 0.05, of each kind below "
+        "0.1; over at least 300 names).",
+        markdown_table((*head, "wrong above 0.8"), lines),
+    ]
+
+
+def _horizons(found: dict[str, Any]) -> list[str]:
+    """Names of real machines at several horizons of the report."""
+    lines = []
+    for machine, r in found.items():
+        for told in r["horizons"]:
+            names = [f"{e['effect']}@{e['at']}" for e in told["effects"]]
+            gap = told["gap"]
+            lines.append(
+                (
+                    *(machine.removeprefix("gap_horizons_"), f"{told['horizon']:g}"),
+                    *(", ".join(names), f"{gap['before']:.3g} to {gap['after']:.3g}"),
+                )
+            )
+    same = sum(r["same_names"] for r in found.values())
+    far = max(r["farthest_value"] for r in found.values())
+    return [
+        "`python -m benchmarks.gap_horizons`: the same names at all horizons on "
+        f"{same} of {len(found)} machines; values differ by {100 * far:.2g} % at most.",
+        markdown_table(("recordings", "horizon [s]", "named", "gap"), lines),
+    ]
+
+
 _FIRST = next(iter(HIDDEN))
 SECTIONS = (
     Section("## Hidden effects", "gap_cases.jsonl", "gap", _cases),
@@ -267,6 +312,18 @@ SECTIONS = (
     ),
     Section("", "gap_contacts.jsonl", "gap --effect contact_friction", _contacts),
     Section("", "gap_coarse.jsonl", "gap --coarse --cheap", _coarse, optional=True),
+    Section(
+        "### What a stated confidence is worth",
+        "gap_confidence.json",
+        "gap_confidence",
+        _confidence,
+    ),
+    Section(
+        "### Names at several horizons",
+        "gap_horizons_*.json",
+        "gap_horizons",
+        _horizons,
+    ),
     Section("## Effects in real recordings", "gap_real_*.json", "gap_real", _real),
     Section("## Time of train.gap", "gap_times.jsonl", "gap_times", _times),
     *(
