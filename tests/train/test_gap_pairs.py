@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from easi_jax.gap import analysis
+from easi_jax.gap import effect_search
 from easi_jax.gap.candidates import places
 from easi_jax.io.models.effects_file import read_effects
 from tests.commands import command, read
@@ -57,9 +57,10 @@ def write_log(path: Path, m: mujoco.MjModel, rows: int, seed: int) -> None:
 def only(monkeypatch: pytest.MonkeyPatch, *effects: str) -> None:
     """Few rivals: no others are tried."""
     monkeypatch.setattr(
-        *(analysis, "places"), lambda *a: [p for p in places(*a) if p.effect in effects]
+        *(effect_search, "places"),
+        lambda *a: [p for p in places(*a) if p.effect in effects],
     )
-    monkeypatch.setattr(analysis, "ripples", lambda *a: [])
+    monkeypatch.setattr(effect_search, "ripples", lambda *a: [])
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from easi_jax.gap import analysis
+from easi_jax.gap import effect_search
 from easi_jax.gap.candidates import places
 from tests.commands import command, read
 from train import gap
@@ -37,9 +37,10 @@ def test_friction_of_a_pendulum_that_nobody_drives(
 ) -> None:
     few = ("coulomb_friction", "stribeck_friction", "armature")
     monkeypatch.setattr(
-        *(analysis, "places"), lambda *a: [p for p in places(*a) if p.effect in few]
+        *(effect_search, "places"),
+        lambda *a: [p for p in places(*a) if p.effect in few],
     )
-    monkeypatch.setattr(analysis, "ripples", lambda *a: [])
+    monkeypatch.setattr(effect_search, "ripples", lambda *a: [])
     (tmp_path / "model.xml").write_text(XML)
     write_log(tmp_path / "log.csv")
     out = tmp_path / "out"

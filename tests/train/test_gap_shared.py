@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from easi_jax.gap import analysis
+from easi_jax.gap import effect_search
 from easi_jax.gap.candidates import places
 from easi_jax.io.models.effects_file import read_effects
 from tests.commands import command, read
@@ -69,9 +69,10 @@ def test_late_drives_are_named_one_by_one(
     if len(late) == len(NAMES):  # the slow ones have rivals
         few = (*few, "actuator_gain", "armature")
     monkeypatch.setattr(
-        *(analysis, "places"), lambda *a: [p for p in places(*a) if p.effect in few]
+        *(effect_search, "places"),
+        lambda *a: [p for p in places(*a) if p.effect in few],
     )
-    monkeypatch.setattr(analysis, "ripples", lambda *a: [])
+    monkeypatch.setattr(effect_search, "ripples", lambda *a: [])
     (tmp_path / "arm.xml").write_text(xml(len(late)))
     write_log(tmp_path / "log.csv", late)
     out = tmp_path / "out"
