@@ -28,6 +28,7 @@ import numpy as np
 from benchmarks._cells import Share, run_cells
 from benchmarks._common import RESULTS
 from benchmarks._page import Section, met, table
+from benchmarks.gap_score import keys_of
 from train._command import main
 
 RATES = (50, 100, 250, 500, 1000)  # Hz
@@ -271,7 +272,7 @@ def solve(case: Case) -> dict[str, Any]:
     return {
         "strength": size,
         "verdict": told["verdict"],
-        "named": [f"{e['effect']}@{e['at']}" for e in told["effects"]],
+        "named": keys_of(told["effects"]),
         "gap": told["gap"],
         "ratio": told["gap"]["after"] / told["gap"]["floor"],
         "refit_ratio": told["gap"]["refit"] / told["gap"]["floor"],

@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from benchmarks.gap_score import keys_of
 from train._command import main, say
 
 RESULTS = Path(__file__).parent / "results"
@@ -118,9 +119,9 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
     among the names that the held-out data do not tell from one of those.
     """
     known = [e for e in answer["effects"] if e["kind"] != "outside"]
-    truth = {f"{e['effect']}@{e['at']}": set(e["twins"]) for e in known}
+    truth = dict(zip(keys_of(known), (set(e["twins"]) for e in known), strict=True))
     outside = answer["kind"] == "outside"
-    named = [f"{e['effect']}@{e['at']}" for e in told["effects"]]
+    named = keys_of(told["effects"])
     first = named[: max(1, len(truth))]
     found = {
         key: any(n == key or n in twins for n in first) for key, twins in truth.items()

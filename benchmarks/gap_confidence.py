@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.gap_score import brier
 from train._command import main, say, show_table
 
 RESULTS = Path(__file__).parent / "results"
@@ -84,21 +85,15 @@ def figures(stated: np.ndarray, there: np.ndarray) -> dict[str, float]:
         "names": len(stated),
         "there": int(there.sum()),
         "mean confidence": float(stated.mean()),
-        "Brier score": float(np.mean((stated - there) ** 2)),
+        "Brier score": brier(list(zip(there, stated, strict=True))),
         "calibration error": off,
         "wrong above 0.8": int(((stated > _SURE) & ~there).sum()),
     }
 
 
-def curve(cost: np.ndarray, odds: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Confidence at parameters ``at (2,)``: logarithms of what is even, and how
-    steep."""
-    even, steep = np.exp(at)
-    return 1.0 / (1.0 + (even / np.maximum(cost, 1e-6)) ** steep) / (1.0 + odds)
-
-
 def fitted(part: Said) -> np.ndarray:
-    """Parameters of `curve` that make what was the case most likely, ``(2,)``."""
+    """Logarithms of the curve's two numbers that make what was the case most likely,
+    ``(2,)``."""
     from scipy.optimize import minimize
 
     from easi_jax.gap.model_comparison import confidence
@@ -107,7 +102,9 @@ def fitted(part: Said) -> np.ndarray:
     odds = np.maximum(alone / np.maximum(part.confidence, 1e-9) - 1.0, 0.0)
 
     def unlikely(at: np.ndarray) -> float:
-        p = np.clip(curve(part.cost, odds, at), 1e-3, 1 - 1e-3)
+        each = zip(part.cost, odds, strict=True)
+        p = np.array([confidence(c, o, *np.exp(at)) for c, o in each])
+        p = np.clip(p, 1e-3, 1 - 1e-3)
         return -float(np.sum(np.where(part.there, np.log(p), np.log(1 - p))))
 
     return minimize(unlikely, np.zeros(2), method="Nelder-Mead").x

@@ -11,7 +11,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from benchmarks.gap_real import MACHINES, Simulator
+from benchmarks.gap_real import MACHINES, Simulator, analysed, check
+from benchmarks.gap_score import keys_of
 from train._command import main, say, show_table
 
 DOUBLE = Simulator(
@@ -47,14 +48,8 @@ class Config:
 def run(config: Config) -> None:
     """Asks, compares and writes, machine by machine."""
     from benchmarks._common import command_of, write_result
-    from benchmarks.gap_real import analysed
-    from easi_jax.errors import UserError, nearest
 
-    for name in config.machines:
-        if name not in MADE:
-            raise UserError(f'unknown machine "{name}"{nearest(name, MADE)}')
-        if not (config.data / MADE[name].folder / "model.xml").is_file():
-            raise UserError(f"{config.data} does not hold the recordings; give --data")
+    check(config.machines, MADE, config.data)
     for name in config.machines:
         found = []
         for horizon in config.horizons:
@@ -62,13 +57,14 @@ def run(config: Config) -> None:
             with tempfile.TemporaryDirectory() as folder:
                 told = analysed(machine, config.data, Path(folder) / "gap")
             found.append({"horizon": horizon, **told})
-            say(f"{name}, {horizon:g} s: {', '.join(names(told)) or 'nothing'}")
+            named = ", ".join(keys_of(told["effects"])) or "nothing"
+            say(f"{name}, {horizon:g} s: {named}")
         chosen = dataclasses.replace(config, machines=(name,))
         path = write_result(
             f"gap_horizons_{name}",
             command_of("benchmarks.gap_horizons", chosen),
             {"machine": name, "folder": MADE[name].folder},
-            same_names=len({tuple(sorted(names(f))) for f in found}) == 1,
+            same_names=len({tuple(sorted(keys_of(f["effects"]))) for f in found}) == 1,
             farthest_value=farthest(found),
             horizons=found,
         )
@@ -76,27 +72,27 @@ def run(config: Config) -> None:
         say(f"written: {path}")
 
 
-def names(told: dict[str, Any]) -> list[str]:
-    """``effect@at`` of all that was named."""
-    return [f"{e['effect']}@{e['at']}" for e in told["effects"]]
-
-
 def farthest(found: list[dict[str, Any]]) -> float:
     """The largest relative difference of a value from that at the first horizon, of
     effects that both name."""
-    first = {
-        (f"{e['effect']}@{e['at']}", k): p["value"]
-        for e in found[0]["effects"]
+    first, *others = map(_values, found)
+    off = [
+        abs(value / first[key] - 1.0)
+        for values in others
+        for key, value in values.items()
+        if first.get(key)
+    ]
+    return max(off, default=0.0)
+
+
+def _values(told: dict[str, Any]) -> dict[tuple[str, str], float]:
+    """Of each parameter of each effect."""
+    keys = keys_of(told["effects"])
+    return {
+        (key, k): p["value"]
+        for key, e in zip(keys, told["effects"], strict=True)
         for k, p in e["parameters"].items()
     }
-    off = [0.0]
-    for told in found[1:]:
-        for e in told["effects"]:
-            for k, p in e["parameters"].items():
-                before = first.get((f"{e['effect']}@{e['at']}", k))
-                if before:
-                    off.append(abs(p["value"] / before - 1.0))
-    return max(off)
 
 
 def table(found: list[dict[str, Any]]) -> list[tuple[str, ...]]:
@@ -106,7 +102,12 @@ def table(found: list[dict[str, Any]]) -> list[tuple[str, ...]]:
         gap = told["gap"]
         figures = f"{gap['before']:.3g} to {gap['after']:.3g}, floor {gap['floor']:.2g}"
         rows.append(
-            (f"{told['horizon']:g}", told["verdict"], figures, ", ".join(names(told)))
+            (
+                f"{told['horizon']:g}",
+                told["verdict"],
+                figures,
+                ", ".join(keys_of(told["effects"])),
+            )
         )
     return rows
 

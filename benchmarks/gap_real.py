@@ -8,10 +8,11 @@ Recordings under ``held_out`` take part in no fit.
 
 import dataclasses
 import json
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.gap_score import is_among
+from benchmarks.gap_score import is_among, keys_of
 from train._command import main, say, show_table
 
 
@@ -91,16 +92,22 @@ class Config:
     """Folder of the runs."""
 
 
+def check(names: Iterable[str], known: Mapping[str, Simulator], data: Path) -> None:
+    """UserError for machines that are not known, or have no recordings in ``data``."""
+    from easi_jax.errors import UserError, nearest
+
+    for name in names:
+        if name not in known:
+            raise UserError(f'unknown machine "{name}"{nearest(name, known)}')
+        if not (data / known[name].folder / "model.xml").is_file():
+            raise UserError(f"{data} does not hold the recordings; give --data")
+
+
 def run(config: Config) -> None:
     """Analyses each, and writes what was found."""
     from benchmarks._common import command_of, write_result
-    from easi_jax.errors import UserError, nearest
 
-    for name in config.machines:
-        if name not in MACHINES:
-            raise UserError(f'unknown machine "{name}"{nearest(name, MACHINES)}')
-        if not (config.data / MACHINES[name].folder / "model.xml").is_file():
-            raise UserError(f"{config.data} does not hold the recordings; give --data")
+    check(config.machines, MACHINES, config.data)
     for name in config.machines:
         chosen = dataclasses.replace(config, machines=(name,))
         told = analysed(MACHINES[name], config.data, config.out / name)
@@ -140,7 +147,7 @@ def analysed(machine: Simulator, data: Path, out: Path) -> dict[str, Any]:
     )
     told = json.loads((out / "gap.json").read_text())
     effects = told["effects"]
-    names = {f"{e['effect']}@{e['at']}" for e in effects}
+    names = set(keys_of(effects))
     return {
         "found": {e: is_among(e, names) for e in machine.expected},
         "wrongly_named": [e["effect"] for e in effects if e["effect"] in machine.never],

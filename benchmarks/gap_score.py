@@ -1,6 +1,6 @@
 """How often train.gap is right, counted over the cases of ``benchmarks.gap``."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from math import hypot, sqrt
 from typing import Any
 
@@ -16,6 +16,11 @@ RATIO_GOAL = 1.2  # median gap after, in floors
 _VECTORS = (("x", "y", "z"), ("roll", "pitch"))
 _SURE = 0.8
 _BINS = 5
+
+
+def keys_of(effects: Iterable[Mapping[str, Any]]) -> list[str]:
+    """``EFFECT@PLACE`` of each effect of a ``gap.json`` or an answer."""
+    return [f"{e['effect']}@{e['at']}" for e in effects]
 
 
 def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:

@@ -19,6 +19,7 @@ from benchmarks.gap_score import (
     confusion,
     is_among,
     judged,
+    keys_of,
     parameter_errors,
     ratios,
     shares,
@@ -179,7 +180,7 @@ def _loop(robot: str, found: dict[str, Any]) -> list[str]:
     """Returns in a target with a hidden effect, before and after it is found."""
     lines = []
     for effect, r in found.items():
-        named = ", ".join(f"{e['effect']}@{e['at']}" for e in r["found"]["effects"])
+        named = ", ".join(keys_of(r["found"]["effects"]))
         each = [[*v.values()] for v in r["returns"].values()]
         lines.append((effect, named, *map(_mean_and_all, each)))
     methods = list(r["returns"])
@@ -220,7 +221,7 @@ def _real(found: dict[str, Any]) -> list[str]:
     columns = {
         "recordings": "{name}",
         "named (confidence)": lambda r: _sure(
-            [f"{e['effect']}@{e['at']}" for e in r["effects"]],
+            keys_of(r["effects"]),
             [e["confidence"] for e in r["effects"]],
         ),
         "expected but not named": _unnamed,
@@ -284,7 +285,7 @@ def _horizons(found: dict[str, Any]) -> list[str]:
     lines = []
     for machine, r in found.items():
         for told in r["horizons"]:
-            names = [f"{e['effect']}@{e['at']}" for e in told["effects"]]
+            names = keys_of(told["effects"])
             gap = told["gap"]
             lines.append(
                 (

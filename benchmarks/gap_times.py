@@ -16,6 +16,7 @@ from typing import Any
 
 from benchmarks._cells import Share, run_cells
 from benchmarks._common import RESULTS, first_start
+from benchmarks.gap_score import keys_of
 from train._command import main
 
 GOALS = {"pendulum": 90, "cartpole": 180, "leg": 300, "arm6": 600}  # s, on two cores
@@ -71,8 +72,8 @@ def solve(cell: Cell) -> dict[str, Any]:
         seconds, told = timed(case, Path(folder))
         answer = json.loads((case / "answer.json").read_text())
     return {
-        "truth": [f"{e['effect']}@{e['at']}" for e in answer["effects"]],
-        "named": [f"{e['effect']}@{e['at']}" for e in told["effects"]],
+        "truth": keys_of(answer["effects"]),
+        "named": keys_of(told["effects"]),
         "seconds": seconds,
         "goal_s": GOALS[cell.mechanism],
         "cores": len(os.sched_getaffinity(0)),

@@ -84,11 +84,12 @@ class Analysis:
                 f"{lead_rows(dt) * dt:.3g} s before it: record more, or shorten "
                 "--horizon"
             )
+        seen = filled(reported)
         self.predictor = Predictor(
             mj_model,
             space,
             layout,
-            join([filled(reported), kept]),
+            join([seen, kept]),
             dt,
             fixed,
             Logged.of(runs),
@@ -114,7 +115,7 @@ class Analysis:
             (k for k, f in enumerate(lengths) if f.steps <= middle), default=0
         )
         self.search = EffectSearch(lengths, settles, self.places, tell)
-        self.held_out = self._held_out(kept, len(filled(reported)) // BLOCK)
+        self.held_out = self._held_out(kept, len(seen) // BLOCK)
 
     def _fitting(self, predictor: Predictor, windows: WindowSet, steps: int) -> Fitting:
         own, given = range(self.space.size), (self.data, predictor, windows, steps)
