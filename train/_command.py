@@ -122,7 +122,7 @@ def _engine(config: Any) -> Iterator[None]:
     if not isinstance(config, EngineOptions):
         yield
         return
-    from easi_jax.errors import UserError
+    from easi_jax.errors import EngineError, UserError
     from easi_jax.io.runs.folder import engine_of
     from easi_jax.simulation import engine
 
@@ -131,7 +131,7 @@ def _engine(config: Any) -> Iterator[None]:
     try:
         with engine.using(kept[0] if kept else config.engine, say):
             yield
-    except engine.EngineError as error:
+    except EngineError as error:
         left = _left(out, hasattr(config, "resume"))
         raise UserError(f"{error}{left}") from error
 

@@ -48,6 +48,7 @@ def run_stage(
 
     from easi_jax.devices import distributed
     from easi_jax.devices.mesh import placed
+    from easi_jax.errors import engine_calls
     from easi_jax.io.runs import checkpoints
 
     folder = run.checkpoints / name
@@ -72,6 +73,7 @@ def run_stage(
             seconds = None
             state = placed(state)
             info = jax.device_get(distributed.local(info))
+            engine_calls.check()
             if check is not None:
                 check(done, info)
             lines = rows(done, info)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from easi_jax.devices import distributed
-from easi_jax.errors import UserError
+from easi_jax.errors import UserError, engine_calls
 
 _NON_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 
@@ -46,7 +46,10 @@ def atomic_write(path: Path, data: str | bytes) -> None:
 
     Raises:
         UserError: the file cannot be written; what was there before is kept.
+        EngineError: a simulation failed, so that what would be written is worth
+            nothing.
     """
+    engine_calls.check()
     if not distributed.leader():
         return
     # Half of a surrogate pair, as a file's name may hold, is no UTF-8.

@@ -11,17 +11,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
-import jax
 import mujoco
 import numpy as np
 
 from easi_jax.devices.runtime import on_cpu
-from easi_jax.errors import UserError, nearest
+from easi_jax.errors import UserError, engine_calls, nearest
 from easi_jax.model.contact_pairs import Pair
 from easi_jax.simulation.compile_time import expected_of, size_of
 from easi_jax.simulation.guard import Deviation, compare, random_states
 from easi_jax.simulation.logged import Logged
-from easi_jax.simulation.native import failures
 
 Engine = Literal["mjx", "mujoco"]
 CHOICES = ("auto", "mjx", "mujoco")
@@ -34,10 +32,6 @@ CHOICES = ("auto", "mjx", "mujoco")
 # second on MJX; Ballbalance 56 and 0.6 s, 0.5 times; Go2 59 and 0.6 s, 0.6 times. Only
 # with a policy is Ant quicker on MJX, 1.3 times once it is compiled.
 LONGEST = 11.0
-
-
-class EngineError(UserError):
-    """Native MuJoCo could not go on with a simulation."""
 
 
 @dataclass
@@ -89,18 +83,18 @@ def using(name: str, tell: Callable[[str], None] | None = None) -> Iterator[None
             f'engine "{name}": give one of {", ".join(CHOICES)}{nearest(name, CHOICES)}'
         )
     _stack.append(_Choice(name, tell))
-    failures.clear()
+    engine_calls.watched = True
     try:
         yield
-    except jax.errors.JaxRuntimeError as error:  # in which jax wraps it as a text
-        if not failures:
-            raise
-        what = failures[0]
-        raise EngineError(
-            f"the engine mujoco failed in a simulation: {type(what).__name__}: {what}"
-        ) from error
+        engine_calls.check()
+    except Exception:  # may well come from the numbers that are missing
+        engine_calls.check()
+        raise
     finally:
         _stack.pop()
+        if len(_stack) == 1:
+            engine_calls.failures.clear()
+            engine_calls.watched = False
 
 
 @contextlib.contextmanager

@@ -21,6 +21,7 @@ from jax.experimental.buffer_callback import buffer_callback
 from mujoco import batch as mujoco_batch
 
 from easi_jax.devices.runtime import cores
+from easi_jax.errors import engine_calls
 from easi_jax.model.contact_pairs import pair_ids
 from easi_jax.model.native_model import NativeModel, Template, nominal_field
 from easi_jax.model.quantities import direct_solref
@@ -35,8 +36,6 @@ _REST = (
     mujoco.mjtState.mjSTATE_PLUGIN,
     mujoco.mjtState.mjSTATE_PLASTIC,
 )
-# What calls have raised, which jax passes on as a text only.
-failures: list[Exception] = []
 _KEPT = 8  # batches kept for each model: chunks of a few sizes, on each device
 _KEPT_BYTES = 2**28  # of the models of one batch, beside the batch's own
 _RECORDED = 2**25  # numbers recorded at once, 256 MB
@@ -540,18 +539,41 @@ class _Call:
             values: fields of the model.
             given: the others, those of `_OWN`.
         """
-        try:
-            return self._called(self._numbers(values), self._numbers(given))
-        except Exception as error:
-            failures.append(error)
-            raise
+        args = self._numbers(values), self._numbers(given)
+        if not engine_calls.failures:
+            try:
+                return self._called(*args)
+            except Exception as error:
+                if not engine_calls.watched:
+                    raise
+                engine_calls.failures.append(error)
+        return self._missing(*args)
+
+    def _lead(
+        self, values: dict[str, np.ndarray], given: dict[str, np.ndarray]
+    ) -> tuple[tuple[int, ...], dict[str, int]]:
+        """Axes of the batch, and those that each field has of its own."""
+        mj = self.template.mj
+        fields = {name: np.ndim(nominal_field(mj, name)) for name in values}
+        return _together({**values, **given}, {**fields, **_OWN}), fields
+
+    def _missing(
+        self, values: dict[str, np.ndarray], given: dict[str, np.ndarray]
+    ) -> tuple[np.ndarray, ...]:
+        """Results of a call that failed: no numbers."""
+        lead, _ = self._lead(values, given)
+        filled = (
+            np.nan if np.issubdtype(x.dtype, np.floating) else 0 for x in self.out
+        )
+        return tuple(
+            _crossing(np.full((*lead, *x.shape), value, x.dtype), x)
+            for x, value in zip(self.out, filled, strict=True)
+        )
 
     def _called(
         self, values: dict[str, np.ndarray], given: dict[str, np.ndarray]
     ) -> tuple[np.ndarray, ...]:
-        mj = self.template.mj
-        fields = {name: np.ndim(nominal_field(mj, name)) for name in values}
-        lead = _together({**values, **given}, {**fields, **_OWN})
+        lead, fields = self._lead(values, given)
         of_models = _together(values, fields)
         of_models = (1,) * (len(lead) - len(of_models)) + of_models
         number = np.arange(int(np.prod(of_models, dtype=int))).reshape(of_models)

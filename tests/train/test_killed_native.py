@@ -110,6 +110,7 @@ def _kill_in_search(whole: Path, copy: Path) -> None:
 
 
 @pytest.mark.fault("an engine that fails in a run")
+@pytest.mark.timeout(600, method="thread")  # a wait inside a program takes no signal
 def test_search_of_logs_in_which_the_engine_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from easi_jax.devices import distributed
-from easi_jax.errors import UserError
+from easi_jax.errors import UserError, engine_calls
 from easi_jax.io.files import os_reason, read_json, to_json
 
 FORMAT = 1
@@ -66,12 +66,14 @@ def save(folder: Path, step: int, state: Any, *, config_hash: str) -> Path:
 
     Raises:
         UserError: it cannot be written; the earlier ones are as they were.
+        EngineError: a simulation failed, so that the state is worth nothing.
     """
     final = _named(folder, step)
     raw = distributed.local(_raw_keys(state))
     if not distributed.leader():
         return final
     names, leaves = _named_leaves(jax.device_get(raw))
+    engine_calls.check()
     types = _leaf_types(state)
     kinds = jax.tree.leaves(jax.eval_shape(lambda: _raw_keys(state)))
     arrays = {

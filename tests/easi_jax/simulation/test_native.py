@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from easi_jax.data.segments import Segments
-from easi_jax.errors import UserError
+from easi_jax.errors import EngineError, UserError
+from easi_jax.io.files import atomic_write
 from easi_jax.io.runs.folder import RunFolder, engine_of
 from easi_jax.model.addresses import describe, split
 from easi_jax.model.contact_pairs import pair_ids
@@ -440,14 +441,40 @@ class _Failing:
 def test_a_call_that_fails_is_one_line() -> None:
     m = _model()
     line = "the engine mujoco failed in a simulation: MemoryError: no room for\n 300"
-    with pytest.raises(engine.EngineError, match=line), engine.using("mujoco"):
+    with pytest.raises(EngineError, match=line), engine.using("mujoco"):
         simulator = Simulator(m, ParameterSpace(()), 0.02)
         model, state = simulator.base.mjx, simulator.start(*jnp.zeros((2, 2)))
         run = jax.jit(lambda u: native.run(model, state, u, read=_Failing())[2])
         jax.block_until_ready(run(jnp.zeros((1, 2))))
-    # What fails next is not taken for it.
+    # What fails next is not taken for it, and where nobody asks it is raised.
     with pytest.raises(jax.errors.JaxRuntimeError), engine.using("mujoco"):
         raise jax.errors.JaxRuntimeError("something else")
+    raised = jax.errors.JaxRuntimeError, ValueError  # by another thread or our own
+    with pytest.raises(raised, match="MemoryError"):
+        jax.block_until_ready(run(jnp.zeros((1, 2))))
+
+
+def test_after_a_call_that_failed_nothing_is_written(tmp_path: Path) -> None:
+    """Results are no numbers, at once and on every device; only a file would show
+    them."""
+    m = _model()
+    with pytest.raises(EngineError, match="300"), engine.using("mujoco"):
+        simulator = Simulator(m, ParameterSpace(()), 0.02)
+        model, state = simulator.base.mjx, simulator.start(*jnp.zeros((2, 2)))
+
+        def run(u: jax.Array) -> jax.Array:
+            physics, _, seen = native.run(model, state, u, read=_Failing())
+            return seen + physics[0].sum()
+
+        assert jax.local_device_count() > 1
+        mesh = jax.make_mesh((2,), ("seed",), axis_types=(jax.sharding.AxisType.Auto,))
+        spread = jax.NamedSharding(mesh, jax.P("seed"))
+        given = jax.device_put(jnp.zeros((2, 1, 2)), spread)
+        got = jax.jit(lambda u: jax.vmap(run)(u).sum())(given)
+        assert np.isnan(jax.device_get(got))
+        with pytest.raises(EngineError):
+            atomic_write(tmp_path / "result.json", "NaN")
+        assert not list(tmp_path.iterdir())
 
 
 def test_outside_of_a_choice_auto_chooses_and_says() -> None:
