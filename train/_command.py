@@ -140,19 +140,15 @@ def _engine(config: Any) -> Iterator[None]:
 def _warnings_told() -> Iterator[None]:
     """Says at the end, each once, what MuJoCo warned of, which it writes on standard
     error and to a file in the working folder otherwise. Its threads may warn, too."""
-    import mujoco
+    from easi_jax.model.mujoco_warnings import warnings_to
 
     warned = Counter[str]()
 
     def count(text: str) -> None:
         warned[_PLACE.sub("", text)] += 1
 
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(count)
-    try:
+    with warnings_to(count):
         yield
-    finally:
-        mujoco.set_mju_user_warning(before)
     for text, times in warned.items():
         say(f"note: MuJoCo warned, {times} times in all: {text}")
 

@@ -16,6 +16,7 @@ from easi_jax.devices.runtime import cores
 from easi_jax.errors import UserError
 from easi_jax.model.distribution import gaussian
 from easi_jax.model.joint_space import Configuration
+from easi_jax.model.mujoco_warnings import warnings_to
 from easi_jax.simulation.mujoco_c import InMujoco
 
 _TRIALS = 8  # simulations of a step's length, on average, that the budget allows for
@@ -93,8 +94,7 @@ class MujocoSysid:
             name = task.space.names[i]
             parameters.add(sysid.Parameter(name, start[i], low[i], high[i]))
         # One that goes astray is seen in the residual; MuJoCo need not tell of it.
-        mujoco.set_mju_user_warning(lambda _: None)
-        try:
+        with warnings_to():
             found, result = sysid.optimize(
                 parameters,
                 residual,
@@ -104,8 +104,6 @@ class MujocoSysid:
             )
             solution = found.as_vector()
             last = residual(solution, found)[0]
-        finally:
-            mujoco.set_mju_user_warning(None)
         own, _ = sysid.calculate_intervals(last, result.jac)
         mean, cov = start.copy(), np.diag(np.asarray(task.start_std, float) ** 2)
         mean[free] = solution

@@ -10,6 +10,7 @@ import numpy as np
 from easi_jax.data.recording import physics_steps
 from easi_jax.excite.drives import Feedback, Limits, driven
 from easi_jax.model.joint_space import scalar_dofs
+from easi_jax.model.mujoco_warnings import warnings_to
 
 _WRONG = 0.2  # by how much mass and friction may be wrong
 _ROUNDS = 30
@@ -89,23 +90,22 @@ def play(
     d.qpos[:] = start
     end = rows
     # One that goes astray is found below; MuJoCo need not tell of it.
-    mujoco.set_mju_user_warning(lambda _: None)
-    for t in range(rows):
-        qpos[t], qvel[t] = d.qpos, d.qvel
-        lost = reach is not None and bool(
-            (np.abs(d.qpos[q_at] - start[q_at]) > reach).any()
-        )
-        if lost or d.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
-            end = t
-            break
-        u = ctrl[t]
-        if feedback is not None:
-            u = u + feedback.command(d.qpos, d.qvel)
-        sent[t] = u
-        d.ctrl[:] = u
-        mujoco.mj_step(m, d, substeps)
-        force[t] = d.actuator_force
-    mujoco.set_mju_user_warning(None)
+    with warnings_to():
+        for t in range(rows):
+            qpos[t], qvel[t] = d.qpos, d.qvel
+            lost = reach is not None and bool(
+                (np.abs(d.qpos[q_at] - start[q_at]) > reach).any()
+            )
+            if lost or d.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
+                end = t
+                break
+            u = ctrl[t]
+            if feedback is not None:
+                u = u + feedback.command(d.qpos, d.qvel)
+            sent[t] = u
+            d.ctrl[:] = u
+            mujoco.mj_step(m, d, substeps)
+            force[t] = d.actuator_force
     m.opt.timestep = old
     return Motion(qpos[:end], qvel[:end], sent[:end], force[:end])
 

@@ -16,6 +16,7 @@ from easi_jax.data.recording import physics_steps
 from easi_jax.gap.table import Place
 from easi_jax.gap.window_set import WindowSet
 from easi_jax.model.joint_space import Configuration
+from easi_jax.model.mujoco_warnings import warnings_to
 
 _FINER = 8
 _OWN_SHIFT = 0.75  # of a physics step
@@ -42,16 +43,13 @@ def error_of_steps(
     state[:, 1 + m.nq + m.nv : 1 + m.nq + m.nv + m.na] = windows.start_act
     configuration, paths = Configuration.of(m), []
     # What explodes is left out below; MuJoCo would write a file about it.
-    mujoco.set_mju_user_warning(lambda _: None)
-    try:
+    with warnings_to():
         for fine in (_FINER * parts, parts):
             m.opt.timestep = dt / fine
             ctrl = np.repeat(windows.ctrl, fine, axis=1)
             states, _ = rollout.rollout(m, mujoco.MjData(m), state, ctrl)
             qpos = states[:, fine - 1 :: fine, 1 : 1 + m.nq]
             paths.append(configuration.difference(windows.start_qpos[:, None], qpos))
-    finally:
-        mujoco.set_mju_user_warning(None)
     out = np.pad(paths[1] - paths[0], [(0, 0), (1, 0), (0, 0)])
     return np.where(np.isfinite(out).all((1, 2), keepdims=True), out, 0.0)
 

@@ -26,6 +26,7 @@ from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.table import Place
 from easi_jax.gap.whitening import Residuals
 from easi_jax.io.runs.step_cache import Arrays, Journal
+from easi_jax.model.mujoco_warnings import warnings_to
 from easi_jax.progress import Progress, silent
 
 _SHORTLIST = 7  # names that are fitted in full at each stage
@@ -116,7 +117,9 @@ class Selector:
         """Whitened errors ``(B, W, m)`` of vectors ``(B, n)``; ``some`` as in
         `errors`."""
         at = None if some is None else self.windows_of(some)
-        grouped = self.residuals.grouped(self.errors(x, some))
+        with warnings_to():  # what a trial does to MuJoCo is nobody's fault
+            errors = self.errors(x, some)
+        grouped = self.residuals.grouped(errors)
         return self.residuals.whitened(grouped, at)
 
     def columns(self, place: Place, fitted: bool = True) -> np.ndarray:

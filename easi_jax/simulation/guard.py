@@ -6,7 +6,6 @@ that make the model's constraints act. Where the velocities differ, the terms of
 step (forces, activations, rows of constraints) are compared to say what differs.
 """
 
-import contextlib
 import copy
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -23,6 +22,7 @@ from easi_jax.errors import UserError
 from easi_jax.model.contact_pairs import Pair
 from easi_jax.model.mjx_data import make_data
 from easi_jax.model.mjx_model import put_model
+from easi_jax.model.mujoco_warnings import warnings_to
 from easi_jax.simulation.step import WRITTEN_OUT, mjx_step
 
 # Share of a step's velocity change. What MJX computes as MuJoCo does agrees to 1e-12,
@@ -126,7 +126,7 @@ def compare(
     errors = _errors(m, states, ours, theirs)
     if max(errors) <= TOLERANCE:
         return found(errors)
-    with _quiet():
+    with warnings_to():
         without = _without(m, states, ours, max(errors))
     causes = [without] if without else _causes(m, states, ours, theirs)
     return found(errors, causes)
@@ -158,7 +158,7 @@ def random_states(
         d.act[:] = rng.uniform(0.05, 0.95, m.na)
         ctrl = rng.uniform(low, high) if m.nu else np.zeros(0)
         d.ctrl[:] = ctrl
-        with _quiet():
+        with warnings_to():
             for _ in range(int(rng.integers(_SIMULATED)) if i % 4 else 0):
                 mujoco.mj_step(m, d)
         row = (d.qpos.copy(), d.qvel.copy(), d.act.copy(), ctrl)
@@ -448,18 +448,6 @@ def _errors(
         if largest:
             force = max(force, float(np.abs(mine - other).max() / largest))
     return error, force
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """MuJoCo's warnings are neither shown nor written: a random state may be wild, and
-    a model without a part of it none that one would simulate."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda _: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
 
 
 def _without(

@@ -15,6 +15,7 @@ from easi_jax.errors import UserError
 from easi_jax.io.files import os_reason, regular_file
 from easi_jax.io.models.completed import as_read, held_joint, hold, names_note
 from easi_jax.model.mjx_model import put_model, simulated
+from easi_jax.model.mujoco_warnings import warnings_to
 from easi_jax.simulation import engine
 
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
@@ -92,14 +93,9 @@ def mujoco_warnings() -> Iterator[list[str]]:
     """Collects what MuJoCo warns of, which otherwise goes to a file in the working
     folder."""
     said: list[str] = []
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(said.append)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield said
-    finally:
-        mujoco.set_mju_user_warning(before)
+    with warnings_to(said.append), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield said
 
 
 def check_assets(path: Path, allowed: Sequence[Path] = ()) -> None:
