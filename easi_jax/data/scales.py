@@ -24,9 +24,8 @@ def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
     d = mujoco.MjData(m)
     total = sum(len(r) for r in runs)
     stride = max(1, total // _ROWS)
-    rows: dict[str, list[np.ndarray]] = {
-        k: [] for k in ("v", "a", "torque", "force", "inertia", "ctrl", "q", "touching")
-    }
+    names = "v", "a", "torque", "force", "inertia", "alone", "ctrl", "q", "touching"
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
     full, pairs = np.zeros((m.nv, m.nv)), pair_ids(m)
     for run in runs:
         v = fitted_velocity(run.qpos, run.dt, run.configuration)
@@ -48,6 +47,7 @@ def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
             rows["torque"].append(np.hypot(d.qfrc_inverse, driven))
             rows["force"].append(force)
             rows["inertia"].append(np.diag(full).copy())
+            rows["alone"].append(1.0 / np.diag(np.linalg.pinv(full)))
             rows["v"].append(v[i])
             rows["a"].append(acceleration)
             rows["ctrl"].append(run.ctrl[i])
@@ -78,6 +78,7 @@ def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
         torque=np.maximum(torque, 1e-9),
         most=np.abs(got["torque"]).max(0),
         inertia=inertia,
+        alone=got["alone"].min(0),
         command=np.maximum(rms(got["ctrl"]), 1e-9) if m.nu else np.zeros(0),
         force=np.maximum(rms(got["force"]), 1e-9) if m.nu else np.zeros(0),
         peak=np.percentile(np.abs(forces), _PEAK, axis=0) if m.nu else np.zeros(0),

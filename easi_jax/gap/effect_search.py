@@ -16,8 +16,8 @@ from easi_jax.gap.candidates import places, ripples
 from easi_jax.gap.discretization_error import within_a_step
 from easi_jax.gap.effect_set import Candidate, Model, keys, last
 from easi_jax.gap.fitting import Fitting
-from easi_jax.gap.forward_selection import shortlist
 from easi_jax.gap.model_comparison import HELPS, better, probability, rank, simplest
+from easi_jax.gap.screening import expanded, screened, shortlist
 from easi_jax.gap.table import Place, covered, does
 from easi_jax.model.effect_catalog import Scales
 from easi_jax.model.joint_space import is_hinge, scalar_dofs
@@ -189,7 +189,7 @@ class EffectSearch:
                     for c in self.offered.candidates(parent.places)
                     if not likely or c.place.key in likely
                 ]
-                models, names = chosen.expanded(parent, more)
+                models, names = expanded(chosen, parent, more)
                 likely = likely or {*names[:most], *(p.key for p in model.places)}
                 for m in models:
                     key = keys(m)
@@ -222,7 +222,7 @@ class EffectSearch:
         without = self.at.without(model, [place])
         others = self.offered.candidates(model.places)
         others = [c for c in others if c.place.key != place.key]
-        short = shortlist(chosen.screened(without, others))
+        short = shortlist(screened(chosen, without, others))
         out = chosen.fitted(without.places, without.fit.x, short)
         return sorted(out, key=lambda m: m.loss.mean())
 

@@ -15,13 +15,12 @@ from easi_jax.gap.batched_least_squares import (
     Asks,
     Bounds,
     Fitted,
-    difference,
     least_squares,
     lockstep,
 )
 from easi_jax.gap.effect_set import Candidate, Model
 from easi_jax.gap.gap_metric import finite
-from easi_jax.gap.model_comparison import better, contains, rank
+from easi_jax.gap.model_comparison import better, contains
 from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.table import Place
 from easi_jax.gap.whitening import Residuals
@@ -29,11 +28,6 @@ from easi_jax.io.runs.step_cache import Arrays, Journal
 from easi_jax.model.mujoco_warnings import warnings_to
 from easi_jax.progress import Progress, silent
 
-_SHORTLIST = 7  # names that are fitted in full at each stage
-_STARTS = 2  # of each
-_SCREENED = 2  # blocks of windows that a larger robot's effects are first tried on
-_TRIED = ("cost", "which", "end")
-_HOPELESS = 4.0  # times the best promise; beyond, only the first few are fitted
 _LOST = 0.5  # of the windows not finite: beyond, a vector predicts nothing
 _FELT = 1e-3  # of the most that a number of an effect changes
 
@@ -227,75 +221,6 @@ class Selector:
 
     # -- stages ----------------------------------------------------------------
 
-    def screened(
-        self, base: Model, candidates: Sequence[Candidate]
-    ) -> list[tuple[float, Candidate]]:
-        """Candidates with the cost that one Gauss-Newton step promises, best first."""
-        if not candidates:
-            return []
-        kept = self.journal.remember(lambda: self._tried(base, candidates))
-        out = [
-            (float(cost), replace(candidates[i], ends=tuple(end)))
-            for cost, i, end in zip(*(kept[k] for k in _TRIED), strict=True)
-        ]
-        return sorted(out, key=lambda item: item[0])
-
-    def _tried(self, base: Model, candidates: Sequence[Candidate]) -> Arrays:
-        """Costs, indices and ends of the candidates that predict finite numbers."""
-        x = base.fit.x
-        some = np.arange(len(self.blocks))
-        if self.predictor.simulator.wide:
-            # A short list of names needs no more, and takes minutes as it is.
-            some = some[:: max(1, len(some) // _SCREENED)]
-        seen = self.windows_of(some)
-        w = self.weight[seen]
-        asks, spans = [], []
-        for c in candidates:
-            y = self.started(x, c)
-            cols = self.columns(c.place)
-            if c.place.row.is_sine:
-                cols = cols[[0, 2]]  # amplitude and phase; cycles come from the grid
-            moved, step = difference(y, cols, self.bounds)
-            asks.append(np.concatenate([y[None], moved]))
-            spans.append((cols, step))
-        got, at = self._many(np.concatenate(asks), some), 0
-        known = base.fit.slope[seen] * self.bounds.size[base.fit.active]
-        costs, which, ends = [], [], []
-        for i, (c, ask) in enumerate(zip(candidates, asks, strict=True)):
-            cols, step = spans[i]
-            part = got[at : at + len(ask)]
-            at += len(ask)
-            r = part[0]
-            if not np.isfinite(part).all():
-                continue
-            new = np.moveaxis((part[1:] - r) / step[:, None, None], 0, -1)
-            j = np.concatenate([known, new * np.abs(step)], -1)
-            cost, move = _promised(r, j, w)
-            index = np.concatenate([base.fit.active, cols])
-            size = np.concatenate([self.bounds.size[base.fit.active], np.abs(step)])
-            end = ask[0].copy()
-            end[index] += move * size
-            if c.place.row.is_sine:
-                end[cols] = as_sine(ask[0][cols], end[cols])
-            # Not the others: a force limit that is off lies outside its bounds.
-            end[index] = np.clip(
-                end[index], self.bounds.low[index], self.bounds.high[index]
-            )
-            costs.append(cost)
-            which.append(i)
-            ends.append(end)
-        shape = (len(ends), len(base.fit.x))
-        found = np.array(costs), np.array(which, int), np.reshape(ends, shape)
-        return dict(zip(_TRIED, found, strict=True))
-
-    def _many(self, x: np.ndarray, some: np.ndarray, most: int = 256) -> np.ndarray:
-        got = []
-        with self.progress("trying effects", len(x)) as shown:
-            for i in range(0, len(x), most):
-                got.append(self.simulate(x[i : i + most], some))
-                shown.advance(len(got[-1]))
-        return np.concatenate(got)
-
     def fitted(
         self, places: list[Place], x: np.ndarray, chosen: Sequence[Candidate]
     ) -> list[Model]:
@@ -318,16 +243,6 @@ class Selector:
                 best[key] = (f.cost, c.place, f)
         models = [self.model([*places, p], f) for _, p, f in best.values()]
         return [m for m in models if np.isfinite(m.loss).all()]
-
-    def expanded(
-        self, base: Model, candidates: Sequence[Candidate]
-    ) -> tuple[list[Model], list[str]]:
-        """A model with one effect more, the most promising ones, best first; and the
-        names of all by what they promise."""
-        screened = self.screened(base, candidates)
-        models = self.fitted(base.places, base.fit.x, shortlist(screened))
-        names = dict.fromkeys(c.place.key for _, c in screened)
-        return sorted(models, key=rank), [*names]
 
     def richer(self, model: Model, candidates: Sequence[Candidate]) -> Model:
         """The model with effects replaced by ones that contain them and do better."""
@@ -361,54 +276,3 @@ class Selector:
                 break
             model = best
         return model
-
-
-def as_sine(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Amplitude and phase where a step from a small sine of phase 0 leads: it is linear
-    in the sine's and the cosine's share, not in the phase."""
-    cosine = start[0] * (end[1] - start[1])
-    return np.array([np.hypot(end[0], cosine), np.arctan2(cosine, end[0])])
-
-
-def shortlist(screened: Sequence[tuple[float, Candidate]]) -> list[Candidate]:
-    """The most promising names with the best starts of each, and the special cases of
-    those names, which promise less but ask for less."""
-    chosen = _promising(screened)
-    general = [mine[0].place for mine in chosen.values()]
-    for _, c in screened:
-        if any(contains(g, c.place) for g in general):
-            mine = chosen.setdefault(c.place.key, [])
-            if c not in mine and len(mine) < _STARTS:
-                mine.append(c)
-    return [c for mine in chosen.values() for c in mine]
-
-
-def _promising(
-    screened: Sequence[tuple[float, Candidate]],
-) -> dict[str, list[Candidate]]:
-    chosen: dict[str, list[Candidate]] = {}
-    first = screened[0][0] if screened else 0.0
-    for cost, c in screened:
-        mine = chosen.get(c.place.key)
-        if mine is None:
-            hopeless = cost > _HOPELESS * first and len(chosen) >= _SHORTLIST // 2
-            if len(chosen) == _SHORTLIST or hopeless:
-                continue
-            mine = chosen.setdefault(c.place.key, [])
-        if len(mine) < _STARTS:
-            mine.append(c)
-    return chosen
-
-
-def _promised(
-    residual: np.ndarray, slope: np.ndarray, weight: np.ndarray
-) -> tuple[float, np.ndarray]:
-    """Cost after a Gauss-Newton step, and the step."""
-    root = np.sqrt(weight)[:, None]
-    r = (root * residual).reshape(-1)
-    j = (root[..., None] * slope).reshape(-1, slope.shape[-1])
-    normal, gradient = j.T @ j, j.T @ r
-    curvature = np.diag(normal)
-    ridge = 1e-6 * np.diag(curvature + curvature.max() + 1e-30)
-    step = -np.linalg.solve(normal + ridge, gradient)
-    return float(0.5 * r @ r + 0.5 * gradient @ step), step

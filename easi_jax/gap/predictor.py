@@ -42,6 +42,7 @@ from easi_jax.simulation.step import Physics, arrived_sensed, arrived_step
 
 BLOCK = 16  # windows
 _ITEMS = 4  # that a core works on together: many requests ask for few
+_STEPPED = 16  # likewise, where each physics step is a call: most of it is the calling
 _ACCELERATOR_ITEMS = 256
 _ROW = 0.01  # s of it at a time
 
@@ -74,6 +75,7 @@ _LEFT_OUT = {
         native_step.STATE_DEPENDENT,
         (*_PLAY, "resistance"),
         _PLAY,
+        ("resistance", *native_step.AT_PAIRS),
         (),
     ),
 }
@@ -105,6 +107,8 @@ class Predictor:
         channels: numbers that are compared, ``nv + N``.
         largest: motion that was measured in a window, ``(channels,)``.
         steps: control steps of a window, those before its start counted.
+        data: the windows in blocks, on all devices.
+        programs: others' that were compiled for windows like these.
         size: of a start state: positions, velocities, activations, ``2 nv + na``.
     """
 
@@ -145,10 +149,11 @@ class Predictor:
             self.wrapped[dofs(m, j)] = turns_fully(m, j)
         self.channels = nv + len(self.sensors)
         self._scalar = scalar_places(m).T
-        self._mesh = make_mesh()
+        self.mesh = make_mesh()
         engine = self.simulator.engine
         on_host = on_cpu() or engine == "mujoco"
         self._items = _ITEMS if on_host else _ACCELERATOR_ITEMS
+        self._more = _STEPPED if engine == "mujoco" else self._items
         latest = sum(
             max((c.high for c in layout.columns if c.field == name), default=0.0)
             for name in ("delay", "late")
@@ -156,7 +161,7 @@ class Predictor:
         self._delay_steps = math.ceil(latest / dt - 1e-9) + 1
         self._fields = _fields(layout)
         # Columns that each program has not, but for the details of effects.
-        self._without: dict[tuple[str, ...], np.ndarray] = {}
+        self.without: dict[tuple[str, ...], np.ndarray] = {}
         for left_out in reversed(_LEFT_OUT[engine]):
             told = [
                 self.own + i
@@ -165,8 +170,8 @@ class Predictor:
             ]
             # Where a program is no quicker than the next, it is not made.
             if not left_out or told:
-                self._without[left_out] = np.array(told, int)
-        self._without = dict(reversed(self._without.items()))
+                self.without[left_out] = np.array(told, int)
+        self.without = dict(reversed(self.without.items()))
         self._take(windows)
 
     def _take(self, windows: WindowSet) -> None:
@@ -178,8 +183,9 @@ class Predictor:
         self.largest = np.concatenate([moved, span])[: self.channels]
         # By powers of two, so that the program of one log often serves the next.
         self._room = 1 << (self.blocks - 1).bit_length()
-        self._data = self._placed(windows)
-        self._compiled: dict[tuple[str, ...], Callable[[], Any]] = {}
+        self.data = self._placed(windows)
+        self._compiled: dict[tuple[tuple[str, ...], int], Callable[[], Any]] = {}
+        self.programs: dict[Any, Any] = {}
 
     @property
     def _compared(self) -> np.ndarray:
@@ -200,7 +206,7 @@ class Predictor:
         padded = windows.take(fill)
         read = self._unwrapped(padded.read)
         sensed = self._readings(padded)
-        whole = NamedSharding(self._mesh, PartitionSpec())
+        whole = NamedSharding(self.mesh, PartitionSpec())
 
         def blocks(x: np.ndarray) -> jax.Array:
             shape = (self._room, BLOCK, *x.shape[1:])
@@ -236,7 +242,7 @@ class Predictor:
     @property
     def devices(self) -> int:
         """That share the work."""
-        return self._mesh.size
+        return self.mesh.size
 
     @property
     def blocks(self) -> int:
@@ -259,14 +265,18 @@ class Predictor:
         if mine != theirs or len(windows) > self.capacity:
             other._take(windows)
         else:
-            other.windows, other._data = windows, other._placed(windows)
+            other.windows, other.data = windows, other._placed(windows)
         return other
 
-    def model(self, x: jax.Array, left_out: tuple[str, ...] = ()) -> Model:
-        """The model of a vector ``(n,)``, fields ``left_out`` neutral in it; pure."""
+    def model(
+        self, x: jax.Array, left_out: tuple[str, ...] = (), more: tuple[str, ...] = ()
+    ) -> Model:
+        """The model of a vector ``(n,)``, fields ``left_out`` neutral in it; pure.
+        Fields ``more`` may be changed in it."""
         e = self.layout.effects(x[self.own :])
         model = self.simulator.model(x[: self.own])
-        present = tuple(f for f in self._fields if f not in left_out)
+        there = dict.fromkeys((*self._fields, *more))
+        present = tuple(f for f in there if f not in left_out)
         return model.replace(
             mjx=effects.with_effects(model.mjx, e, present),
             effects=e,
@@ -288,23 +298,22 @@ class Predictor:
         commands = start + step[:-1]
         return Rows(np.round(readings).astype(int), np.round(commands).astype(int))
 
-    def _program(self, left_out: tuple[str, ...]) -> Any:
+    def _program(self, left_out: tuple[str, ...], batch: int) -> Any:
         """A compiled one. For an arm MJX's take a minute each, so side by side."""
-        if left_out not in self._compiled:
-            batch = self._items * self._mesh.size
+        if (left_out, batch) not in self._compiled:
             like = (
                 np.zeros((batch, len(self.neutral)), np.float32),
                 np.zeros(batch, np.int32),
                 np.zeros((batch, BLOCK, self.size), np.float32),
             )
-            for out in self._without if self.simulator.engine == "mjx" else [left_out]:
+            for out in self.without if self.simulator.engine == "mjx" else [left_out]:
                 # Play is for few predictions.
                 quick = quick_compile() | (fast_loops() if out else {})
                 program = jax.jit(partial(self._sharded, out), compiler_options=quick)
-                lowered = program.lower(*like, *self._data)
-                self._compiled[out] = started(lowered.compile)
-            self._wait(self._compiled[left_out], expected(self.simulator))
-        return self._compiled[left_out]()
+                lowered = program.lower(*like, *self.data)
+                self._compiled[out, batch] = started(lowered.compile)
+            self._wait(self._compiled[left_out, batch], expected(self.simulator))
+        return self._compiled[left_out, batch]()
 
     def _sharded(
         self,
@@ -317,7 +326,7 @@ class Predictor:
         def local(items: tuple[jax.Array, ...], *data: jax.Array) -> jax.Array:
             return jax.vmap(lambda *i: self._block(left_out, data, *i))(*items)
 
-        return sharded_map(local, self._mesh, (x, block, moved), *windows)
+        return sharded_map(local, self.mesh, (x, block, moved), *windows)
 
     def _block(
         self,
@@ -341,30 +350,13 @@ class Predictor:
         compared with the readings of the times that are simulated: as far from its
         start as without delays. Where a run only begins, all is later by that delay.
         """
-        start_q, start_act, ctrl, past, past_q, past_v, seen, speed, led, *more = window
-        sensed, last = more
+        *_, ctrl, _, _, _, _, speed, led, sensed, _ = window
         simulator, e, nv = self.simulator, model.effects, self.nv
         assert e is not None
+        start_q = window[0]
+        q, read, physics, arrived = self.begun(model, window, moved)
         early = led * jnp.max(e.late)
         start = len(speed) // 2  # its row in both
-        now = start - (early - e.late) / simulator.dt  # (nv,)
-        read = _between(seen, now + jnp.arange(self.steps + 1)[:, None])
-        v = _between(speed, now[None])[0]
-        q = simulator.move(start_q, read[0] - e.bias + moved[:nv])
-        physics = simulator.start(q, v + moved[nv : 2 * nv], model)
-        physics = physics.replace(memory=(), act=start_act + moved[2 * nv :])
-        # Sensors are read where a step begins, the last of them after the last step.
-        sent = [past, ctrl, last[None]] if self.sensors else [past, ctrl]
-        arrived = effects.command_sequence(
-            e.replace(delay=e.delay + early),
-            jnp.concatenate(sent),
-            self._delay_steps,
-            simulator.dt,
-            simulator.substeps,
-        )
-        if effects.has_backlash(model.present):
-            before = (past_q, past_v)
-            physics = self._turned(model, physics, arrived[: len(past)], *before)
 
         def step(state: Physics, u: jax.Array) -> tuple:
             if not self.sensors:
@@ -373,7 +365,7 @@ class Predictor:
             state, each = arrived_sensed(model, state, u)
             return state, (state.qpos, each)
 
-        arrived, at_once = arrived[len(past) :], None
+        at_once = None
         if simulator.engine == "mujoco":
             at_once = native_step.replay(model, physics, arrived)
         if at_once:
@@ -397,6 +389,37 @@ class Predictor:
         readings = self.sensors.reading.alike(readings, read[:, None])
         begins, ends = readings[:, 0] - read, readings[:-1, 1] - read[1:]
         return jnp.concatenate([error, begins, jnp.pad(ends, [(1, 0), (0, 0)])], 1)
+
+    def begun(
+        self, model: Model, window: tuple, moved: jax.Array
+    ) -> tuple[jax.Array, jax.Array, Physics, jax.Array]:
+        """Where a window begins ``(nq,)``, what its joints are compared with ``(H + 1,
+        nv)``, its first state, and what reaches the actuators in the physics steps of
+        each row after it, ``(H, substeps, nu)``, one row more with sensors."""
+        start_q, start_act, ctrl, past, past_q, past_v, seen, speed, led, *more = window
+        simulator, e, nv = self.simulator, model.effects, self.nv
+        assert e is not None
+        early = led * jnp.max(e.late)
+        start = len(speed) // 2  # its row in both
+        now = start - (early - e.late) / simulator.dt  # (nv,)
+        read = _between(seen, now + jnp.arange(self.steps + 1)[:, None])
+        v = _between(speed, now[None])[0]
+        q = simulator.move(start_q, read[0] - e.bias + moved[:nv])
+        physics = simulator.start(q, v + moved[nv : 2 * nv], model)
+        physics = physics.replace(memory=(), act=start_act + moved[2 * nv :])
+        # Sensors are read where a step begins, the last of them after the last step.
+        sent = [past, ctrl, more[1][None]] if self.sensors else [past, ctrl]
+        arrived = effects.command_sequence(
+            e.replace(delay=e.delay + early),
+            jnp.concatenate(sent),
+            self._delay_steps,
+            simulator.dt,
+            simulator.substeps,
+        )
+        if effects.has_backlash(model.present):
+            before = (past_q, past_v)
+            physics = self._turned(model, physics, arrived[: len(past)], *before)
+        return q, read, physics, arrived[len(past) :]
 
     def _turned(
         self, model: Model, first: Physics, arrived: Any, qpos: Any, qvel: Any
@@ -470,25 +493,31 @@ class Predictor:
         shape = items, BLOCK, self.steps + 1, self.channels
         out = np.empty(shape, np.float32)
         neutral, left = self.neutral.astype(np.float32), np.ones(items, bool)
-        for left_out, columns in self._without.items():
+        for left_out, columns in self.without.items():
             fits = left & (vectors[:, columns] == neutral[columns]).all(1)
             left &= ~fits
             if not fits.any():
                 continue
-            program = self._program(left_out)
-            for part in self._batches(np.flatnonzero(fits)):
+            at_once = left_out == next(iter(self.without))
+            for part in self._batches(np.flatnonzero(fits), at_once):
+                program = self._program(left_out, len(part))
                 args = vectors[part], which[part], offsets[part]
-                got = np.asarray(program(*args, *self._data))
+                got = np.asarray(program(*args, *self.data))
                 out[part] = got[..., self._compared]
         out = out.reshape(count, nb * BLOCK, *shape[2:])
         return out[:, : self.count(windows)]
 
-    def _batches(self, chosen: np.ndarray) -> list[np.ndarray]:
-        """Items by batches of one size; the last item fills the last of them."""
-        batch = self._items * self._mesh.size
-        pad = -len(chosen) % batch
-        filled = np.concatenate([chosen, np.repeat(chosen[-1:], pad)])
-        return list(filled.reshape(-1, batch))
+    def _batches(self, chosen: np.ndarray, at_once: bool) -> list[np.ndarray]:
+        """Items by batches of one size, or two where windows are not predicted
+        ``at_once``; the last item fills the last of them."""
+        few, most = (n * self.mesh.size for n in (self._items, self._more))
+        parts = []
+        if not at_once:
+            whole = len(chosen) // most * most
+            parts, chosen = list(chosen[:whole].reshape(-1, most)), chosen[whole:]
+        batch = few if at_once or 2 * len(chosen) <= most else most
+        filled = np.concatenate([chosen, np.repeat(chosen[-1:], -len(chosen) % batch)])
+        return [*parts, *filled.reshape(-1, batch)]
 
     def count(self, windows: np.ndarray | None) -> int:
         """Number of windows in some blocks; all where None."""

@@ -31,6 +31,8 @@ class Scales:
         torque: median of what moves it, ``(nv,)``.
         most: the most of that, ``(nv,)``.
         inertia: about each degree of freedom, ``(nv,)``.
+        alone: that a torque at each alone meets, the least of it, ``(nv,)``: less
+            inertia than that cannot be taken from one.
         command: RMS, ``(nu,)``.
         force: RMS of an actuator's force, ``(nu,)``.
         peak: its largest, but for two rows in 1,000, ``(nu,)``.
@@ -50,6 +52,7 @@ class Scales:
     torque: np.ndarray
     most: np.ndarray
     inertia: np.ndarray
+    alone: np.ndarray
     command: np.ndarray
     force: np.ndarray
     peak: np.ndarray
@@ -131,7 +134,7 @@ def _of_joint(o: Spot) -> dict[str, float]:
         "damping": float(m.dof_damping[d]),
         "frictionloss": float(m.dof_frictionloss[d]),
         # Most of the inertia that a drive may have.
-        "drive": armature if armature > 0 else 0.7 * inertia,
+        "drive": armature if armature > 0 else 0.7 * float(s.alone[d]),
         # What free play is a share of.
         "reach": min(span, 1.0 if is_hinge else np.inf),
         # Cycles per 2 pi of position: slower over the whole range, a ripple is a spring

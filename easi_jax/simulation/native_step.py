@@ -20,14 +20,14 @@ from easi_jax.model.effect_numbers import fields_that_act
 from easi_jax.model.joint_space import scalar_places
 from easi_jax.simulation import native
 
-_AT_PAIRS = ("slip", "give")  # for which MuJoCo is called simulation by simulation
+AT_PAIRS = ("slip", "give")  # for which MuJoCo is called simulation by simulation
 # Effects in the step that are the same at every state.
-_STEADY = ("coulomb", "damping", "stiffness", "spring", "constant", "force", *_AT_PAIRS)
-_IN_STEPS = (*fields_that_act("step"), *fields_that_act("drive"), *_AT_PAIRS)
+_STEADY = ("coulomb", "damping", "stiffness", "spring", "constant", "force", *AT_PAIRS)
+_IN_STEPS = (*fields_that_act("step"), *fields_that_act("drive"), *AT_PAIRS)
 # Those for which MuJoCo is called once a physics step.
 STATE_DEPENDENT = tuple(f for f in _IN_STEPS if f not in _STEADY)
 # Those without which a call goes through all steps of all simulations.
-SLOW = (*STATE_DEPENDENT, *_AT_PAIRS)
+SLOW = (*STATE_DEPENDENT, *AT_PAIRS)
 
 
 @flax.struct.dataclass
@@ -73,7 +73,7 @@ def _edge(model: Any) -> Any:
 
 def _pairs(model: Any) -> Any:
     """Factors on the contacts of pairs of geoms, where there may be any."""
-    if not {*_AT_PAIRS} & {*_acting(model)}:
+    if not {*AT_PAIRS} & {*_acting(model)}:
         return None
     return jnp.concatenate([model.effects.slip[:, None], model.effects.give], 1)
 

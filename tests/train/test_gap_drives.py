@@ -13,6 +13,7 @@ from easi_jax.gap import effect_search
 from easi_jax.gap.analysis import Analysis
 from easi_jax.gap.candidates import places
 from easi_jax.gap.result import Numbers
+from easi_jax.gap.screening import expanded
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import engine
 from tests.commands import command
@@ -69,7 +70,7 @@ def test_a_fit_of_each_candidate_tells_them_apart(
         a = Analysis(m, ParameterSpace(()), [fit], [held], noise, 0.2)
         at = a.search.at
         at.whiten(at.neutral)
-        found, _ = at.selector.expanded(at.refit([]), a.places.candidates([]))
+        found, _ = expanded(at.selector, at.refit([]), a.places.candidates([]))
     (place,) = found[0].places
     assert place.key == "drive_stiffness@servo"
     value, _, unit = Numbers(at.selector, found[0]).values(place)["factor"]

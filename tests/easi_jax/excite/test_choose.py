@@ -16,7 +16,7 @@ def test_a_named_effect_is_no_parameter_of_the_model() -> None:
     assert "joint.cart.frictionloss" in own.names
     joint, drive, pairs = np.ones(m.nv), np.ones(m.nu), np.zeros(0)
     scales = Scales(
-        *([joint] * 6 + [drive] * 3 + [joint] * 2 + [pairs]),
+        *([joint] * 7 + [drive] * 3 + [joint] * 2 + [pairs]),
         dt=0.02,
         longest=0.1,
     )

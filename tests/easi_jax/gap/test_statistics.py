@@ -24,7 +24,7 @@ from easi_jax.gap.candidates import places, ripples
 from easi_jax.gap.discretization_error import error_of_steps, within_a_step
 from easi_jax.gap.effect_set import Candidate, Model
 from easi_jax.gap.effect_vector import Layout
-from easi_jax.gap.forward_selection import Selector, as_sine, shortlist
+from easi_jax.gap.forward_selection import Selector
 from easi_jax.gap.model_comparison import (
     advantage,
     are_twins,
@@ -36,6 +36,7 @@ from easi_jax.gap.model_comparison import (
     simplest,
 )
 from easi_jax.gap.predictor import BLOCK, Predictor
+from easi_jax.gap.screening import as_sine, shortlist
 from easi_jax.gap.sensor_faults import velocity_lags
 from easi_jax.gap.table import Place
 from easi_jax.gap.whitening import Residuals, make_residuals, row_groups

@@ -80,9 +80,9 @@ def model() -> mujoco.MjModel:
 
 def scales(m: mujoco.MjModel) -> Scales:
     rng = np.random.default_rng(0)
-    joint, drive = rng.uniform(0.2, 3.0, (8, m.nv)), rng.uniform(0.2, 3.0, (3, m.nu))
+    joint, drive = rng.uniform(0.2, 3.0, (9, m.nv)), rng.uniform(0.2, 3.0, (3, m.nu))
     touching = np.ones(len(pair_ids(m)))
-    sizes = (*joint[:6], *drive, *joint[6:], touching)
+    sizes = (*joint[:7], *drive, *joint[7:], touching)
     return Scales(*sizes, dt=0.01, longest=0.1)
 
 
