@@ -22,7 +22,8 @@ from easi_jax.io.runs.step_cache import Arrays
 _SHORTLIST = 7  # names that are fitted in full at each stage
 _STARTS = 2  # of each
 _HOPELESS = 4.0  # times the best promise; beyond, only the first few are fitted
-_FEW = 2  # blocks of windows that a larger robot's effects are first tried on
+_FEW = 2  # blocks of windows that effects are first tried on, of a larger robot ...
+_LONG = 0.5  # ... or in windows of more than so many seconds
 _SIMULATED = 20  # names that are simulated after all have been reckoned
 _HOLDS = 0.5  # of the windows, in which torques are linear, for any to be reckoned
 _AT_ONCE = 256  # vectors
@@ -54,8 +55,9 @@ class Screening:
     def __init__(self, selector: Selector, base: Model) -> None:
         self.selector, self.base = selector, base
         self.some = np.arange(len(selector.blocks))
-        if selector.predictor.simulator.wide:
-            # A short list of names needs no more, and takes minutes as it is.
+        p = selector.predictor
+        # A short list of names needs no more, where it takes minutes as it is.
+        if p.simulator.wide or p.steps * p.simulator.dt > _LONG:
             self.some = self.some[:: max(1, len(self.some) // _FEW)]
         self.seen = selector.windows_of(self.some)
         self.weight = selector.weight[self.seen]
