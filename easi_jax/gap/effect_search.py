@@ -132,7 +132,9 @@ class EffectSearch:
         for k, length in enumerate(self.lengths):
             if k < self.settles and self.at.gap < _LOST:
                 continue
-            if k > self.settles and not self.lengths[k - 1].closed_by(found):
+            # Where feet stick and slip, what is long is not linear in what lacks.
+            before = self.lengths[k - 1]
+            if k > self.settles and (before.sticks or not before.closed_by(found)):
                 break
             known = {p.key for p in found.places}
             seconds = (length.steps - length.data.lead) * length.data.dt

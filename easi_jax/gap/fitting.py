@@ -7,7 +7,7 @@ import numpy as np
 
 from easi_jax.errors import UserError
 from easi_jax.estimation.least_squares import AT_BOUND
-from easi_jax.estimation.starts import DRAWS, better_noise, floor, known_noise
+from easi_jax.estimation.starts import better_noise, floor, known_noise
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.batched_least_squares import Bounds, window_weights
 from easi_jax.gap.discretization_error import error_of_steps
@@ -24,6 +24,7 @@ from easi_jax.gap.window_starts import window_starts
 from easi_jax.progress import Progress, silent
 
 _BLOCKS = 10  # of time, for cross-validation
+_DRAWS = 5  # of the noise of each window: its mean over all of them is wanted
 _CLOSED = 1.05  # times the floor: nothing left to explain, where not surely more
 _STEPS_SEEN = 0.75  # of the floor: less is lost in noise
 _WHOLE = 1.15  # of the error of steps; a finer simulation leaves some of it
@@ -158,7 +159,7 @@ class Fitting:
         """Whether nothing is left to explain, whitened at ``x``."""
         errors = self.selector.errors(x[None])[0]
         rng, after, moved = np.random.default_rng(1), self.data.lead + 1, self.moved
-        noise = floor(self.starts, x, moved, DRAWS, self.data.resolution, rng)
+        noise = floor(self.starts, x, moved, _DRAWS, self.data.resolution, rng)
         square, due = measure.squares(errors[:, after:]), noise[:, after:].mean((0, 1))
         low = openness(square, due, self.channels.scale).low
         return bool(np.nanmax(low) <= _CLOSED)
