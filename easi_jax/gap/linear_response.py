@@ -147,9 +147,11 @@ class LinearResponse:
         return out
 
     def _checked(self, moved: np.ndarray) -> np.ndarray:
-        """`holds`, by constant torques at all joints."""
+        """`holds`, by constant torques at all joints; nowhere if there are none."""
         p = self.predictor
         at = [i for i, c in enumerate(p.layout.columns) if c.field == "constant"]
+        if not at:
+            return np.zeros(self.count, bool)
         vectors = np.repeat(self.x[None], len(at), 0)
         vectors[np.arange(len(at)), np.array(at, int) + p.own] += [
             p.layout.columns[i].size for i in at
