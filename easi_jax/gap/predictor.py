@@ -107,7 +107,9 @@ class Predictor:
         channels: numbers that are compared, ``nv + N``.
         largest: motion that was measured in a window, ``(channels,)``.
         steps: control steps of a window, those before its start counted.
-        data: the windows in blocks, on all devices.
+        data: the windows in blocks, on all devices of ``mesh``.
+        without: programs by what is left out of them, the quickest first, each with the
+            columns of a vector that have to be neutral for it.
         programs: others' that were compiled for windows like these.
         size: of a start state: positions, velocities, activations, ``2 nv + na``.
     """
@@ -160,7 +162,7 @@ class Predictor:
         )
         self._delay_steps = math.ceil(latest / dt - 1e-9) + 1
         self._fields = _fields(layout)
-        # Columns that each program has not, but for the details of effects.
+        # But for the details of effects.
         self.without: dict[tuple[str, ...], np.ndarray] = {}
         for left_out in reversed(_LEFT_OUT[engine]):
             told = [
