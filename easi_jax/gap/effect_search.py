@@ -132,10 +132,11 @@ class EffectSearch:
         for k, length in enumerate(self.lengths):
             if k < self.settles and self.at.gap < _LOST:
                 continue
-            # Where feet stick and slip, what is long is not linear in what lacks.
-            before = self.lengths[k - 1]
-            if k > self.settles and (before.sticks or not before.closed_by(found)):
-                break
+            if k > self.settles:
+                # Where feet stick and slip, what is long is not linear in what lacks.
+                before = self.lengths[k - 1]
+                if before.sticks or not before.closed_by(found):
+                    break
             known = {p.key for p in found.places}
             seconds = (length.steps - length.data.lead) * length.data.dt
             self.tell(f"windows of {seconds:.3g} s:")

@@ -76,8 +76,7 @@ class LinearResponse:
     def changes(self, vectors: np.ndarray) -> np.ndarray:
         """Of errors from those of ``x``, ``(B, W, H + 1, nv)``."""
         p = self.predictor
-        speeds = np.concatenate([self._speeds(self.x[None]), self._speeds(vectors)])
-        torque = (speeds[1:] - speeds[0]).astype(float)  # in what one step does
+        torque = (self._speeds(vectors) - self._still).astype(float)  # of one step
         path = np.zeros((*torque.shape[:3], p.nv))
         state = np.zeros((*torque.shape[:2], p.size))
         for k in range(torque.shape[2]):
@@ -103,21 +102,14 @@ class LinearResponse:
             p.programs[key] = jax.jit(whole, compiler_options=quick_compile())
         return p.programs[key]
 
-    def _left_out(self, vectors: np.ndarray) -> tuple[str, ...]:
-        """What a program need not have for these vectors."""
-        neutral = self.predictor.neutral.astype(np.float32)
-        for left_out, columns in self.predictor.without.items():
-            if (vectors[:, columns].astype(np.float32) == neutral[columns]).all():
-                return left_out
-        return ()
-
     def _linearize(self) -> None:
-        left_out = self._left_out(self.x[None])
+        ((left_out, _),) = self.predictor.by_program(self.x[None])
         program = self._program(_linearized, left_out)
         sizes = self._sizes.astype(np.float32), self._acceleration.astype(np.float32)
         given = self.x.astype(np.float32), *sizes
         items = self.blocks.astype(np.int32), self._offsets
-        self.middle, *found = program(items, *given, *self.predictor.data)
+        self.middle, still, *found = program(items, *given, *self.predictor.data)
+        self._still = np.asarray(still).reshape(-1, *still.shape[2:])
         after, torques, one = (
             np.nan_to_num(np.asarray(x, float).reshape(-1, *x.shape[2:])) for x in found
         )
@@ -129,21 +121,16 @@ class LinearResponse:
     def _speeds(self, vectors: np.ndarray) -> np.ndarray:
         """After one physics step from each state, ``(B, W, N, nv)``."""
         p = self.predictor
-        out: np.ndarray | None = None
-        kinds = [self._left_out(v[None]) for v in vectors]
-        for left_out in dict.fromkeys(kinds):
-            at = np.flatnonzero([kind == left_out for kind in kinds])
+        out = np.empty((len(vectors), *self._still.shape), np.float32)
+        for left_out, at in p.by_program(vectors):
             program = self._program(_stepped, left_out)
             for i in range(0, len(at), _BATCH * p.devices):
                 some = at[i : i + _BATCH * p.devices]
                 filled = np.resize(some, _BATCH * p.devices)
                 given = self.blocks.astype(np.int32), self._offsets, self.middle
                 got = program(vectors[filled].astype(np.float32), *given, *p.data)
-                got = np.asarray(got).reshape(len(filled), -1, *got.shape[3:])
-                if out is None:
-                    out = np.zeros((len(vectors), *got.shape[1:]), np.float32)
+                got = np.asarray(got).reshape(len(filled), *out.shape[1:])
                 out[some] = got[: len(some)]
-        assert out is not None
         return out
 
     def _checked(self, moved: np.ndarray) -> np.ndarray:
@@ -186,12 +173,13 @@ def _linearized(
     sizes: jax.Array,
     acceleration: jax.Array,
     *data: jax.Array,
-) -> tuple[Physics, jax.Array, jax.Array, jax.Array]:
+) -> tuple[Physics, jax.Array, jax.Array, jax.Array, jax.Array]:
     """Of blocks of windows ``(nb,)``, with offsets of their starts: states in the
-    middle of every ``rows`` rows; derivatives of the state after them with that before
-    ``(nb, BLOCK, N, s, s)`` and with torques that accelerate so much, held for all of
-    them ``(nb, BLOCK, N, s, nv)``; and what the same torques do to speeds in one
-    physics step from the middle ``(nb, BLOCK, N, nv, nv)``."""
+    middle of every ``rows`` rows, and speeds one physics step later; derivatives of the
+    state after them with that before ``(nb, BLOCK, N, s, s)`` and with torques that
+    accelerate so much, held for all of them ``(nb, BLOCK, N, s, nv)``; and what the
+    same torques do to speeds in one physics step from the middle ``(nb, BLOCK, N, nv,
+    nv)``."""
     model = p.model(x, left_out, ("constant",))
     e, nv = model.effects, p.nv
     assert e is not None
@@ -239,6 +227,7 @@ def _linearized(
         still = each(jnp.zeros((1, nv)), middle, parts)
         return (
             middle,
+            still[..., 0],
             after_state(jnp.diag(sizes), before, parts, after) / sizes,
             after_torque(jnp.diag(torque), before, parts, after),
             each(jnp.diag(torque), middle, parts) - still,

@@ -9,7 +9,7 @@ one size.
 
 import copy
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -108,8 +108,6 @@ class Predictor:
         largest: motion that was measured in a window, ``(channels,)``.
         steps: control steps of a window, those before its start counted.
         data: the windows in blocks, on all devices of ``mesh``.
-        without: programs by what is left out of them, the quickest first, each with the
-            columns of a vector that have to be neutral for it.
         programs: others' that were compiled for windows like these.
         size: of a start state: positions, velocities, activations, ``2 nv + na``.
     """
@@ -162,8 +160,8 @@ class Predictor:
         )
         self._delay_steps = math.ceil(latest / dt - 1e-9) + 1
         self._fields = _fields(layout)
-        # But for the details of effects.
-        self.without: dict[tuple[str, ...], np.ndarray] = {}
+        # Columns that each program has not, but for the details of effects.
+        self._without: dict[tuple[str, ...], np.ndarray] = {}
         for left_out in reversed(_LEFT_OUT[engine]):
             told = [
                 self.own + i
@@ -172,8 +170,8 @@ class Predictor:
             ]
             # Where a program is no quicker than the next, it is not made.
             if not left_out or told:
-                self.without[left_out] = np.array(told, int)
-        self.without = dict(reversed(self.without.items()))
+                self._without[left_out] = np.array(told, int)
+        self._without = dict(reversed(self._without.items()))
         self._take(windows)
 
     def _take(self, windows: WindowSet) -> None:
@@ -308,7 +306,7 @@ class Predictor:
                 np.zeros(batch, np.int32),
                 np.zeros((batch, BLOCK, self.size), np.float32),
             )
-            for out in self.without if self.simulator.engine == "mjx" else [left_out]:
+            for out in self._without if self.simulator.engine == "mjx" else [left_out]:
                 # Play is for few predictions.
                 quick = quick_compile() | (fast_loops() if out else {})
                 program = jax.jit(partial(self._sharded, out), compiler_options=quick)
@@ -494,20 +492,28 @@ class Predictor:
             offsets = whole.reshape(shape)
         shape = items, BLOCK, self.steps + 1, self.channels
         out = np.empty(shape, np.float32)
-        neutral, left = self.neutral.astype(np.float32), np.ones(items, bool)
-        for left_out, columns in self.without.items():
-            fits = left & (vectors[:, columns] == neutral[columns]).all(1)
-            left &= ~fits
-            if not fits.any():
-                continue
-            at_once = left_out == next(iter(self.without))
-            for part in self._batches(np.flatnonzero(fits), at_once):
+        for left_out, chosen in self.by_program(vectors):
+            at_once = left_out == next(iter(self._without))
+            for part in self._batches(chosen, at_once):
                 program = self._program(left_out, len(part))
                 args = vectors[part], which[part], offsets[part]
                 got = np.asarray(program(*args, *self.data))
                 out[part] = got[..., self._compared]
         out = out.reshape(count, nb * BLOCK, *shape[2:])
         return out[:, : self.count(windows)]
+
+    def by_program(
+        self, vectors: np.ndarray
+    ) -> Iterator[tuple[tuple[str, ...], np.ndarray]]:
+        """What the quickest program leaves out that has all of them, and which of the
+        vectors ``(B, n)`` go through it."""
+        vectors = vectors.astype(np.float32)
+        neutral, left = self.neutral.astype(np.float32), np.ones(len(vectors), bool)
+        for left_out, columns in self._without.items():
+            fits = left & (vectors[:, columns] == neutral[columns]).all(1)
+            left &= ~fits
+            if fits.any():
+                yield left_out, np.flatnonzero(fits)
 
     def _batches(self, chosen: np.ndarray, at_once: bool) -> list[np.ndarray]:
         """Items by batches of one size, or two where windows are not predicted

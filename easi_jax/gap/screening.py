@@ -61,11 +61,13 @@ class Screening:
             self.some = self.some[:: max(1, len(self.some) // _FEW)]
         self.seen = selector.windows_of(self.some)
         self.weight = selector.weight[self.seen]
-        self.linear = self._linear()
+        self.linear = self._linearized()
         if self.linear is not None:
             self.weight = self.weight * self.linear.holds
+            # As whitened now: the fit may be older.
+            self.first = selector.simulate(base.fit.x[None], self.some)[0]
 
-    def _linear(self) -> LinearResponse | None:
+    def _linearized(self) -> LinearResponse | None:
         """None where everything has to be simulated."""
         s = self.selector
         if s.predictor.simulator.engine != "mujoco" or s.predictor.sensors:
@@ -157,26 +159,24 @@ class Screening:
 
     def _whitened(self, x: np.ndarray, reckoned: np.ndarray) -> np.ndarray:
         """Whitened errors of vectors ``(B, n)``, ``(B, W, m)``."""
-        s, simulated = self.selector, np.flatnonzero(~reckoned)
-        out: list[np.ndarray | None] = [None] * len(x)
-        with s.progress("trying effects", len(x)) as shown:
-            for i in range(0, len(simulated), _AT_ONCE):
-                part = simulated[i : i + _AT_ONCE]
-                for k, errors in zip(part, s.simulate(x[part], self.some), strict=True):
-                    out[k] = errors
-                shown.advance(len(part))
-            at = np.flatnonzero(reckoned)
-            if self.linear is not None and len(at):
-                first = s.simulate(self.base.fit.x[None], self.some)
+        out = np.empty((len(x), *self.base.fit.residual[self.seen].shape))
+        with self.selector.progress("trying effects", len(x)) as shown:
+            for way, chosen in ((self._simulated, ~reckoned), (self._linear, reckoned)):
+                at = np.flatnonzero(chosen)
                 for i in range(0, len(at), _AT_ONCE):
                     part = at[i : i + _AT_ONCE]
-                    changes = self.linear.changes(s.plain(x[part]))
-                    changes = s.residuals.grouped(changes)
-                    changes = s.residuals.whitened(changes, self.seen)
-                    for k, errors in zip(part, first + changes, strict=True):
-                        out[k] = errors
+                    out[part] = way(x[part])
                     shown.advance(len(part))
-        return np.stack([x for x in out if x is not None])
+        return out
+
+    def _simulated(self, x: np.ndarray) -> np.ndarray:
+        return self.selector.simulate(x, self.some)
+
+    def _linear(self, x: np.ndarray) -> np.ndarray:
+        assert self.linear is not None
+        s, at = self.selector, self.seen
+        changes = s.residuals.grouped(self.linear.changes(s.plain(x)))
+        return self.first + s.residuals.whitened(changes, at)
 
 
 def as_sine(start: np.ndarray, end: np.ndarray) -> np.ndarray:

@@ -100,10 +100,7 @@ def _torque(
     limited = np.asarray(m.actuator_forcelimited)[acts].astype(bool)
     edge = jnp.asarray(m.actuator_forcerange)[acts]
     force = jnp.where(limited, jnp.clip(force, edge[:, 0], edge[:, 1]), force)
-    # Batches of sums by a matrix; a scatter goes number by number on a CPU.
-    return (np.arange(len(drives))[:, None] == place).astype(np.float32) @ (
-        gear * force
-    )
+    return jnp.zeros(len(drives)).at[place].add(gear * force)
 
 
 def sent(m: Any, ctrl: jax.Array, act: jax.Array) -> jax.Array:

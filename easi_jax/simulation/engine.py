@@ -86,10 +86,11 @@ def using(name: str, tell: Callable[[str], None] | None = None) -> Iterator[None
     engine_calls.watched = True
     try:
         yield
-        engine_calls.check()
     except Exception:  # may well come from the numbers that are missing
         engine_calls.check()
         raise
+    else:
+        engine_calls.check()
     finally:
         _stack.pop()
         if len(_stack) == 1:

@@ -5,8 +5,12 @@ import numpy as np
 import pytest
 
 from easi_jax.data.scales import scales_of
+from easi_jax.gap import screening
+from easi_jax.gap.batched_least_squares import bounds_of
 from easi_jax.gap.candidates import places
+from easi_jax.gap.effect_set import Candidate
 from easi_jax.gap.effect_vector import Layout
+from easi_jax.gap.forward_selection import Selector
 from easi_jax.gap.linear_response import LinearResponse
 from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.window_set import window_set
@@ -93,11 +97,6 @@ def test_windows_in_which_a_foot_begins_to_slip_are_left_out() -> None:
 
 
 def test_names_are_the_same_with_and_without(monkeypatch: pytest.MonkeyPatch) -> None:
-    from easi_jax.gap import screening
-    from easi_jax.gap.batched_least_squares import bounds_of
-    from easi_jax.gap.effect_set import Candidate
-    from easi_jax.gap.forward_selection import Selector
-
     m = mujoco.MjModel.from_xml_string(ARM.format(SECOND))
     truth = mujoco.MjModel.from_xml_string(ARM.format(SECOND))
     truth.dof_damping[1] += 0.05
@@ -144,8 +143,10 @@ def test_names_are_the_same_with_and_without(monkeypatch: pytest.MonkeyPatch) ->
 def _plain(p: Predictor) -> object:
     """Residuals that are the errors themselves, in milliradians."""
 
+    size = (p.steps + 1) * p.nv
+
     class Plain:
-        plain = np.broadcast_to(np.eye(1), (len(p.windows), 1, 1))
+        plain = np.broadcast_to(np.eye(size), (len(p.windows), size, size))
 
         def grouped(self, errors: np.ndarray) -> np.ndarray:
             return 1e3 * errors
@@ -153,7 +154,4 @@ def _plain(p: Predictor) -> object:
         def whitened(self, grouped: np.ndarray, at: object = None) -> np.ndarray:
             return grouped.reshape(*grouped.shape[:2], -1).astype(float)
 
-    Plain.plain = np.broadcast_to(
-        np.eye((p.steps + 1) * p.nv), (len(p.windows), *((p.steps + 1) * p.nv,) * 2)
-    )
     return Plain()
