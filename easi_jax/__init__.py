@@ -10,6 +10,7 @@ move between versions, these names stay.
     train_policy                            a policy under what was found
     export_model, export_policy             files for other programs
     BraxEnv, GymnasiumEnv                   robots for brax's and for own loops
+    OwnEffect, Number                       an effect of your own, for find_effects
     UserError                               a mistake that a user can mend
 """
 
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
         train_policy,
     )
     from easi_jax.errors import UserError
+    from easi_jax.model.own_effects import Number, OwnEffect
     from easi_jax.rl.brax_env import BraxEnv
     from easi_jax.rl.gymnasium_env import GymnasiumEnv
 
@@ -46,6 +48,8 @@ __all__ = [
     "BraxEnv",
     "Estimated",
     "GymnasiumEnv",
+    "Number",
+    "OwnEffect",
     "Policy",
     "Searched",
     "UserError",
@@ -64,6 +68,8 @@ __all__ = [
 _ELSEWHERE = {
     "BraxEnv": "rl.brax_env",
     "GymnasiumEnv": "rl.gymnasium_env",
+    "Number": "model.own_effects",
+    "OwnEffect": "model.own_effects",
     "UserError": "errors",
 }
 

@@ -39,6 +39,8 @@ from easi_jax.model import distribution
 from easi_jax.model.checks import checked_array
 from easi_jax.model.distribution import Distribution
 from easi_jax.model.found_effects import FoundEffects
+from easi_jax.model.own_effects import OwnEffect, registered
+from easi_jax.model.own_effects_check import check_own_effects
 from easi_jax.model.parameter_proposal import own_space
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.results import Flag, GapResult, HeldOutErrors
@@ -336,6 +338,7 @@ def find_effects(
     parameters: ParameterSpace | None = None,
     held_out: Log | None = None,
     horizon: float = HORIZON,
+    own: Sequence[OwnEffect] = (),
     engine: str = "auto",
     tell: Tell = _silent,
 ) -> GapResult:
@@ -348,6 +351,7 @@ def find_effects(
             stiffness that it states, each within a factor of 5.
         held_out: kept out of every fit; None: part of ``log`` is.
         horizon: of the predictions that are compared [s].
+        own: effects of your own, beside those that are known.
         engine: as in `search_parameters`.
         tell: takes a line on how far it is.
 
@@ -357,8 +361,23 @@ def find_effects(
         effects as `estimate_parameters` takes them.
 
     Raises:
-        UserError: data too short, too still, or that the model does not cover.
+        UserError: data too short, too still, or that the model does not cover; an
+            effect of your own that cannot be believed.
     """
+    with registered(own):
+        check_own_effects(model)
+        return _effects(model, log, parameters, held_out, horizon, engine, tell)
+
+
+def _effects(
+    model: mujoco.MjModel,
+    log: Log,
+    parameters: ParameterSpace | None,
+    held_out: Log | None,
+    horizon: float,
+    engine: str,
+    tell: Tell,
+) -> GapResult:
     runs = measured_runs(model, log, held_out, checked_horizon(horizon))
     space = own_space(model) if parameters is None else parameters
     faults = reading_faults(model, runs.recorded)

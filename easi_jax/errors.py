@@ -1,7 +1,10 @@
 """Mistakes that a user can mend, and calls of an engine that failed."""
 
 import difflib
-from collections.abc import Iterable
+import traceback
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
 
 
 class UserError(Exception):
@@ -17,6 +20,23 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """Returns ``'; did you mean "x"?'`` for the closest known name, or ``''``."""
     found = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
     return f'; did you mean "{found[0]}"?' if found else ""
+
+
+def source_of(function: Callable[..., Any]) -> str:
+    """The file that a function is written in."""
+    code = getattr(function, "__code__", None)
+    return code.co_filename if code else "?"
+
+
+def told_by_line(path: Path | str, error: BaseException) -> str:
+    """What a user's Python file raised, and in which of its lines."""
+    if isinstance(error, SyntaxError) and error.lineno:
+        return f"{path}, line {error.lineno}: {error.msg}"
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [f.lineno for f in frames if Path(f.filename) == Path(path)]
+    where = f", line {lines[-1]}" if lines else ""
+    words = " ".join(str(error).split("\n")[0].split())
+    return f"{path}{where}: {type(error).__name__}: {words}"
 
 
 class EngineError(UserError):

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn, Protocol, TypeVar
 
 from train import _interrupt
-from train._options import EngineOptions
+from train._options import EngineOptions, OwnEffectsOptions
 
 _Config = TypeVar("_Config")
 
@@ -93,7 +93,7 @@ def main(
         from easi_jax.errors import UserError
 
         try:
-            with _interrupt.remembered(), _engine(config), _warnings_told():
+            with _interrupt.remembered(), _about(config), _warnings_told():
                 if getattr(config, "distributed", False):
                     distributed.start()
                 run(config)
@@ -114,6 +114,19 @@ def main(
         out = getattr(config, "out", None)
         left = _left(out, hasattr(config, "resume"))
         _stop(f"interrupted{left}", INTERRUPTED, args is None)
+
+
+@contextlib.contextmanager
+def _about(config: Any) -> Iterator[None]:
+    """What holds while a command runs: the user's effects, the engine."""
+    with contextlib.ExitStack() as all_of:
+        if isinstance(config, OwnEffectsOptions) and config.effects_from:
+            from easi_jax.io.models.own_effects_file import read_all
+            from easi_jax.model.own_effects import registered
+
+            all_of.enter_context(registered(read_all(config.effects_from)))
+        all_of.enter_context(_engine(config))
+        yield
 
 
 @contextlib.contextmanager

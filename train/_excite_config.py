@@ -4,11 +4,11 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
-from train._options import BaseOptions, EngineOptions
+from train._options import BaseOptions, EngineOptions, OwnEffectsOptions
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(EngineOptions, BaseOptions):
+class Config(EngineOptions, OwnEffectsOptions, BaseOptions):
     """Writes commands to play on the machine, so that its log says the most.
 
     Multisines, chirps, pulses and steps of several sizes are simulated in the model,

@@ -3,13 +3,13 @@
 import dataclasses
 from pathlib import Path
 
-from train._options import BaseOptions, EngineOptions
+from train._options import BaseOptions, EngineOptions, OwnEffectsOptions
 
 _HORIZON = 0.2  # s
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(EngineOptions, BaseOptions):
+class Config(EngineOptions, OwnEffectsOptions, BaseOptions):
     """Finds where a simulation and measured logs disagree, and names what is missing.
 
     The model predicts short windows of the logs from their measured starts. Every

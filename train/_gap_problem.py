@@ -88,6 +88,7 @@ def read_gap_problem(config: "Config") -> GapProblem:
     from easi_jax.gap.excitation_coverage import coverage_notes
     from easi_jax.gap.sensor_faults import reading_faults, without_faults
     from easi_jax.io.models.parameter_file import read_parameter_file
+    from easi_jax.model.own_effects_check import check_own_effects
     from easi_jax.model.parameter_proposal import own_space
     from train._log_problem import held_of, read_runs
 
@@ -95,6 +96,7 @@ def read_gap_problem(config: "Config") -> GapProblem:
         raise UserError(f"--horizon is {config.horizon:g}: give seconds above 0")
     model = read_model(config.model, config.allow_assets, held_of(config), True)
     mj_model = model.mj_model
+    check_own_effects(mj_model)
     space = (
         own_space(mj_model)
         if config.parameters is None

@@ -29,8 +29,18 @@ class EngineOptions:
     small robots, else mujoco; the choice is said, and kept by --resume."""
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OwnEffectsOptions:
+    """Effects that the user wrote."""
+
+    effects_from: tuple[Path, ...] = ()
+    """Python files with effects of your own (template:
+    examples/own_effects/coupling_spring.py), which join those that are known. They are
+    run."""
+
+
 @dataclasses.dataclass(frozen=True)
-class TargetOptions:
+class TargetOptions(OwnEffectsOptions):
     """The pseudo-real robot, and what it has that the model lacks."""
 
     target: tuple[str, ...] | None = None

@@ -5,13 +5,13 @@ from functools import partial
 from pathlib import Path
 
 from train._command import compiled, main, say, show_table
-from train._options import EngineOptions
+from train._options import EngineOptions, OwnEffectsOptions
 
 _FPS = 25  # frames per second of a video, about
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(EngineOptions):
+class Config(EngineOptions, OwnEffectsOptions):
     """Tests the policies of a run in a target of your choice.
 
     Prints the return of every seed and, with --out, writes all episodes as JSON.

@@ -7,12 +7,13 @@ from typing import Annotated, Any
 import tyro
 
 from train._command import main, say
+from train._options import OwnEffectsOptions
 
 _FORMS = ("onnx", "stablehlo", "mjcf", "randomization")
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(OwnEffectsOptions):
     """Writes a run's policy and parameters for other programs.
 
     onnx: the policy with its normalizer and action scaling, for onnxruntime

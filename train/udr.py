@@ -5,7 +5,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from train._command import main, say, show_table
-from train._options import EngineOptions, RobotOptions, RunOptions, TrainingOptions
+from train._options import (
+    EngineOptions,
+    OwnEffectsOptions,
+    RobotOptions,
+    RunOptions,
+    TrainingOptions,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,7 +22,9 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(RunOptions, EngineOptions, TrainingOptions, RobotOptions):
+class Config(
+    RunOptions, EngineOptions, TrainingOptions, OwnEffectsOptions, RobotOptions
+):
     """Trains a policy under uniformly random physics (UDR), the rough start of EASI.
 
     Each episode draws the robot's parameters from [nominal / k, k nominal]. The policy

@@ -26,6 +26,8 @@ class Segments:
         sensed: readings of N numbers of sensors where each step begins, or where it
             ends (`easi_jax.data.sensor_channels.SensorNumber.at_end`), ``(M, H, N)``;
             () where none are compared.
+        time: of the start since that of its run or episode, ``(M,)`` [s]; () where no
+            simulation has use for it.
     """
 
     qpos: Any
@@ -37,6 +39,7 @@ class Segments:
     past: Any = ()
     act: Any = ()
     sensed: Any = ()
+    time: Any = ()
 
     @property
     def count(self) -> int:
@@ -72,6 +75,7 @@ def cut(
     act: np.ndarray | None = None,
     before: np.ndarray | None = None,
     sensed: np.ndarray | None = None,
+    dt: float | None = None,
 ) -> Segments | None:
     """Segments of one uninterrupted recording ``(T, ...)``, None if too short.
 
@@ -81,6 +85,7 @@ def cut(
         before: commands before the first row, ``(D, nu)``.
         sensed: what sensors read where the step of a row begins, or ends,
             ``(T - 1, N)``.
+        dt: control step [s], where the pieces hold their times.
     """
     starts = np.arange(0, len(qpos) - horizon, every)
     if not len(starts):
@@ -98,6 +103,7 @@ def cut(
         past=sent[np.maximum(earlier, 0)] if past else (),
         act=act[starts] if act is not None and act.shape[1] else (),
         sensed=sensed[steps] if sensed is not None and sensed.shape[1] else (),
+        time=starts * dt if dt is not None else (),
     )
 
 
@@ -142,6 +148,7 @@ def windows(
         weight=flat(t.weight[:, rows].min(-1)),
         past=jax.tree.map(flat, before),
         act=jax.tree.map(lambda x: flat(x[:, starts]), t.act),
+        time=jax.tree.map(lambda x: flat(x[:, starts]), t.time),
     )
 
 

@@ -80,7 +80,8 @@ def segments_from_runs(
         )
         act = activation_guess(simulator.mj_model, run)
         given = run.qpos, qvel, run.ctrl, horizon, every, simulator.past_steps
-        parts.append(cut(*given, act, run.before, _read_in_steps(sensors, run)))
+        more = act, run.before, _read_in_steps(sensors, run)
+        parts.append(cut(*given, *more, run.dt if simulator.is_timed else None))
     whole = [p for p in parts if p is not None]
     if not whole:
         longest = max(runs, key=len)

@@ -22,7 +22,7 @@ from easi_jax.excite.separation import (
 from easi_jax.gap.batched_least_squares import bounds_of
 from easi_jax.gap.candidates import places, ripples
 from easi_jax.gap.table import Place, covered, does
-from easi_jax.model.effect_catalog import EFFECTS, Scales
+from easi_jax.model.effect_catalog import CATALOG, Scales
 from easi_jax.model.joint_space import scalar_dofs
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.step import WRITTEN_OUT
@@ -63,10 +63,10 @@ class Choice:
 def check_names(names: Sequence[str]) -> None:
     """Raises `UserError` for a name that is no effect's."""
     for name in names:
-        if name not in EFFECTS:
+        if name not in CATALOG:
             raise UserError(
-                f'unknown effect "{name}"{nearest(name, EFFECTS)} (known: '
-                f"{', '.join(EFFECTS)})"
+                f'unknown effect "{name}"{nearest(name, CATALOG)} (known: '
+                f"{', '.join(CATALOG)})"
             )
 
 

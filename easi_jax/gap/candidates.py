@@ -9,7 +9,12 @@ import numpy as np
 from easi_jax.gap.table import Column, Place, name_of
 from easi_jax.model.contact_pairs import contact_pairs
 from easi_jax.model.effect_catalog import CATALOG, Effect, Part, Scales, Spot
-from easi_jax.model.effect_numbers import NO_FORCE_LIMIT, field_of
+from easi_jax.model.effect_numbers import (
+    NO_FORCE_LIMIT,
+    OWN_LAWS,
+    field_of,
+    own_row,
+)
 from easi_jax.model.joint_space import scalar_dofs
 from easi_jax.model.parameter_proposal import like_places
 
@@ -123,16 +128,24 @@ def _adds(part: Part, c: Column) -> bool:
 
 
 def _column(part: Part, o: _Object) -> Column:
-    spot, (_, _, entry) = o.spot, part.column.partition(".")
-    last = (int(entry),) if entry else ()
+    spot = o.spot
     return Column(
         field_of(part.column),
-        (*o.index, *last) if not o.tied else (),
+        _index(part, o.index) if not o.tied else (),
         part.name,
         part.unit or part.number.unit(spot.m, spot.i),
         part.neutral(spot),
         *part.bounds(spot),
         part.size * spot.sizes[part.scale],
         spot.sizes[part.of],
-        tuple((*index, *last) for index in o.among),
+        tuple(_index(part, index) for index in o.among),
+        part.column,
     )
+
+
+def _index(part: Part, at: tuple[int, ...]) -> tuple[int, ...]:
+    """Where a number is in its field, for something that is there at ``at``."""
+    first, _, entry = part.column.partition(".")
+    if first in OWN_LAWS:
+        return own_row(part.column), *(at or (0,))
+    return (*at, int(entry)) if entry else at

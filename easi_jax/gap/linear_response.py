@@ -17,7 +17,8 @@ import numpy as np
 
 from easi_jax.devices.mesh import sharded_map
 from easi_jax.devices.runtime import quick_compile
-from easi_jax.gap.predictor import BLOCK, Predictor
+from easi_jax.gap.predictor import BLOCK, Predictor, Window
+from easi_jax.model.effect_numbers import OWN
 from easi_jax.simulation.step import Physics, arrived_step
 
 _SPACING = 0.01  # s between states, at most: commands and drives change in as much
@@ -27,7 +28,10 @@ _ALIKE = 0.1  # of what a torque does, that the recursion may be off in a window
 _STUCK = 1e-3  # of the most that a torque does: less is none
 # Fields of `Effects` that are no torques of a state, or change with it at once.
 _SIMULATED = frozenset(
-    ("bias", "late", "width", "rotor", "limit", "friction", "softness", "slip", "give")
+    (
+        *("bias", "late", "width", "rotor", "limit", "friction", "softness"),
+        *("slip", "give", OWN),
+    )
 )
 _BATCH = 8  # vectors at once on each device
 
@@ -193,7 +197,7 @@ def _linearized(
         path = p.simulator.difference(*both)
         return jnp.concatenate([path, other.act - first.act])
 
-    def window(w: tuple, moved: jax.Array) -> tuple:
+    def window(w: Window, moved: jax.Array) -> tuple:
         _, _, first, arrived = p.begun(model, w, moved)
         parts = _parts(arrived, p.steps, rows)
         half = parts.shape[1] // 2
@@ -234,7 +238,7 @@ def _linearized(
         )
 
     which, moved = blocks
-    return jax.vmap(jax.vmap(window))(tuple(a[which] for a in data), moved)
+    return jax.vmap(jax.vmap(window))(_some(which, data), moved)
 
 
 def _stepped(
@@ -253,7 +257,7 @@ def _stepped(
     def of_vector(x: jax.Array) -> jax.Array:
         model = p.model(x, left_out)
 
-        def window(w: tuple, moved: jax.Array, states: Physics) -> jax.Array:
+        def window(w: Window, moved: jax.Array, states: Physics) -> jax.Array:
             arrived = p.begun(model, w, moved)[-1]
             sent = _parts(arrived, p.steps, rows).mean(1)
 
@@ -263,9 +267,14 @@ def _stepped(
             return jax.vmap(one)(states, sent)
 
         of_block = jax.vmap(jax.vmap(window))
-        return of_block(tuple(a[blocks] for a in data), moved, middle)
+        return of_block(_some(blocks, data), moved, middle)
 
     return jax.vmap(of_vector)(x)
+
+
+def _some(which: jax.Array, data: tuple[jax.Array, ...]) -> Window:
+    """Blocks of windows."""
+    return jax.tree.map(lambda a: a[which], Window(*data))
 
 
 def _parts(arrived: jax.Array, steps: int, rows: int) -> jax.Array:

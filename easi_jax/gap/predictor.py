@@ -11,7 +11,7 @@ import copy
 import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,7 @@ from easi_jax.model.effect_numbers import EFFECT_TABLE, fields_that_act
 from easi_jax.model.effects import Effects
 from easi_jax.model.joint_space import dofs, scalar_places, turns_fully
 from easi_jax.model.mjx_model import Model, for_every_effect
+from easi_jax.model.own_laws import reading_offsets
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.progress import Wait, at_once
 from easi_jax.simulation import native_step
@@ -41,10 +42,35 @@ from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.step import Physics, arrived_sensed, arrived_step
 
 BLOCK = 16  # windows
+
+
+class Window(NamedTuple):
+    """One of a `WindowSet`, or some, on devices; what it has there, as simulated:
+    turns of hinges without limits counted, sensors that are predicted alone.
+
+    Attributes:
+        time: of its start, since the start of its run [s].
+    """
+
+    start_qpos: jax.Array
+    start_act: jax.Array
+    ctrl: jax.Array
+    past: jax.Array
+    past_qpos: jax.Array
+    past_qvel: jax.Array
+    read: jax.Array
+    speed: jax.Array
+    led: jax.Array
+    sensed: jax.Array
+    last: jax.Array
+    time: jax.Array
+
+
 _ITEMS = 4  # that a core works on together: many requests ask for few
 _STEPPED = 16  # likewise, where each physics step is a call: most of it is the calling
 _ACCELERATOR_ITEMS = 256
 _ROW = 0.01  # s of it at a time
+_PASSES = 3  # by which a reading is undone: each leaves a tenth of what is left
 
 
 def opened(m: mujoco.MjModel) -> mujoco.MjModel:
@@ -200,7 +226,7 @@ class Predictor:
         other.channels, other.largest = self.nv, self.largest[: self.nv]
         return other
 
-    def _placed(self, windows: WindowSet) -> tuple[jax.Array, ...]:
+    def _placed(self, windows: WindowSet) -> Window:
         """The windows in blocks, on all devices; the last is repeated to fill them."""
         fill = np.minimum(np.arange(self._room * BLOCK), len(windows) - 1)
         padded = windows.take(fill)
@@ -212,22 +238,10 @@ class Predictor:
             shape = (self._room, BLOCK, *x.shape[1:])
             return jax.device_put(np.asarray(x, np.float32).reshape(shape), whole)
 
-        return tuple(
-            blocks(x)
-            for x in (
-                padded.start_qpos,
-                padded.start_act,
-                padded.ctrl,
-                padded.past,
-                padded.past_qpos,
-                padded.past_qvel,
-                read,
-                padded.speed,
-                padded.led,
-                sensed,
-                padded.last,
-            )
-        )
+        of_set = {f: getattr(padded, f) for f in Window._fields if f != "time"}
+        time = padded.row * self.simulator.dt
+        given = of_set | {"read": read, "sensed": sensed, "time": time}
+        return Window(**{name: blocks(x) for name, x in given.items()})
 
     def _readings(self, windows: WindowSet) -> np.ndarray:
         """Of the sensors that are predicted, ``(W, T, N)``; planned motion has none."""
@@ -337,11 +351,10 @@ class Predictor:
         moved: jax.Array,
     ) -> jax.Array:
         model = self.model(x, left_out)
-        return jax.vmap(lambda w, d: self._window(model, w, d))(
-            tuple(a[block] for a in data), moved
-        )
+        some = jax.tree.map(lambda a: a[block], Window(*data))
+        return jax.vmap(lambda w, d: self._window(model, w, d))(some, moved)
 
-    def _window(self, model: Model, window: tuple, moved: jax.Array) -> jax.Array:
+    def _window(self, model: Model, window: Window, moved: jax.Array) -> jax.Array:
         """Readings less measurements at each row, ``(H + 1, nv + 2 N)``: those of
         sensors where a row's step begins, then where the step before it ends.
 
@@ -350,34 +363,34 @@ class Predictor:
         compared with the readings of the times that are simulated: as far from its
         start as without delays. Where a run only begins, all is later by that delay.
         """
-        *_, ctrl, _, _, _, _, speed, led, sensed, _ = window
         simulator, e, nv = self.simulator, model.effects, self.nv
         assert e is not None
-        start_q = window[0]
         q, read, physics, arrived = self.begun(model, window, moved)
-        early = led * jnp.max(e.late)
-        start = len(speed) // 2  # its row in both
+        early = window.led * jnp.max(e.late)
+        start = len(window.speed) // 2  # its row in both
 
         def step(state: Physics, u: jax.Array) -> tuple:
             if not self.sensors:
                 state = arrived_step(model, state, u)
-                return state, (state.qpos, ())
+                return state, (state.qpos, state.qvel, ())
             state, each = arrived_sensed(model, state, u)
-            return state, (state.qpos, each)
+            return state, (state.qpos, state.qvel, each)
 
         at_once = None
         if simulator.engine == "mujoco":
             at_once = native_step.replay(model, physics, arrived)
         if at_once:
-            qs, _, readings = at_once
+            qs, vs, readings = at_once
         else:
-            qs, readings = jax.lax.scan(step, physics, arrived)[1]
+            qs, vs, readings = jax.lax.scan(step, physics, arrived)[1]
         # From the start, so that readings are plain numbers also where q is not.
         zero = jnp.zeros(nv)
         difference = jax.vmap(simulator.difference, (None, None, 0, None))
-        qs = jnp.concatenate([q[None], qs[: len(ctrl)]])
-        path = difference(start_q, zero, qs, zero)[:, :nv]
-        error = path + e.bias - read
+        count = len(window.ctrl)
+        qs = jnp.concatenate([q[None], qs[:count]])
+        vs = jnp.concatenate([physics.qvel[None], vs[:count]])
+        path = difference(window.start_qpos, zero, qs, zero)[:, :nv]
+        error = path + e.bias + self._misread(model, window, qs, vs) - read
         turn = 2 * jnp.pi
         near = error - turn * jnp.round(error / turn)
         error = jnp.where(self.wrapped, near, error)
@@ -385,30 +398,63 @@ class Predictor:
             return error
         row = start - early / simulator.dt + jnp.arange(self.steps + 1)
         read = jnp.broadcast_to(row[:, None], (len(row), len(self.sensors)))
-        read = _between(sensed, read)
+        read = _between(window.sensed, read)
         readings = self.sensors.reading.alike(readings, read[:, None])
         begins, ends = readings[:, 0] - read, readings[:-1, 1] - read[1:]
         return jnp.concatenate([error, begins, jnp.pad(ends, [(1, 0), (0, 0)])], 1)
 
+    def _misread(
+        self, model: Model, window: Window, qs: jax.Array, vs: jax.Array
+    ) -> jax.Array:
+        """What owners' effects add to the readings of some rows from the start on,
+        positions ``(T, nq)``, ``(T, nv)``."""
+        e, dt = model.effects, self.simulator.dt
+        if e is None or not effects.has_own(e, model.present):
+            return jnp.zeros_like(vs)
+        sent = jnp.concatenate([window.ctrl, window.last[None]])[: len(qs)]
+        time = window.time + dt * jnp.arange(len(qs))
+        of_row = partial(reading_offsets, e.own, e.laws)
+        return jax.vmap(of_row)(qs, vs, sent, time)
+
+    def _true(
+        self, model: Model, window: Window, qpos: jax.Array, qvel: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Where joints are, and how fast, whose readings at the start are these."""
+        if not effects.has_own(model.effects, model.present):
+            return qpos, qvel
+        at, dof = self._scalar
+
+        def off(q: jax.Array) -> jax.Array:
+            return self._misread(model, window, q[None], qvel[None])[0]
+
+        q, v = qpos, qvel
+        for _ in range(_PASSES):
+            along = jnp.zeros_like(q).at[at].set(v[dof])
+            position, speed = jax.jvp(off, (q,), (along,))
+            q, v = self.simulator.move(qpos, -position), qvel - speed
+        return q, v
+
     def begun(
-        self, model: Model, window: tuple, moved: jax.Array
+        self, model: Model, window: Window, moved: jax.Array
     ) -> tuple[jax.Array, jax.Array, Physics, jax.Array]:
         """Where a window begins ``(nq,)``, what its joints are compared with ``(H + 1,
         nv)``, its first state, and what reaches the actuators in the physics steps of
         each row after it, ``(H, substeps, nu)``, one row more with sensors."""
-        start_q, start_act, ctrl, past, past_q, past_v, seen, speed, led, *more = window
-        simulator, e, nv = self.simulator, model.effects, self.nv
+        w, simulator, e, nv = window, self.simulator, model.effects, self.nv
         assert e is not None
-        early = led * jnp.max(e.late)
-        start = len(speed) // 2  # its row in both
+        early = w.led * jnp.max(e.late)
+        start = len(w.speed) // 2  # its row in both
         now = start - (early - e.late) / simulator.dt  # (nv,)
-        read = _between(seen, now + jnp.arange(self.steps + 1)[:, None])
-        v = _between(speed, now[None])[0]
-        q = simulator.move(start_q, read[0] - e.bias + moved[:nv])
+        read = _between(w.read, now + jnp.arange(self.steps + 1)[:, None])
+        v = _between(w.speed, now[None])[0]
+        q, v = self._true(model, w, simulator.move(w.start_qpos, read[0] - e.bias), v)
+        q = simulator.move(q, moved[:nv])
         physics = simulator.start(q, v + moved[nv : 2 * nv], model)
-        physics = physics.replace(memory=(), act=start_act + moved[2 * nv :])
+        physics = physics.replace(memory=(), act=w.start_act + moved[2 * nv :])
+        if effects.has_own(e, model.present):
+            physics = physics.replace(time=w.time - early)
         # Sensors are read where a step begins, the last of them after the last step.
-        sent = [past, ctrl, more[1][None]] if self.sensors else [past, ctrl]
+        sent = [w.past, w.ctrl, w.last[None]] if self.sensors else [w.past, w.ctrl]
         arrived = effects.command_sequence(
             e.replace(delay=e.delay + early),
             jnp.concatenate(sent),
@@ -417,9 +463,9 @@ class Predictor:
             simulator.substeps,
         )
         if effects.has_backlash(model.present):
-            before = (past_q, past_v)
-            physics = self._turned(model, physics, arrived[: len(past)], *before)
-        return q, read, physics, arrived[len(past) :]
+            before = (w.past_qpos, w.past_qvel)
+            physics = self._turned(model, physics, arrived[: len(w.past)], *before)
+        return q, read, physics, arrived[len(w.past) :]
 
     def _turned(
         self, model: Model, first: Physics, arrived: Any, qpos: Any, qvel: Any

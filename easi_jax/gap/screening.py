@@ -175,8 +175,9 @@ class Screening:
     def _linear(self, x: np.ndarray) -> np.ndarray:
         assert self.linear is not None
         s, at = self.selector, self.seen
-        changes = s.residuals.grouped(self.linear.changes(s.plain(x)))
-        return self.first + s.residuals.whitened(changes, at)
+        # Of short windows fits see the first rows.
+        changes = self.linear.changes(s.plain(x))[:, :, : s.rows]
+        return self.first + s.residuals.whitened(s.residuals.grouped(changes), at)
 
 
 def as_sine(start: np.ndarray, end: np.ndarray) -> np.ndarray:

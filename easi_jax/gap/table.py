@@ -12,7 +12,6 @@ import numpy as np
 
 from easi_jax.model import addresses as language
 from easi_jax.model.effect_catalog import CATALOG, Effect
-from easi_jax.model.effect_numbers import VECTORS
 from easi_jax.model.parameters import ParameterSpace
 
 
@@ -31,6 +30,7 @@ class Column:
         of: what people are told is the value times this.
         among: places in the field that all have it on top of their own; the empty
             ``index`` of a column without them means all places.
+        name: in an effects file: ``com.0`` for one entry of a vector.
     """
 
     field: str
@@ -43,13 +43,7 @@ class Column:
     size: float
     of: float = 1.0
     among: tuple[tuple[int, ...], ...] = ()
-
-    @property
-    def name(self) -> str:
-        """In an effects file: ``com.0`` for one entry of a vector."""
-        index = self.among[0] if self.among else self.index
-        entry = f".{index[-1]}" if self.field in VECTORS else ""
-        return self.field + entry
+    name: str = ""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from mujoco.mjx._src.collision_driver import geom_pairs
 
 from easi_jax.errors import UserError, nearest
 from easi_jax.model.contact_pairs import pair_names
-from easi_jax.model.effect_numbers import EFFECT_TABLE, VECTORS
+from easi_jax.model.effect_numbers import EFFECT_TABLE, is_vector
 from easi_jax.model.quantities import TABLE as MODEL_TABLE
 from easi_jax.model.quantities import Entry, Inert, Quantity, direct_solref, value_of
 
@@ -96,7 +96,7 @@ def split(address: str) -> tuple[str, str, str]:
         name, quantity = "", rest
     elif kind == "effect":
         quantity, _, name = rest.partition(".")
-        if quantity in VECTORS:
+        if is_vector(quantity):
             name, _, part = name.rpartition(".")
             quantity = f"{quantity}.{part}"
     else:

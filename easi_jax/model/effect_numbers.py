@@ -8,13 +8,14 @@ make up: `easi_jax.model.effect_catalog`.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import mujoco
 import numpy as np
 
 from easi_jax.model.backlash import geared
 from easi_jax.model.joint_space import is_scalar
+from easi_jax.model.own_laws import Function
 from easi_jax.model.quantities import (
     SEED,
     Entry,
@@ -328,23 +329,69 @@ READING_TABLE: dict[str, EffectNumber] = {
 }
 NUMBERS = {**EFFECT_TABLE, **READING_TABLE}
 
+OWN = "own"  # the field that holds the numbers of all effects that owners wrote
+
+
+class OwnLaw(NamedTuple):
+    """What an owner's effect does (`easi_jax.model.own_effects`).
+
+    Attributes:
+        name: of the effect.
+        numbers: their names; columns are called ``EFFECT.NUMBER``.
+        on: what it sits at: joint, actuator or model.
+        fits: whether it may sit at a joint or actuator of this name.
+        force, command, reading: its functions.
+    """
+
+    name: str
+    numbers: tuple[str, ...]
+    on: str
+    fits: Callable[[str], bool]
+    force: Function | None
+    command: Function | None
+    reading: Function | None
+
+
+# Those that are registered, in the order of the rows of their numbers.
+OWN_LAWS: dict[str, OwnLaw] = {}
+
+
+def own_row(column: str) -> int:
+    """The row of a number of an owner's effect."""
+    name, _, number = column.partition(".")
+    before = list(OWN_LAWS).index(name)
+    rows = [len(law.numbers) for law in OWN_LAWS.values()]
+    return sum(rows[:before]) + OWN_LAWS[name].numbers.index(number)
+
 
 def field_of(column: str) -> str:
     """The field of `easi_jax.model.effects.Effects` that a number is in."""
-    return column.partition(".")[0]
+    first = column.partition(".")[0]
+    return OWN if first in OWN_LAWS else first
 
 
-VECTORS = tuple(dict.fromkeys(field_of(c) for c in NUMBERS if "." in c))
+_VECTORS = tuple(dict.fromkeys(field_of(c) for c in NUMBERS if "." in c))
+
+
+def is_vector(first: str) -> bool:
+    """Whether columns of this first part have a second one: ``com.0``."""
+    return first in _VECTORS or first in OWN_LAWS
 
 
 def fields_that_act(where: Acts) -> tuple[str, ...]:
-    """Fields whose numbers act there."""
-    return tuple(
-        dict.fromkeys(field_of(c) for c, n in NUMBERS.items() if n.acts == where)
-    )
+    """Fields whose numbers act there; what owners write acts in steps."""
+    named = dict.fromkeys(field_of(c) for c, n in NUMBERS.items() if n.acts == where)
+    return (*named, OWN) if where == "step" else tuple(named)
 
 
 _READINGS = fields_that_act("readings")
+
+
+def _is_read(column: str) -> bool:
+    """Whether a number is in the readings, not in the physics."""
+    if column in NUMBERS:
+        return NUMBERS[column].acts == "readings"
+    return field_of(column) in _READINGS  # of a sensor of several numbers
 
 
 def is_column(name: str) -> bool:
@@ -377,7 +424,7 @@ class EffectEntry:
     @property
     def of_readings(self) -> bool:
         """Whether it is in the readings of a sensor, not in the physics."""
-        return all(field_of(column) in _READINGS for column in self.columns)
+        return all(_is_read(column) for column in self.columns)
 
     def address(self, column: str) -> str:
         """The address of one of its numbers."""

@@ -25,13 +25,16 @@ from easi_jax.model.contact_pairs import Pair, pair_ids
 from easi_jax.model.effect_numbers import (
     NO_FORCE_LIMIT,
     NUMBERS,
-    VECTORS,
+    OWN,
+    OWN_LAWS,
     EffectNumber,
     field_of,
     fields_that_act,
+    is_vector,
 )
 from easi_jax.model.joint_space import scalar_places
 from easi_jax.model.native_model import NativeModel, as_precise
+from easi_jax.model.own_laws import Law, acting, actuators_of, joints_of, widest
 from easi_jax.model.set_const import set_const
 
 _TINY = 1e-9
@@ -82,6 +85,8 @@ class Effects:
         rotor: inertia of the drive's side, part of the joint's, ``(nv,)``.
         effective_inertia: that a torque at the joint alone meets, ``(nv,)``; no effect,
             but what `backlash` goes by.
+        own: numbers of what owners wrote, a row each, ``(K, P)``; () without any.
+        laws: what that does (static).
     """
 
     coulomb: jax.Array
@@ -120,6 +125,8 @@ class Effects:
     width: jax.Array
     rotor: jax.Array
     effective_inertia: jax.Array
+    own: Any = ()
+    laws: tuple[Law, ...] = flax.struct.field(pytree_node=False, default=())
 
     if TYPE_CHECKING:  # made by flax
 
@@ -147,18 +154,45 @@ def none(m: mujoco.MjModel) -> Effects:
     count["geom"] = len(pair_ids(m))
     fields: dict[str, list[EffectNumber]] = {}
     for column, number in NUMBERS.items():
-        fields.setdefault(field_of(column), []).append(number)
+        if (field := field_of(column)) != OWN:
+            fields.setdefault(field, []).append(number)
 
     def leaf(field: str, numbers: Sequence[EffectNumber]) -> jax.Array:
         places = [count[n.on] for n in numbers[:1] if n.on != "model"]
-        entries = [len(numbers)] if field in VECTORS else []
+        entries = [len(numbers)] if is_vector(field) else []
         neutral = min(numbers[0].neutral, NO_FORCE_LIMIT)
         return jnp.full((*places, *entries), neutral, jnp.float32)
 
     return Effects(
         effective_inertia=jnp.asarray(backlash.felt_inertia(m), jnp.float32),
         **{field: leaf(field, numbers) for field, numbers in fields.items()},
+        **_own(m),
     )
+
+
+def _own(m: mujoco.MjModel) -> dict[str, Any]:
+    """What owners wrote, without strength."""
+    if not OWN_LAWS:
+        return {}
+    laws: list[Law] = []
+    neutral: list[float] = []
+    dofs = {name: dof for name, _, dof in joints_of(m)}
+    columns = {"joint": dofs, "model": {"": 0}}
+    columns["actuator"] = {name: a for a, name in enumerate(actuators_of(m))}
+    for own in OWN_LAWS.values():
+        sites = [
+            x for x in columns[own.on].items() if own.on == "model" or own.fits(x[0])
+        ]
+        laws.append(
+            Law(
+                *(own.name, own.numbers, len(neutral), tuple(sites)),
+                *(joints_of(m), actuators_of(m)),
+                *(own.force, own.command, own.reading),
+            )
+        )
+        neutral += [NUMBERS[f"{own.name}.{n}"].neutral for n in own.numbers]
+    known = jnp.broadcast_to(jnp.array(neutral)[:, None], (len(neutral), widest(m)))
+    return {OWN: known.astype(jnp.float32), "laws": tuple(laws)}
 
 
 _STATIC = fields_that_act("model")
@@ -179,6 +213,11 @@ def has_command_memory(present: tuple[str, ...] | None) -> bool:
 def has_backlash(present: tuple[str, ...] | None) -> bool:
     """Whether drives may have play."""
     return present is None or "width" in present
+
+
+def has_own(e: Effects | None, present: tuple[str, ...] | None) -> bool:
+    """Whether something acts that an owner wrote."""
+    return e is not None and bool(e.laws) and (present is None or OWN in present)
 
 
 def has_body_drag(present: tuple[str, ...] | None) -> bool:
@@ -313,6 +352,8 @@ def in_step(
         rotor: drives before the step (`backlash.Rotor`); empty where none has play.
     """
     at, dof = scalar_places(m).T
+    if e.laws and not isinstance(d.time, tuple):
+        d = acting(d, e.own, e.laws)
     v = d.qvel
     fall = jnp.exp(-jnp.square(v / e.stribeck))
     m = m.replace(

@@ -14,6 +14,7 @@ import numpy as np
 from easi_jax.errors import UserError
 from easi_jax.model import addresses as language
 from easi_jax.model.effect_numbers import EFFECT_TABLE, EffectEntry
+from easi_jax.model.own_effects_check import check_own_effects
 from easi_jax.model.parameters import Parameter, ParameterSpace
 
 _STDS = 3.0
@@ -66,6 +67,7 @@ def joined(
     stay = dict(rest)
     for entry in found.physical:
         _check(m, entry)
+    check_own_effects(m, [e.effect for e in found.entries])
     for alike in _alike(found.physical):
         for column, value in alike[0].columns.items():
             p = _parameter(m, alike, column, value)

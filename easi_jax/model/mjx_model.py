@@ -19,7 +19,7 @@ from easi_jax.errors import UserError
 from easi_jax.model import effects as physical
 from easi_jax.model.addresses import Writer, open_gates, resolve
 from easi_jax.model.contact_pairs import Pair, pair_ids, without_pairs
-from easi_jax.model.effect_numbers import direct_contacts
+from easi_jax.model.effect_numbers import direct_contacts, field_of
 from easi_jax.model.effects import Effects
 from easi_jax.model.mjx_data import make_data, without_idle_cone
 from easi_jax.model.native_model import NativeModel, Template, as_precise
@@ -244,7 +244,7 @@ def put_model(
     n = len(per_parameter)
     lasting = [replace(w, parameter=w.parameter - n) for w in writers]
     lasting = tuple(w for w in lasting if w.parameter >= 0)
-    present = {w.quantity.split(".")[0] for w in writers if w.kind == "effect"}
+    present = {field_of(w.quantity) for w in writers if w.kind == "effect"}
     model = Model(
         mjx=put,
         speed_limit=jnp.full(mj_model.nv, jnp.inf),

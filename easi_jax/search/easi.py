@@ -373,6 +373,7 @@ class Search:
             weight=tile(seg.weight),
             past=jax.tree.map(tile, seg.past),
             act=jax.tree.map(tile, seg.act),
+            time=jax.tree.map(tile, seg.time),
         )
         return seg, reference, fake, jax.tree.map(tile, reference)
 

@@ -40,6 +40,7 @@ class StepData:
     ctrl: jax.Array
     qfrc_applied: jax.Array
     xfrc_applied: jax.Array
+    time: Any = ()
     xipos: Any = ()
     subtree_com: Any = ()
     cvel: Any = ()
@@ -169,7 +170,8 @@ def _one(model: Any, state: Any, ctrl: jax.Array) -> Any:
         m = model.torque_speed.limited(m, state.qvel)
     zero = jnp.zeros((m.nbody, 6), state.qpos.dtype)
     d = StepData(
-        *(state.qpos, state.qvel, state.act, ctrl), jnp.zeros_like(state.qvel), zero
+        *(state.qpos, state.qvel, state.act, ctrl),
+        *(jnp.zeros_like(state.qvel), zero, state.time),
     )
     if acting:
         m, d, rotor = effects.in_step(m, d, e, rotor)  # type: ignore[arg-type]
@@ -178,9 +180,12 @@ def _one(model: Any, state: Any, ctrl: jax.Array) -> Any:
             d = d.replace(**dict(zip(native.PLACES, places, strict=True)))
             d = effects.body_resistance(m, d, e)  # type: ignore[arg-type]
     out, _, sensed = native.run(
-        *(m, state, ctrl[None], d.qfrc_applied, d.xfrc_applied),
+        *(m, state, d.ctrl[None], d.qfrc_applied, d.xfrc_applied),
         read=_reading(model),
         pairs=_pairs(model),
         edge=_edge(model),
     )
-    return _after(model, state, out, sensed).replace(rotor=rotor)
+    after = _after(model, state, out, sensed).replace(rotor=rotor)
+    if isinstance(state.time, tuple):
+        return after
+    return after.replace(time=state.time + m.opt.timestep)

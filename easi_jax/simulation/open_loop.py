@@ -47,7 +47,7 @@ def _predicted(
     senses: bool,
 ) -> tuple[jax.Array, jax.Array, Any]:
     def one(
-        qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array, past: Any, act: Any
+        qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array, past: Any, act: Any, t: Any
     ) -> Any:
         def step(state: Any, u: jax.Array) -> Any:
             if senses:
@@ -58,6 +58,8 @@ def _predicted(
 
         known = None if isinstance(act, tuple) else act
         first = simulator.start(qpos, qvel, act=known)
+        if not isinstance(first.time, tuple) and not isinstance(t, tuple):
+            first = dataclasses.replace(first, time=t)
         if not senses:
             first = dataclasses.replace(first, sensed=())
         if not isinstance(past, tuple):
@@ -78,10 +80,11 @@ def _predicted(
             put = jax.tree.map(lambda row, x: row.at[i].set(x), carry[1], seen)
             return state, put
 
-        return jax.lax.fori_loop(0, steps, at, (first, begun))[1]
+        end = jnp.asarray(steps)
+        return jax.lax.fori_loop(jnp.zeros_like(end), end, at, (first, begun))[1]
 
     s = segments
-    return jax.vmap(one)(s.qpos, s.qvel, s.ctrl, s.past, s.act)
+    return jax.vmap(one)(s.qpos, s.qvel, s.ctrl, s.past, s.act, s.time)
 
 
 def prediction_residuals(

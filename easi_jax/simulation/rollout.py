@@ -57,6 +57,7 @@ def policy_rollout(
             weight=alive,
             past=sent if past else (),
             act=state.physics.act if state.physics.act.size else (),
+            time=state.physics.time,
         )
         sent = jnp.concatenate([sent, ctrl[None]])[1:]
         if auto_reset:
@@ -118,4 +119,5 @@ def measured(
         weight=t.weight,
         past=t.past,
         act=t.act,
+        time=t.time,
     )

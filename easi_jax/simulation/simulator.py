@@ -121,6 +121,11 @@ class Simulator:
             return _ACCELERATOR_BATCH
         return _WIDE_BATCH if self.wide else _BATCH
 
+    @property
+    def is_timed(self) -> bool:
+        """Whether something in it may depend on the time: an owner's effect."""
+        return effects.has_own(self.base.effects, self.base.present)
+
     def _longest(self, kind: str) -> float:
         """The largest value that effects of a kind may have [s]; 0 without any."""
         fixed = [v for a, v in self.fixed.items() if a.startswith(kind)]

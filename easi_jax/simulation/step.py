@@ -46,6 +46,8 @@ class Physics:
         rotor: drives with play, where there are any.
         rest: on the engine ``mujoco`` what else its state has (delayed commands and
             readings, plugins, plastic deformation), as words, ``(k,)`` uint32.
+        time: of the recording or episode, where owners' effects may ask for it, ``()``
+            [s].
     """
 
     qpos: jax.Array
@@ -56,6 +58,7 @@ class Physics:
     memory: Any = ()
     rotor: Any = ()
     rest: Any = ()
+    time: Any = ()
 
     if TYPE_CHECKING:  # made by flax
 
@@ -74,7 +77,8 @@ def at_rest(model: Any, qpos: jax.Array, qvel: jax.Array) -> Physics:
         memory = effects.first_memory(model.delay_steps, m.nu)
     native = isinstance(m, NativeModel)
     rest = jnp.asarray(first_rest(m.template.mj)) if native else ()
-    return Physics(qpos, qvel, act, warm, sensed, memory, rotor, rest)
+    time = jnp.zeros(()) if effects.has_own(e, model.present) else ()
+    return Physics(qpos, qvel, act, warm, sensed, memory, rotor, rest, time)
 
 
 def data_at(model: Any, state: Physics, ctrl: jax.Array) -> mjx.Data:
@@ -201,14 +205,18 @@ def substep(model: Any, state: Physics, ctrl: jax.Array, wide: bool = False) -> 
     if model.torque_speed is not None:
         m = model.torque_speed.limited(m, state.qvel)
     d = data_at(model, state, ctrl)
-    e, rotor = model.effects, state.rotor
+    e, rotor, time = model.effects, state.rotor, state.time
+    if effects.has_own(e, model.present):
+        d, time = d.replace(time=time), time + m.opt.timestep
     if e is not None:
         m, d, rotor = effects.in_step(m, d, e, rotor)
     with refusals(NotImplementedError):
         d = mjx_step(m, d, wide, _within(model))
     qvel = jnp.clip(d.qvel, -model.speed_limit, model.speed_limit)
     sensed = model.sense(model.mjx, d) if model.sense else ()
-    return Physics(d.qpos, qvel, d.act, d.qacc_warmstart, sensed, (), rotor)
+    return Physics(
+        *(d.qpos, qvel, d.act, d.qacc_warmstart, sensed, (), rotor), time=time
+    )
 
 
 # What is too large to be written out (benchmarks/engines.py) takes the wide solver.

@@ -20,7 +20,7 @@ import yaml
 from easi_jax.errors import UserError, nearest
 from easi_jax.io.files import atomic_write, to_plain
 from easi_jax.io.strict_yaml import read_yaml
-from easi_jax.model.effect_catalog import EFFECTS
+from easi_jax.model.effect_catalog import CATALOG
 from easi_jax.model.effect_numbers import NUMBERS, is_column
 from easi_jax.model.found_effects import EffectEntry, FoundEffects
 
@@ -110,10 +110,11 @@ def _entry(path: str, i: int, item: Any) -> EffectEntry:
                 f'{path}, {where}: unknown key "{key}"{nearest(str(key), _KEYS)}'
             )
     name = str(item.get("effect", ""))
-    if name not in EFFECTS:
+    if name not in CATALOG:
         raise UserError(
-            f'{path}, {where}: unknown effect "{name}"{nearest(name, EFFECTS)} '
-            f"(known: {', '.join(EFFECTS)})"
+            f'{path}, {where}: unknown effect "{name}"{nearest(name, CATALOG)} '
+            f"(known: {', '.join(CATALOG)}); one that you wrote yourself needs "
+            "--effects-from FILE.py"
         )
     columns = item.get("columns")
     if not isinstance(columns, dict) or not columns:
