@@ -120,7 +120,7 @@ def main(
 def _about(config: Any) -> Iterator[None]:
     """What holds while a command runs: the user's effects, the engine."""
     with contextlib.ExitStack() as all_of:
-        if isinstance(config, OwnEffectsOptions) and config.effects_from:
+        if isinstance(config, OwnEffectsOptions):
             from easi_jax.io.models.own_effects_file import read_all
             from easi_jax.model.own_effects import registered
 

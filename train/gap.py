@@ -63,7 +63,7 @@ def run(config: Config) -> None:
         outcome = analysis.run()
         for note in outcome.notes:
             say(f"note: {note}")
-        result, whole = write_all(folder, config, problem, analysis, outcome)
+        result, whole = write_all(folder, config, problem, analysis.final, outcome)
         if whole:
             analysis.journal.clear()
         else:

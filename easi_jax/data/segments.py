@@ -28,6 +28,8 @@ class Segments:
             () where none are compared.
         time: of the start since that of its run or episode, ``(M,)`` [s]; () where no
             simulation has use for it.
+        hidden: what laws remember there (`easi_jax.data.law_states`), ``(M, S)``;
+            likewise.
     """
 
     qpos: Any
@@ -40,6 +42,7 @@ class Segments:
     act: Any = ()
     sensed: Any = ()
     time: Any = ()
+    hidden: Any = ()
 
     @property
     def count(self) -> int:
@@ -75,7 +78,7 @@ def cut(
     act: np.ndarray | None = None,
     before: np.ndarray | None = None,
     sensed: np.ndarray | None = None,
-    dt: float | None = None,
+    timed: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Segments | None:
     """Segments of one uninterrupted recording ``(T, ...)``, None if too short.
 
@@ -85,7 +88,8 @@ def cut(
         before: commands before the first row, ``(D, nu)``.
         sensed: what sensors read where the step of a row begins, or ends,
             ``(T - 1, N)``.
-        dt: control step [s], where the pieces hold their times.
+        timed: time of each row ``(T,)`` and what laws remember there ``(T, S)``, where
+            the pieces hold them.
     """
     starts = np.arange(0, len(qpos) - horizon, every)
     if not len(starts):
@@ -103,7 +107,8 @@ def cut(
         past=sent[np.maximum(earlier, 0)] if past else (),
         act=act[starts] if act is not None and act.shape[1] else (),
         sensed=sensed[steps] if sensed is not None and sensed.shape[1] else (),
-        time=starts * dt if dt is not None else (),
+        time=timed[0][starts] if timed is not None else (),
+        hidden=timed[1][starts] if timed is not None else (),
     )
 
 
@@ -149,6 +154,7 @@ def windows(
         past=jax.tree.map(flat, before),
         act=jax.tree.map(lambda x: flat(x[:, starts]), t.act),
         time=jax.tree.map(lambda x: flat(x[:, starts]), t.time),
+        hidden=jax.tree.map(lambda x: flat(x[:, starts]), t.hidden),
     )
 
 

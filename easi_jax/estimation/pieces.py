@@ -8,6 +8,7 @@ import numpy as np
 
 from easi_jax.data.activations import activation_guess
 from easi_jax.data.cleaning import _STEPS_AGREE, trusted_velocity
+from easi_jax.data.law_states import law_states, times
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import Segments, cut, join, windows
 from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
@@ -81,7 +82,10 @@ def segments_from_runs(
         act = activation_guess(simulator.mj_model, run)
         given = run.qpos, qvel, run.ctrl, horizon, every, simulator.past_steps
         more = act, run.before, _read_in_steps(sensors, run)
-        parts.append(cut(*given, *more, run.dt if simulator.is_timed else None))
+        timed = None
+        if simulator.is_timed:
+            timed = times(run), law_states(simulator.mj_model, run)
+        parts.append(cut(*given, *more, timed))
     whole = [p for p in parts if p is not None]
     if not whole:
         longest = max(runs, key=len)

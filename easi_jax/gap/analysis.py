@@ -8,7 +8,7 @@ reported at in nothing else.
 
 import itertools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -26,6 +26,7 @@ from easi_jax.gap.effect_set import Model
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.fitting import Fitting, steps_error
 from easi_jax.gap.held_out import HeldOut
+from easi_jax.gap.law_search import LawSearch, Proposed
 from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.recorded import recorded
 from easi_jax.gap.result import Outcome, last_figures
@@ -33,6 +34,7 @@ from easi_jax.gap.statements import stated
 from easi_jax.gap.window_set import WindowSet, join, reach, spread, window_set
 from easi_jax.gap.window_starts import window_starts
 from easi_jax.io.runs.step_cache import Journal, key_of
+from easi_jax.model.found_laws import add_law
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.progress import Progress, Wait, at_once, silent
 from easi_jax.simulation.logged import Logged
@@ -46,8 +48,29 @@ _STEPS = 9_600  # physics steps in them
 Tell = Callable[[str], None]
 
 
+@dataclass(frozen=True)
+class _Chosen:
+    """Effects that fitting data show.
+
+    Attributes:
+        base: the model without them.
+        model: with them.
+        rivals: of each, best first.
+        notes: on what was left out.
+    """
+
+    base: Model
+    model: Model
+    rivals: Mapping[str, Sequence[Model]]
+    notes: list[str]
+
+
 class Analysis:
     """One model and its data, ready to be asked.
+
+    Attributes:
+        final: after `run`, the analysis that its outcome is of: this one, or one that
+            knows the laws that were found.
 
     Raises:
         UserError: data too short, too still, or that the model does not cover.
@@ -65,13 +88,18 @@ class Analysis:
         fixed: Mapping[str, float] | None = None,
         progress: Progress = silent,
         wait: Wait = at_once,
+        only: Collection[str] | None = None,
     ) -> None:
+        """``only``: keys of the effects that are offered; None: all of the catalog."""
         self.m, self.space, self.tell = mj_model, space, tell
+        self._given = mj_model, space, fit, held, noise, horizon, tell
+        self._more = {"fixed": fixed, "progress": progress, "wait": wait}
+        self.final = self
         self.fixed, self._progress = dict(fixed or {}), progress
         dt, runs = fit[0].dt, [*fit, *held]
         scales = scales_of(mj_model, fit)
         sensors, self._ignored = measured_sensors(mj_model, runs)
-        self.places = Places(mj_model, space, scales)
+        self.places = Places(mj_model, space, scales, only)
         shown = [*self.places.everywhere, *self.places.ripples]
         layout = Layout(mj_model, shown)
         self.bounds = bounds_of(space, layout)
@@ -232,10 +260,38 @@ class Analysis:
     # -- the whole -------------------------------------------------------------
 
     def run(self) -> Outcome:
-        """Finds, names and measures."""
-        began, search = time.perf_counter(), self.search
+        """Finds, names and measures; `final` is then the analysis that did."""
+        began = time.perf_counter()
         self.tell("compiling the predictions ...")
         notes = self._read_early()
+        chosen = self._chosen()
+        proposed = proposed_laws(self, chosen.model)
+        if proposed:
+            names = [add_law(p.law, p.sizes) for p in proposed]
+            for p in proposed:
+                unit = p.law.unit_of_force(self.m)
+                self.tell(f"a law is proposed: {p.law.shown(p.sizes, unit)}")
+            kept = [p.key for p in chosen.model.places]
+            laws = [
+                f"{name}@{p.law.at}" for name, p in zip(names, proposed, strict=True)
+            ]
+            other = Analysis(*self._given, **self._more, only=[*kept, *laws])
+            other.journal = self.journal
+            other.predictor.early[:] = self.predictor.early
+            richer = other._chosen()
+            if any(p.key in laws for p in richer.model.places):
+                self.final, chosen = other, richer
+        outcome = self.final._stated(chosen)
+        return replace(
+            outcome,
+            notes=[*notes, *chosen.notes, *outcome.notes],
+            disagreeing=self.final.disagreeing(outcome),
+            seconds=time.perf_counter() - began,
+        )
+
+    def _chosen(self) -> _Chosen:
+        """The effects that fitting data show."""
+        search = self.search
         at = search.at
         for f in dict.fromkeys([self.reported, at]):
             f.begin(f.neutral)
@@ -260,19 +316,26 @@ class Analysis:
             model = search.select(base)
         if model.places:
             base, model = search.at.again(base), search.at.again(model)
-        model, rivals, more = search.needful(model, self.step)
+        model, rivals, notes = search.needful(model, self.step)
+        return _Chosen(base, model, rivals, notes)
+
+    def _stated(self, c: _Chosen) -> Outcome:
+        """What held-out data say of them."""
+        search = self.search
         if search.at.own_steps:
             error = steps_error(self.predictor, self.data)
             self.held_out.steps = error[-len(self.held_out.windows) :]
-        outcome = stated(
-            search, self.held_out, self.space, base, model, rivals, self.step
-        )
-        return replace(
-            outcome,
-            notes=[*notes, *more, *outcome.notes],
-            disagreeing=self.disagreeing(outcome),
-            seconds=time.perf_counter() - began,
-        )
+        found = c.base, c.model, c.rivals
+        return stated(search, self.held_out, self.space, *found, self.step)
+
+    def native_predictor(self, at: Fitting) -> Predictor:
+        """Predictions of the windows of ``at`` by native MuJoCo."""
+        if at.predictor.simulator.engine == "mujoco":
+            return at.predictor
+        p, wait = self.predictor, self._more["wait"]
+        given = self.m, self.space, p.layout, filled(at.windows), self.data.dt
+        logged = p.simulator.logged
+        return Predictor(*given, self.fixed, logged, wait, engine="mujoco")
 
     def _undone(self, base: Model, stuck: Sequence[int]) -> Model:
         """A refit without some parameters, which are offered as effects instead."""
@@ -283,6 +346,20 @@ class Analysis:
         at = self.search.lengths[self.search.settles]
         at.whiten(at.neutral)
         return at.refit([i for i in base.own if i not in stuck])
+
+
+def proposed_laws(analysis: Analysis, model: Model) -> list[Proposed]:
+    """Laws for what a model leaves open in the fitting data.
+
+    None are looked for where sensors are compared, whose readings are not linearized,
+    nor where feet stick and slip.
+    """
+    at = analysis.search.at
+    if at.predictor.sensors or at.sticks or at.closed_by(model):
+        return []
+    model = at.selector.fit(model.places, model.fit.x)
+    predictor = analysis.native_predictor(at)
+    return LawSearch(at, model, predictor).proposed()
 
 
 def filled(windows: WindowSet) -> WindowSet:

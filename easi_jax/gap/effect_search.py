@@ -43,18 +43,29 @@ class Places:
         everywhere: but for ripples.
         offered: of these, what the refit of the model's own parameters does not do.
         ripples: at all of their cycles.
+
+    ``only``: keys of those that are offered; None: all.
     """
 
     def __init__(
-        self, m: mujoco.MjModel, space: ParameterSpace, scales: Scales
+        self,
+        m: mujoco.MjModel,
+        space: ParameterSpace,
+        scales: Scales,
+        only: Collection[str] | None = None,
     ) -> None:
         self.m = m
         self.everywhere = places(m, scales)
-        self.offered = [p for p in self.everywhere if not covered(p, space, m)]
+        self.offered = [
+            p
+            for p in self.everywhere
+            if not covered(p, space, m) and (only is None or p.key in only)
+        ]
         self.ripples = [
             p
             for j in scalar_dofs(m)
             for p in ripples(m, j, scales, _cycles(m, j, scales))
+            if only is None or p.key in only
         ]
         self._dropped: set[str] = set()  # found, and then found to say nothing
 

@@ -13,7 +13,13 @@ from easi_jax.model.effects import Effects
 
 
 class Layout:
-    """The long vector of all columns, and how it becomes `Effects`."""
+    """The long vector of all columns, and how it becomes `Effects`.
+
+    Attributes:
+        columns: its numbers.
+        none: no effect.
+        neutral: the vector of that.
+    """
 
     def __init__(self, m: mujoco.MjModel, found: Sequence[Place]) -> None:
         self.columns: list[Column] = []
@@ -24,7 +30,7 @@ class Layout:
                 if key not in self._index:
                     self._index[key] = len(self.columns)
                     self.columns.append(c)
-        self._none = effects.none(m)
+        self.none = effects.none(m)
         self.neutral = np.array([c.neutral for c in self.columns], np.float64)
 
     def __len__(self) -> int:
@@ -45,7 +51,7 @@ class Layout:
         for i, c in enumerate(self.columns):
             by_field.setdefault(c.field, []).append(i)
         for name, rows in by_field.items():
-            leaf = jnp.asarray(getattr(self._none, name), jnp.float32)
+            leaf = jnp.asarray(getattr(self.none, name), jnp.float32)
             values = x[np.array(rows)].astype(jnp.float32)
             own = [k for k, i in enumerate(rows) if self.columns[i].index]
             if own:
@@ -60,7 +66,7 @@ class Layout:
                 else:
                     leaf = leaf + same if leaf.ndim else values[k]
             changed[name] = leaf
-        return self._none.replace(**changed)  # type: ignore[attr-defined]
+        return self.none.replace(**changed)  # type: ignore[attr-defined]
 
 
 def _key(c: Column) -> object:

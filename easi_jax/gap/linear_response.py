@@ -79,14 +79,28 @@ class LinearResponse:
 
     def changes(self, vectors: np.ndarray) -> np.ndarray:
         """Of errors from those of ``x``, ``(B, W, H + 1, nv)``."""
-        p = self.predictor
         torque = (self._speeds(vectors) - self._still).astype(float)  # of one step
-        path = np.zeros((*torque.shape[:3], p.nv))
-        state = np.zeros((*torque.shape[:2], p.size))
+        return self._paths(torque, self._torques)
+
+    def impulses(self) -> np.ndarray:
+        """Changes of errors by 1 N m (1 N at a slide) at each degree of freedom during
+        the rows from one state to the next, one by one, ``(N, nv, W, H + 1, nv)``."""
+        count, nv = self._torques.shape[1], self.predictor.nv
+        each = np.eye(count * nv).reshape(count * nv, 1, count, nv)
+        each = np.broadcast_to(each, (len(each), len(self._torques), count, nv))
+        paths = self._paths(each, self._pushes)
+        return paths.reshape(count, nv, *paths.shape[1:])
+
+    def _paths(self, torque: np.ndarray, by: np.ndarray) -> np.ndarray:
+        """Changes of errors ``(B, W, H + 1, nv)`` by what ``torque (B, W, N, nv)`` does
+        ``by (W, N, s, nv)``."""
+        nv = self.predictor.nv
+        path = np.zeros((*torque.shape[:3], nv))
+        state = np.zeros((*torque.shape[:2], self.predictor.size))
         for k in range(torque.shape[2]):
             state = np.einsum("wij,bwj->bwi", self._after[:, k], state)
-            state += np.einsum("wij,bwj->bwi", self._torques[:, k], torque[:, :, k])
-            path[:, :, k] = state[..., : p.nv]
+            state += np.einsum("wij,bwj->bwi", by[:, k], torque[:, :, k])
+            path[:, :, k] = state[..., :nv]
         return _each_row(path, self.rows)[:, : self.count]
 
     # -- programs --------------------------------------------------------------
@@ -120,6 +134,8 @@ class LinearResponse:
         # What changes speeds in one step as much as a change does, over all of them.
         unit = self._acceleration[:, None]
         self._after = after
+        felt = np.asarray(self.predictor.felt_inertia, float)
+        self._pushes = torques / (self._acceleration * felt)
         self._torques = torques @ np.linalg.pinv(one / unit, rcond=_STUCK) / unit.T
 
     def _speeds(self, vectors: np.ndarray) -> np.ndarray:

@@ -37,6 +37,7 @@ from easi_jax.model.parameters import ParameterSpace
 from easi_jax.progress import Wait, at_once
 from easi_jax.simulation import native_step
 from easi_jax.simulation.compile_time import expected
+from easi_jax.simulation.engine import Engine
 from easi_jax.simulation.logged import Logged
 from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.step import Physics, arrived_sensed, arrived_step
@@ -46,11 +47,7 @@ BLOCK = 16  # windows
 
 class Window(NamedTuple):
     """One of a `WindowSet`, or some, on devices; what it has there, as simulated:
-    turns of hinges without limits counted, sensors that are predicted alone.
-
-    Attributes:
-        time: of its start, since the start of its run [s].
-    """
+    turns of hinges without limits counted, sensors that are predicted alone."""
 
     start_qpos: jax.Array
     start_act: jax.Array
@@ -64,6 +61,7 @@ class Window(NamedTuple):
     sensed: jax.Array
     last: jax.Array
     time: jax.Array
+    hidden: jax.Array
 
 
 _ITEMS = 4  # that a core works on together: many requests ask for few
@@ -149,13 +147,14 @@ class Predictor:
         logged: Logged | None = None,
         wait: Wait = at_once,
         sensors: Sensors = NO_SENSORS,
+        engine: Engine | None = None,
     ) -> None:
         """``fixed``: what the machine has and MJCF cannot say, by address; ``logged``:
         states of the log that the windows are from; ``wait`` shows what compiles;
         ``sensors``: that ``windows.sensed`` are of."""
         self._wait = wait
         self.simulator = Simulator(
-            opened(mj_model), space, dt, fixed=fixed, logged=logged
+            opened(mj_model), space, dt, fixed=fixed, logged=logged, engine=engine
         )
         self.sensors, self.unpredicted = sensors.simulated_by(self.simulator.engine)
         if self.sensors:
@@ -176,10 +175,9 @@ class Predictor:
         self.channels = nv + len(self.sensors)
         self._scalar = scalar_places(m).T
         self.mesh = make_mesh()
-        engine = self.simulator.engine
-        on_host = on_cpu() or engine == "mujoco"
-        self._items = _ITEMS if on_host else _ACCELERATOR_ITEMS
-        self._more = _STEPPED if engine == "mujoco" else self._items
+        native = self.simulator.engine == "mujoco"
+        self._items = _ITEMS if on_cpu() or native else _ACCELERATOR_ITEMS
+        self._more = _STEPPED if native else self._items
         latest = sum(
             max((c.high for c in layout.columns if c.field == name), default=0.0)
             for name in ("delay", "late")
@@ -188,7 +186,7 @@ class Predictor:
         self._fields = _fields(layout)
         # Columns that each program has not, but for the details of effects.
         self._without: dict[tuple[str, ...], np.ndarray] = {}
-        for left_out in reversed(_LEFT_OUT[engine]):
+        for left_out in reversed(_LEFT_OUT[self.simulator.engine]):
             told = [
                 self.own + i
                 for i, c in enumerate(layout.columns)
@@ -238,9 +236,8 @@ class Predictor:
             shape = (self._room, BLOCK, *x.shape[1:])
             return jax.device_put(np.asarray(x, np.float32).reshape(shape), whole)
 
-        of_set = {f: getattr(padded, f) for f in Window._fields if f != "time"}
-        time = padded.row * self.simulator.dt
-        given = of_set | {"read": read, "sensed": sensed, "time": time}
+        given = {f: getattr(padded, f) for f in Window._fields}
+        given |= {"read": read, "sensed": sensed}
         return Window(**{name: blocks(x) for name, x in given.items()})
 
     def _readings(self, windows: WindowSet) -> np.ndarray:
@@ -252,6 +249,11 @@ class Predictor:
     def _unwrapped(self, read: np.ndarray) -> np.ndarray:
         """``WindowSet.read`` with the turns of hinges without limits counted."""
         return np.where(self.wrapped, np.unwrap(read, axis=1), read)
+
+    @property
+    def felt_inertia(self) -> np.ndarray:
+        """That a torque at each degree of freedom alone meets, ``(nv,)``."""
+        return np.asarray(self.layout.none.effective_inertia)
 
     @property
     def devices(self) -> int:
@@ -452,7 +454,7 @@ class Predictor:
         physics = simulator.start(q, v + moved[nv : 2 * nv], model)
         physics = physics.replace(memory=(), act=w.start_act + moved[2 * nv :])
         if effects.has_own(e, model.present):
-            physics = physics.replace(time=w.time - early)
+            physics = physics.replace(time=w.time - early, hidden=w.hidden)
         # Sensors are read where a step begins, the last of them after the last step.
         sent = [w.past, w.ctrl, w.last[None]] if self.sensors else [w.past, w.ctrl]
         arrived = effects.command_sequence(

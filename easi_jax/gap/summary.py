@@ -10,6 +10,7 @@ from easi_jax.gap.error_localization import condition_errors, where
 from easi_jax.gap.result import Figures, Found, Outcome, last_figures
 from easi_jax.gap.sensor_faults import ReadingFault
 from easi_jax.gap.verdict import Openness
+from easi_jax.model.found_laws import public_name
 from easi_jax.model.joint_space import scalar_dofs
 from easi_jax.model.results import (
     ErrorMap,
@@ -123,7 +124,7 @@ def _effect(f: Found, gap: float) -> NamedEffect:
         at=at,
         values=f.values,
         confidence=f.confidence,
-        indistinguishable=tuple(f.indistinguishable),
+        indistinguishable=tuple(map(public_name, f.indistinguishable)),
         gap_before=gap,
         gaps=gaps,
         columns={columns[k].name: x for k, x in f.fitted.items()},

@@ -9,6 +9,7 @@ import numpy as np
 
 from easi_jax.data.activations import activation_guess
 from easi_jax.data.drive_forces import exertion
+from easi_jax.data.law_states import law_states, times
 from easi_jax.data.recording import Run
 from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
 from easi_jax.data.windows import fitted_velocity, lead_rows, make_windows
@@ -44,6 +45,8 @@ class WindowSet:
             ``(W, 2 L + 2 + H, N)``.
         last: command of the row after the last step, which sensors of forces may read
             there, ``(W, nu)``.
+        time: of the row where the window begins, ``(W,)`` [s].
+        hidden: what laws remember there (`easi_jax.data.law_states`), ``(W, S)``.
     """
 
     run: np.ndarray
@@ -59,6 +62,8 @@ class WindowSet:
     led: np.ndarray
     sensed: np.ndarray
     last: np.ndarray
+    time: np.ndarray
+    hidden: np.ndarray
 
     def __len__(self) -> int:
         return len(self.run)
@@ -148,6 +153,8 @@ def _windows_of(
         led=w.start_row >= late,
         sensed=sensors.readings(run)[inside(seen)],
         last=run.ctrl[w.start_row + steps],
+        time=times(run)[w.start_row],
+        hidden=law_states(m, run)[w.start_row],
     )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from easi_jax.model.backlash import geared
 from easi_jax.model.joint_space import is_scalar
+from easi_jax.model.law_terms import Memory
 from easi_jax.model.own_laws import Function
 from easi_jax.model.quantities import (
     SEED,
@@ -341,6 +342,9 @@ class OwnLaw(NamedTuple):
         on: what it sits at: joint, actuator or model.
         fits: whether it may sit at a joint or actuator of this name.
         force, command, reading: its functions.
+        memories: what it remembers.
+        names: of joints and actuators that it is about: a model without them has no
+            such effect. Empty where that is not known.
     """
 
     name: str
@@ -350,6 +354,8 @@ class OwnLaw(NamedTuple):
     force: Function | None
     command: Function | None
     reading: Function | None
+    memories: tuple[Memory, ...] = ()
+    names: frozenset[str] = frozenset()
 
 
 # Those that are registered, in the order of the rows of their numbers.

@@ -177,19 +177,17 @@ def _own(m: mujoco.MjModel) -> dict[str, Any]:
     laws: list[Law] = []
     neutral: list[float] = []
     dofs = {name: dof for name, _, dof in joints_of(m)}
-    columns = {"joint": dofs, "model": {"": 0}}
-    columns["actuator"] = {name: a for a, name in enumerate(actuators_of(m))}
+    sites = {"joint": dofs, "model": {"": 0}}
+    sites["actuator"] = {name: a for a, name in enumerate(actuators_of(m))}
+    states = 0
     for own in OWN_LAWS.values():
-        sites = [
-            x for x in columns[own.on].items() if own.on == "model" or own.fits(x[0])
-        ]
-        laws.append(
-            Law(
-                *(own.name, own.numbers, len(neutral), tuple(sites)),
-                *(joints_of(m), actuators_of(m)),
-                *(own.force, own.command, own.reading),
-            )
-        )
+        mine = [(name, at) for name, at in sites[own.on].items() if own.fits(name)]
+        if own.names <= {*dofs, *sites["actuator"]}:
+            what = (own.name, own.numbers, len(neutral), tuple(mine))
+            about = (joints_of(m), actuators_of(m))
+            does = (own.force, own.command, own.reading, own.memories)
+            laws.append(Law(*what, *about, *does, states))
+            states += len(own.memories)
         neutral += [NUMBERS[f"{own.name}.{n}"].neutral for n in own.numbers]
     known = jnp.broadcast_to(jnp.array(neutral)[:, None], (len(neutral), widest(m)))
     return {OWN: known.astype(jnp.float32), "laws": tuple(laws)}
@@ -344,16 +342,18 @@ def in_step(
     d: mjx.Data,
     e: Effects,
     rotor: Any,
+    hidden: Any = (),
 ) -> tuple[mjx.Model, mjx.Data, Any]:
     """Model, data and drives with play of one physics step.
 
     Args:
         d: before `forward`.
         rotor: drives before the step (`backlash.Rotor`); empty where none has play.
+        hidden: what laws remember (`own_laws.next_states`).
     """
     at, dof = scalar_places(m).T
     if e.laws and not isinstance(d.time, tuple):
-        d = acting(d, e.own, e.laws)
+        d = acting(d, e.own, e.laws, hidden)
     v = d.qvel
     fall = jnp.exp(-jnp.square(v / e.stribeck))
     m = m.replace(

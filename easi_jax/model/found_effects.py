@@ -14,6 +14,7 @@ import numpy as np
 from easi_jax.errors import UserError
 from easi_jax.model import addresses as language
 from easi_jax.model.effect_numbers import EFFECT_TABLE, EffectEntry
+from easi_jax.model.found_laws import check_law, law_of, public_name
 from easi_jax.model.own_effects_check import check_own_effects
 from easi_jax.model.parameters import Parameter, ParameterSpace
 
@@ -91,6 +92,8 @@ def _alike(entries: Iterable[EffectEntry]) -> list[list[EffectEntry]]:
 
 
 def _check(m: mujoco.MjModel, entry: EffectEntry) -> None:
+    if (law := law_of(entry.effect)) is not None:
+        check_law(m, law)
     where = f'effect {entry.effect} at "{entry.at}"' if entry.at else entry.effect
     for column in entry.columns:
         if column not in EFFECT_TABLE:
@@ -118,7 +121,7 @@ def _parameter(
         high = min(high, _FARTHER * start[1])
     at = "all" if len(alike) == m.nu > 1 else "+".join(e.at for e in alike)
     place = f"@{at}" if at else ""
-    name = f"{entry.effect}{place}.{EFFECT_TABLE[column].word}"
+    name = public_name(f"{entry.effect}{place}.{EFFECT_TABLE[column].word}")
     return Parameter(name, addresses, value, start, (low, high), unit, log=False)
 
 
@@ -169,4 +172,5 @@ def _about(p: Parameter, nominal: float) -> Parameter:
 
 def named(entries: Sequence[EffectEntry]) -> str:
     """``EFFECT@PLACE`` of all, for a line of text."""
-    return ", ".join(f"{e.effect}@{e.at}" if e.at else e.effect for e in entries)
+    names = (f"{e.effect}@{e.at}" if e.at else e.effect for e in entries)
+    return public_name(", ".join(names))

@@ -165,46 +165,43 @@ class OwnEffect:
 
 @contextlib.contextmanager
 def registered(own: Sequence[OwnEffect]) -> Iterator[None]:
-    """The catalog has these effects as well, inside.
+    """The catalog has these effects as well, inside; what is added there goes, too.
 
     Raises:
         UserError: what is wrong with one of them.
     """
-    added: list[tuple[dict[str, Any], str]] = []
+    tables: tuple[dict[str, Any], ...] = (OWN_LAWS, NUMBERS, EFFECT_TABLE, CATALOG)
+    before = [dict(table) for table in tables]
     try:
         for effect in own:
             effect.check()
-            _add(effect, added)
+            _add(effect)
         yield
     finally:
-        for table, key in reversed(added):
-            del table[key]
+        for table, kept in zip(tables, before, strict=True):
+            table.clear()
+            table.update(kept)
 
 
-def _add(effect: OwnEffect, added: list[tuple[dict[str, Any], str]]) -> None:
-    def put(table: dict[str, Any], key: str, row: Any) -> None:
-        table[key] = row
-        added.append((table, key))
-
+def _add(effect: OwnEffect) -> None:
     names = tuple(n.name for n in effect.numbers)
     functions = effect.force, effect.command, effect.reading
     law = OwnLaw(effect.name, names, effect.on, effect.fits, *functions)
-    put(OWN_LAWS, effect.name, law)
+    OWN_LAWS[effect.name] = law
     parts = []
     for n in effect.numbers:
         column = f"{effect.name}.{n.name}"
         number = _number(effect, n, own_row(column))
-        put(NUMBERS, column, number)
+        NUMBERS[column] = number
         if not effect.reading:  # no address reaches readings
-            put(EFFECT_TABLE, column, number)
+            EFFECT_TABLE[column] = number
         parts.append(Part(column, n.name, "1", n.low, n.high, n.size))
 
     def able(o: Spot) -> bool:
         return effect.fits(_name(o.m, effect.on, o.i))
 
     site = Site(tuple(parts), _starts(effect), able=able)
-    row = Effect(effect.name, effect.sentence, {effect.on: site})
-    put(CATALOG, effect.name, row)
+    CATALOG[effect.name] = Effect(effect.name, effect.sentence, {effect.on: site})
 
 
 def _starts(effect: OwnEffect) -> tuple[tuple[float, ...], ...]:

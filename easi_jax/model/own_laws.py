@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import mujoco
 
 from easi_jax.model.joint_space import is_scalar
+from easi_jax.model.law_terms import Known, Memory
 
 D = TypeVar("D")
 
@@ -28,6 +29,7 @@ class Now(NamedTuple):
         command: that reaches each actuator, by its name.
         time: since the start of the recording or of the episode [s].
         here: the joint or actuator that the effect sits at; "" for the whole model.
+        memory: states of what the law remembers.
     """
 
     position: Mapping[str, Any]
@@ -35,6 +37,7 @@ class Now(NamedTuple):
     command: Mapping[str, Any]
     time: Any
     here: str
+    memory: tuple[Any, ...] = ()
 
 
 # Of now and of the effect's numbers (by name, as attributes): a number for ``here``, or
@@ -54,6 +57,8 @@ class Law:
         joints: name, place in ``qpos`` and degree of freedom of each hinge and slide.
         actuators: names.
         force, command, reading: what it does; None: nothing to it.
+        memories: what it remembers; one state for each.
+        state: the first of those among the states of all laws.
     """
 
     name: str
@@ -65,28 +70,46 @@ class Law:
     force: Function | None = None
     command: Function | None = None
     reading: Function | None = None
+    memories: tuple[Memory, ...] = ()
+    state: int = 0
+
+    def known(self, q: Any, v: Any, u: Any, time: Any) -> Known:
+        """What its terms are evaluated on."""
+        return Known(
+            {name: q[at] for name, at, _ in self.joints},
+            {name: v[dof] for name, _, dof in self.joints},
+            dict(zip(self.actuators, u, strict=True)),
+            time,
+        )
 
     def outputs(
-        self, function: Function, known: Any, q: Any, v: Any, u: Any, time: Any
+        self,
+        function: Function,
+        known: Any,
+        q: Any,
+        v: Any,
+        u: Any,
+        time: Any,
+        memory: Any = (),
     ) -> list[dict[str, Any]]:
         """What a function gives at each place, by the names of joints or actuators.
 
         Args:
             known: numbers of all effects, ``(K, P)``.
             q, v, u: positions ``(nq,)``, velocities ``(nv,)``, commands ``(nu,)``.
+            memory: states of all laws, ``(S,)``.
 
         Raises:
             TypeError: neither a number nor a mapping.
         """
-        position = {name: q[at] for name, at, _ in self.joints}
-        speed = {name: v[dof] for name, _, dof in self.joints}
-        command = dict(zip(self.actuators, u, strict=True))
+        at = self.known(q, v, u, time)
+        states = tuple(memory[self.state + k] for k in range(len(self.memories)))
         out = []
         for here, column in self.sites:
             values = {
                 n: known[self.row + k, column] for k, n in enumerate(self.numbers)
             }
-            now = Now(position, speed, command, time, here)
+            now = Now(at.qpos, at.qvel, at.ctrl, time, here, states)
             got = function(now, SimpleNamespace(**values))
             if isinstance(got, Mapping):
                 out.append(dict(got))
@@ -119,9 +142,38 @@ def actuators_of(m: mujoco.MjModel) -> tuple[str, ...]:
     return tuple(m.actuator(a).name or f"actuator{a}" for a in range(m.nu))
 
 
-def acting(d: D, known: Any, laws: tuple[Law, ...]) -> D:
+def count_states(laws: tuple[Law, ...]) -> int:
+    """Of what some laws remember."""
+    return sum(len(law.memories) for law in laws)
+
+
+def first_states(laws: tuple[Law, ...], q: Any, v: Any, u: Any, time: Any) -> Any:
+    """What laws remember where nothing is known of what came before, ``(S,)``: lags
+    have settled, bristles are straight."""
+    out = [
+        memory.follows(law.known(q, v, u, time))[0] if memory.kind == "lag" else 0.0
+        for law in laws
+        for memory in law.memories
+    ]
+    return jnp.array(out, v.dtype)
+
+
+def next_states(
+    laws: tuple[Law, ...], states: Any, q: Any, v: Any, u: Any, time: Any, h: Any
+) -> Any:
+    """What laws remember a time ``h`` [s] later, while everything else is as now."""
+    out = []
+    for law in laws:
+        known = law.known(q, v, u, time)
+        for k, memory in enumerate(law.memories, law.state):
+            target, rate = memory.follows(known)
+            out.append(target + (states[k] - target) * jnp.exp(-rate * h))
+    return jnp.stack(out) if out else states
+
+
+def acting(d: D, known: Any, laws: tuple[Law, ...], states: Any = ()) -> D:
     """Data of a physics step (`mjx.Data`, before `forward`) with what laws do to its
-    commands and to the torques at its joints."""
+    commands and to the torques at its joints; ``states``: what they remember."""
     data: Any = d
     q, v, time = data.qpos, data.qvel, data.time
     for law in laws:
@@ -137,7 +189,7 @@ def acting(d: D, known: Any, laws: tuple[Law, ...]) -> D:
     for law in laws:
         if law.force is None:
             continue
-        for got in law.outputs(law.force, known, q, v, data.ctrl, time):
+        for got in law.outputs(law.force, known, q, v, data.ctrl, time, states):
             for name, x in got.items():
                 torque = torque.at[law.dofs[name]].add(x)
     return data.replace(qfrc_applied=torque)

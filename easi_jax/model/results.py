@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from easi_jax.model.found_effects import EffectEntry, FoundEffects
+from easi_jax.model.found_laws import law_of, public_name
 
 Flag = Literal["determined", "not determined", "at bound"]
 Outcome = Literal["converged", "at bound", "not determined", "diverged"]
@@ -60,7 +61,25 @@ class NamedEffect:
     def label(self) -> str:
         """``effect@at``, ``effect@all``, or ``effect@PATTERN``."""
         one = self.pattern or self.at[0]
-        return f"{self.effect}@{'all' if self.shared else one}"
+        return f"{self.name}@{'all' if self.shared else one}"
+
+    @property
+    def name(self) -> str:
+        """Of the effect, as files have it."""
+        return public_name(self.effect)
+
+    @property
+    def law(self) -> str:
+        """Its formula, where it is a law that was found; else empty."""
+        law = law_of(self.effect)
+        if law is None:
+            return ""
+        return law.shown([self.values[n][0] for n in law.numbers], self.force_unit)
+
+    @property
+    def force_unit(self) -> str:
+        """N m or N: of a law's numbers, before what they are per."""
+        return "N m" if "N m" in next(iter(self.values.values()))[2] else "N"
 
     @property
     def gap_after(self) -> float:

@@ -374,6 +374,7 @@ class Search:
             past=jax.tree.map(tile, seg.past),
             act=jax.tree.map(tile, seg.act),
             time=jax.tree.map(tile, seg.time),
+            hidden=jax.tree.map(tile, seg.hidden),
         )
         return seg, reference, fake, jax.tree.map(tile, reference)
 

@@ -18,6 +18,7 @@ from easi_jax.errors import UserError
 from easi_jax.model import effects
 from easi_jax.model.effect_numbers import fields_that_act
 from easi_jax.model.joint_space import scalar_places
+from easi_jax.model.own_laws import next_states
 from easi_jax.simulation import native
 
 AT_PAIRS = ("slip", "give")  # for which MuJoCo is called simulation by simulation
@@ -174,7 +175,7 @@ def _one(model: Any, state: Any, ctrl: jax.Array) -> Any:
         *(jnp.zeros_like(state.qvel), zero, state.time),
     )
     if acting:
-        m, d, rotor = effects.in_step(m, d, e, rotor)  # type: ignore[arg-type]
+        m, d, rotor = effects.in_step(m, d, e, rotor, state.hidden)  # type: ignore[arg-type]
         if "resistance" in acting:
             places = native.bodies(m, state)
             d = d.replace(**dict(zip(native.PLACES, places, strict=True)))
@@ -188,4 +189,6 @@ def _one(model: Any, state: Any, ctrl: jax.Array) -> Any:
     after = _after(model, state, out, sensed).replace(rotor=rotor)
     if isinstance(state.time, tuple):
         return after
-    return after.replace(time=state.time + m.opt.timestep)
+    h, now = m.opt.timestep, (state.qpos, state.qvel, ctrl, state.time)
+    hidden = next_states(e.laws, state.hidden, *now, h)
+    return after.replace(time=state.time + h, hidden=hidden)

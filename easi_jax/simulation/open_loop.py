@@ -46,9 +46,9 @@ def _predicted(
     steps: int | jax.Array | None,
     senses: bool,
 ) -> tuple[jax.Array, jax.Array, Any]:
-    def one(
-        qpos: jax.Array, qvel: jax.Array, ctrl: jax.Array, past: Any, act: Any, t: Any
-    ) -> Any:
+    def one(s: Segments) -> Any:
+        ctrl, act, past = s.ctrl, s.act, s.past
+
         def step(state: Any, u: jax.Array) -> Any:
             if senses:
                 state, sensed = simulator.sensed_step(model, state, u)
@@ -57,9 +57,9 @@ def _predicted(
             return state, (state.qpos, state.qvel, sensed)
 
         known = None if isinstance(act, tuple) else act
-        first = simulator.start(qpos, qvel, act=known)
-        if not isinstance(first.time, tuple) and not isinstance(t, tuple):
-            first = dataclasses.replace(first, time=t)
+        first = simulator.start(s.qpos, s.qvel, act=known)
+        if not isinstance(first.time, tuple) and not isinstance(s.time, tuple):
+            first = dataclasses.replace(first, time=s.time, hidden=s.hidden)
         if not senses:
             first = dataclasses.replace(first, sensed=())
         if not isinstance(past, tuple):
@@ -83,8 +83,7 @@ def _predicted(
         end = jnp.asarray(steps)
         return jax.lax.fori_loop(jnp.zeros_like(end), end, at, (first, begun))[1]
 
-    s = segments
-    return jax.vmap(one)(s.qpos, s.qvel, s.ctrl, s.past, s.act, s.time)
+    return jax.vmap(one)(segments)
 
 
 def prediction_residuals(

@@ -58,6 +58,7 @@ def policy_rollout(
             past=sent if past else (),
             act=state.physics.act if state.physics.act.size else (),
             time=state.physics.time,
+            hidden=state.physics.hidden,
         )
         sent = jnp.concatenate([sent, ctrl[None]])[1:]
         if auto_reset:
@@ -120,4 +121,5 @@ def measured(
         past=t.past,
         act=t.act,
         time=t.time,
+        hidden=t.hidden,
     )

@@ -24,6 +24,7 @@ from easi_jax.model.joint_space import scalar_places
 from easi_jax.model.mjx_data import make_data
 from easi_jax.model.mjx_model import refusals
 from easi_jax.model.native_model import NativeModel
+from easi_jax.model.own_laws import first_states, next_states
 from easi_jax.simulation import constraint_solver, native_step
 from easi_jax.simulation.cpu.unroll import scalarized
 from easi_jax.simulation.mjx_patches import with_velocity_products
@@ -48,6 +49,7 @@ class Physics:
             readings, plugins, plastic deformation), as words, ``(k,)`` uint32.
         time: of the recording or episode, where owners' effects may ask for it, ``()``
             [s].
+        hidden: what laws remember, ``(S,)``; likewise.
     """
 
     qpos: jax.Array
@@ -59,6 +61,7 @@ class Physics:
     rotor: Any = ()
     rest: Any = ()
     time: Any = ()
+    hidden: Any = ()
 
     if TYPE_CHECKING:  # made by flax
 
@@ -77,8 +80,11 @@ def at_rest(model: Any, qpos: jax.Array, qvel: jax.Array) -> Physics:
         memory = effects.first_memory(model.delay_steps, m.nu)
     native = isinstance(m, NativeModel)
     rest = jnp.asarray(first_rest(m.template.mj)) if native else ()
-    time = jnp.zeros(()) if effects.has_own(e, model.present) else ()
-    return Physics(qpos, qvel, act, warm, sensed, memory, rotor, rest, time)
+    time, hidden = (), ()
+    if e is not None and effects.has_own(e, model.present):
+        time = jnp.zeros(())
+        hidden = first_states(e.laws, qpos, qvel, jnp.zeros(m.nu), time)
+    return Physics(qpos, qvel, act, warm, sensed, memory, rotor, rest, time, hidden)
 
 
 def data_at(model: Any, state: Physics, ctrl: jax.Array) -> mjx.Data:
@@ -205,18 +211,23 @@ def substep(model: Any, state: Physics, ctrl: jax.Array, wide: bool = False) -> 
     if model.torque_speed is not None:
         m = model.torque_speed.limited(m, state.qvel)
     d = data_at(model, state, ctrl)
-    e, rotor, time = model.effects, state.rotor, state.time
+    e, rotor, own = model.effects, state.rotor, {}
     if effects.has_own(e, model.present):
-        d, time = d.replace(time=time), time + m.opt.timestep
+        d, own = d.replace(time=state.time), later(model, state, ctrl, m.opt.timestep)
     if e is not None:
-        m, d, rotor = effects.in_step(m, d, e, rotor)
+        m, d, rotor = effects.in_step(m, d, e, rotor, state.hidden)
     with refusals(NotImplementedError):
         d = mjx_step(m, d, wide, _within(model))
     qvel = jnp.clip(d.qvel, -model.speed_limit, model.speed_limit)
     sensed = model.sense(model.mjx, d) if model.sense else ()
-    return Physics(
-        *(d.qpos, qvel, d.act, d.qacc_warmstart, sensed, (), rotor), time=time
-    )
+    return Physics(*(d.qpos, qvel, d.act, d.qacc_warmstart, sensed, (), rotor), **own)
+
+
+def later(model: Any, state: Physics, ctrl: jax.Array, h: Any) -> dict[str, Any]:
+    """Time, and what laws remember, after a physics step ``h`` [s]."""
+    laws, now = model.effects.laws, (state.qpos, state.qvel, ctrl, state.time)
+    hidden = next_states(laws, state.hidden, *now, h)
+    return {"time": state.time + h, "hidden": hidden}
 
 
 # What is too large to be written out (benchmarks/engines.py) takes the wide solver.

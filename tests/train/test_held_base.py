@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from easi_jax.gap import analysis
+from easi_jax.gap import effect_search
 from easi_jax.gap.candidates import places
 from easi_jax.io.logs.reader import read_logs
 from tests.commands import command, read, refused
@@ -134,9 +134,10 @@ def test_an_effect_is_found_in_the_stand(
     model, _, whole = stand
     few = ("coulomb_friction",)
     monkeypatch.setattr(
-        *(analysis, "places"), lambda *a: [p for p in places(*a) if p.effect in few]
+        *(effect_search, "places"),
+        lambda *a: [p for p in places(*a) if p.effect in few],
     )
-    monkeypatch.setattr(analysis, "ripples", lambda *a: [])
+    monkeypatch.setattr(effect_search, "ripples", lambda *a: [])
     out = tmp_path / "gap"
     command(gap, "--model", model, "--held-base", "--data", whole, "--out", out)
     told = read(out / "gap.json")

@@ -23,8 +23,16 @@ from easi_jax.io.strict_yaml import read_yaml
 from easi_jax.model.effect_catalog import CATALOG
 from easi_jax.model.effect_numbers import NUMBERS, is_column
 from easi_jax.model.found_effects import EffectEntry, FoundEffects
+from easi_jax.model.found_laws import (
+    FOUND_LAW,
+    add_law,
+    law_of,
+    public_name,
+    read_law,
+)
 
 _KEYS = ("effect", "at", "kind", "columns", "parameters", "std")
+_LAW_KEYS = ("law", "acts", "terms")
 
 
 def write_effects(
@@ -41,17 +49,7 @@ def write_effects(
     """
     content = {
         "model": model,
-        "effects": [
-            {
-                "effect": e.effect,
-                "at": e.at,
-                "kind": e.kind,
-                "parameters": to_plain(s),
-                "columns": to_plain(e.columns),
-                "std": to_plain(e.std),
-            }
-            for e, s in zip(entries, shown, strict=True)
-        ],
+        "effects": [_written(e, shown=s) for e, s in zip(entries, shown, strict=True)],
         "refitted": [
             {"address": r["address"], "value": float(r["to"])} for r in refitted
         ],
@@ -63,6 +61,29 @@ def write_effects(
     )
     text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
     atomic_write(path, head + text)
+
+
+def _written(e: EffectEntry, shown: Mapping[str, Any]) -> dict[str, Any]:
+    law = law_of(e.effect)
+    numbers = {"columns": dict(e.columns), "std": dict(e.std)}
+    more: dict[str, Any] = {}
+    if law is not None:
+        numbers = {
+            key: {column.rpartition(".")[2]: x for column, x in values.items()}
+            for key, values in numbers.items()
+        }
+        values = [numbers["columns"][n] for n in law.numbers]
+        more["law"] = law.shown(values, "(SI units)")
+        more["acts"] = dict(law.acts)
+        more["terms"] = [t.text for t in law.terms]
+    return {
+        "effect": public_name(e.effect),
+        "at": e.at,
+        "kind": e.kind,
+        **more,
+        "parameters": to_plain(shown),
+        **to_plain(numbers),
+    }
 
 
 def read_effects(path: Path) -> tuple[list[EffectEntry], dict[str, float]]:
@@ -104,12 +125,16 @@ def _entry(path: str, i: int, item: Any) -> EffectEntry:
     where = f"effect {i}"
     if not isinstance(item, dict):
         raise UserError(f"{path}, {where}: write effect:, at:, kind: and columns:")
-    for key in item:
-        if key not in _KEYS:
-            raise UserError(
-                f'{path}, {where}: unknown key "{key}"{nearest(str(key), _KEYS)}'
-            )
     name = str(item.get("effect", ""))
+    known = (*_KEYS, *_LAW_KEYS) if name == FOUND_LAW else _KEYS
+    for key in item:
+        if key not in known:
+            raise UserError(
+                f'{path}, {where}: unknown key "{key}"{nearest(str(key), known)}'
+            )
+    if name == FOUND_LAW:
+        item = _with_law(f"{path}, {where}", item)
+        name = item["effect"]
     if name not in CATALOG:
         raise UserError(
             f'{path}, {where}: unknown effect "{name}"{nearest(name, CATALOG)} '
@@ -137,6 +162,34 @@ def _entry(path: str, i: int, item: Any) -> EffectEntry:
         {str(k): _number(path, where, v) for k, v in columns.items()},
         {str(k): _number(path, where, v) for k, v in std.items()},
     )
+
+
+def _with_law(where: str, item: dict[str, Any]) -> dict[str, Any]:
+    """A law's entry by its name in this process, columns likewise."""
+    acts, terms = item.get("acts"), item.get("terms")
+    if not isinstance(acts, dict) or not isinstance(terms, list):
+        raise UserError(
+            f"{where} ({FOUND_LAW}): acts: holds joints with their shares, terms: a "
+            "list of terms"
+        )
+    shares = {str(k): _number(where, "acts", v) for k, v in acts.items()}
+    try:
+        law = read_law(shares, [str(t) for t in terms])
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from error
+    numbers: dict[str, Any] = {}
+    for key in ("columns", "std"):
+        values = item.get(key) or {}
+        if not isinstance(values, dict) or not {*values} <= {*law.numbers}:
+            raise UserError(
+                f"{where} ({FOUND_LAW}): {key}: holds a number for each term: "
+                f"{', '.join(law.numbers)}"
+            )
+        numbers[key] = {f"{law.name}.{k}": v for k, v in values.items()}
+    if len(numbers["columns"]) < len(law.numbers):
+        raise UserError(f"{where} ({FOUND_LAW}): columns: lacks a number of a term")
+    add_law(law)
+    return {**item, **numbers, "effect": law.name, "at": law.at, "kind": "joint"}
 
 
 def _number(path: str, where: str, value: Any) -> float:

@@ -81,9 +81,10 @@ def _effect_json(r: GapResult, e: NamedEffect) -> Iterator[dict[str, Any]]:
         each = [(e.pattern, e.gap_before, e.gap_after)]
     for at, before, gap in each:
         yield {
-            "effect": e.effect,
+            "effect": e.name,
             "at": at,
             **({"places": e.at} if e.pattern else {}),
+            **({"law": e.law} if e.law else {}),
             "kind": e.kind,
             "parameters": {
                 k: {"value": v, "std": s, "unit": u}
@@ -243,7 +244,7 @@ def effect_rows(r: GapResult, between: str, none: str) -> list[tuple[str, ...]]:
     """Rows of a table of effects: `EFFECT_COLUMNS` and rivals."""
     return [
         (
-            e.effect,
+            f"{e.name}: {e.law}" if e.law else e.name,
             e.pattern or ", ".join(e.at) or "whole model",
             parameters_text(e.values, between),
             f"{e.confidence:.2f}",

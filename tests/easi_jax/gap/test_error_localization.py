@@ -61,6 +61,8 @@ def simulator() -> tuple[WindowSet, list[Run]]:
         led=rows >= 0,
         sensed=np.zeros((len(rows), H + 2, 0)),
         last=run.ctrl[rows + H],
+        time=TIME[rows],
+        hidden=np.zeros((len(rows), 0)),
     )
     return windows, [run]
 

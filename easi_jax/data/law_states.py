@@ -1,0 +1,48 @@
+"""What laws remember in the rows of a recording, and the time of those rows."""
+
+import mujoco
+import numpy as np
+
+from easi_jax.data.recording import Run
+from easi_jax.data.windows import fitted_velocity
+from easi_jax.model import effects
+from easi_jax.model.law_terms import Known, Memory
+from easi_jax.model.own_laws import Law
+
+_SMALL = 1e5  # s; single precision tells 10 ms apart until then
+
+
+def times(run: Run) -> np.ndarray:
+    """Of the rows [s], ``(T,)``: as logged, so that what was cut out of a recording
+    keeps its own; from the run's start where the clock counts years."""
+    large = np.abs(run.time).max(initial=0.0) > _SMALL
+    return run.time - run.time[0] if large else run.time
+
+
+def known_rows(law: Law, run: Run) -> Known:
+    """All rows of a run, as terms are evaluated on."""
+    speed = fitted_velocity(run.qpos, run.dt, run.configuration)
+    return law.known(run.qpos.T, speed.T, run.ctrl.T, times(run))
+
+
+def memory_path(memory: Memory, known: Known, dt: float) -> np.ndarray:
+    """States of one memory in all rows, ``(T,)``, from a start as
+    `easi_jax.model.own_laws.first_states` has it."""
+    target, rate = (np.asarray(x, float) for x in memory.follows(known))
+    target, rate = np.broadcast_arrays(target, rate)
+    left = np.exp(-rate * dt)
+    out = np.zeros(len(target))
+    out[0] = target[0] if memory.kind == "lag" else 0.0
+    for k in range(1, len(out)):
+        out[k] = target[k - 1] + (out[k - 1] - target[k - 1]) * left[k - 1]
+    return out
+
+
+def law_states(m: mujoco.MjModel, run: Run) -> np.ndarray:
+    """States of all laws of a model in the rows of a run, ``(T, S)``."""
+    paths = [
+        memory_path(memory, known_rows(law, run), run.dt)
+        for law in effects.none(m).laws
+        for memory in law.memories
+    ]
+    return np.stack(paths, 1) if paths else np.zeros((len(run), 0))
