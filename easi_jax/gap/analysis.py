@@ -266,22 +266,25 @@ class Analysis:
         notes = self._read_early()
         chosen = self._chosen()
         proposed = proposed_laws(self, chosen.model)
+        poorer: _Chosen | None = None
+        laws: list[str] = []
         if proposed:
-            names = [add_law(p.law, p.sizes) for p in proposed]
+            laws = [f"{add_law(p.law, p.sizes)}@{p.law.at}" for p in proposed]
             for p in proposed:
                 unit = p.law.unit_of_force(self.m)
                 self.tell(f"a law is proposed: {p.law.shown(p.sizes, unit)}")
             kept = [p.key for p in chosen.model.places]
-            laws = [
-                f"{name}@{p.law.at}" for name, p in zip(names, proposed, strict=True)
-            ]
             other = Analysis(*self._given, **self._more, only=[*kept, *laws])
             other.journal = self.journal
             other.predictor.early[:] = self.predictor.early
             richer = other._chosen()
             if any(p.key in laws for p in richer.model.places):
-                self.final, chosen = other, richer
+                self.final, poorer, chosen = other, chosen, richer
         outcome = self.final._stated(chosen)
+        if poorer is not None and any(f.place.key in laws for f in outcome.found):
+            x = self.search.at.plain(poorer.model.fit.x)
+            gap = self.held_out.look(x).gap
+            outcome = replace(outcome, known_effects=gap)
         return replace(
             outcome,
             notes=[*notes, *chosen.notes, *outcome.notes],

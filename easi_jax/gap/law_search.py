@@ -70,18 +70,10 @@ class LawSearch:
         chosen = self._chosen(columns, terms)
         if not chosen:
             return []
-        values = self._solved(columns[chosen])
-        laws: dict[tuple[tuple[str, float], ...], list[tuple[Term, float]]] = {}
-        for k, value in zip(chosen, values, strict=True):
-            t = terms[k]
-            term = self._softened(t, value)
-            laws.setdefault(t.acts, []).append((term, float(value)))
+        # A law for each term: what is needless beside others is then not chosen.
         return [
-            Proposed(
-                FoundLaw(acts, tuple(term for term, _ in parts)),
-                tuple(value for _, value in parts),
-            )
-            for acts, parts in laws.items()
+            Proposed(FoundLaw(terms[k].acts, (self._softened(terms[k], x),)), (x,))
+            for k, x in zip(chosen, self._solved(columns[chosen]).tolist(), strict=True)
         ]
 
     # -- responses -------------------------------------------------------------

@@ -16,7 +16,7 @@ from easi_jax.model.effect_catalog import Scales
 from easi_jax.model.joint_space import is_hinge, scalar_dofs
 from easi_jax.model.law_terms import Term, name_of
 
-_WIDTH = 0.02  # of the speeds, over which a sign turns
+_WIDTH = 0.005  # of the speeds, over which a sign turns
 _BENDS = 0.003, 0.01, 0.03, 0.1  # of the range, that bristles bend by
 _LAGS = 0.05, 0.2, 1.0  # s
 _WARMS = 3.0, 10.0, 30.0  # s

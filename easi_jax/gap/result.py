@@ -96,6 +96,8 @@ class Outcome:
         open_refit, open_after: errors beside their floor.
         horizon: of the predictions [s].
         start: time on either side of a start that it is fitted to [s].
+        known_effects: where laws were found, the held-out gap that the effects of the
+            catalog leave without them; else None.
     """
 
     verdict: str
@@ -118,6 +120,7 @@ class Outcome:
     seconds: float = 0.0
     horizon: float = 0.0
     start: float = 0.0
+    known_effects: float | None = None
 
 
 def last_figures(o: Outcome) -> Figures:

@@ -68,6 +68,7 @@ def gap_result(
         disagreeing=o.disagreeing,
         seconds=o.seconds,
         start=o.start,
+        known_effects=o.known_effects,
         bounded=_named(c.names, np.append(o.floor_is_bound, False)),
         open=_named(c.names, o.open_after.is_open),
         undecided=_named(c.names, o.open_after.undecided),

@@ -68,7 +68,8 @@ def joined(
     stay = dict(rest)
     for entry in found.physical:
         _check(m, entry)
-    check_own_effects(m, [e.effect for e in found.entries])
+    own = [e.effect for e in found.entries if law_of(e.effect) is None]
+    check_own_effects(m, own)
     for alike in _alike(found.physical):
         for column, value in alike[0].columns.items():
             p = _parameter(m, alike, column, value)

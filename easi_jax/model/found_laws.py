@@ -15,7 +15,7 @@ from typing import Any
 import jax.numpy as jnp
 import mujoco
 
-from easi_jax.errors import UserError
+from easi_jax.errors import UserError, nearest
 from easi_jax.model.effect_catalog import CATALOG, Effect, Part, Site, Spot
 from easi_jax.model.effect_numbers import (
     EFFECT_TABLE,
@@ -93,7 +93,7 @@ class FoundLaw:
         for value, term in zip(values, self.terms, strict=True):
             sign = "-" if value < 0 else "+" if text else ""
             space = " " if text else ""
-            text += f"{space}{sign}{space}{abs(value):.4g}*{_factor(term.shown)}"
+            text += f"{space}{sign}{space}{abs(value):.4g}*{_factor(term)}"
         return f"{text} {unit}"
 
     def unit_of_force(self, m: mujoco.MjModel) -> str:
@@ -119,8 +119,8 @@ def _braced(text: str) -> str:
     return text.replace("{", "{{").replace("}", "}}")
 
 
-def _factor(text: str) -> str:
-    return f"({text})" if " + " in text or " - " in text.replace("(", " (", 1) else text
+def _factor(term: Term) -> str:
+    return f"({term.shown})" if term.is_sum else term.shown
 
 
 @functools.cache
@@ -199,16 +199,20 @@ def check_law(m: mujoco.MjModel, law: FoundLaw) -> None:
     Raises:
         UserError: a joint or actuator that the model lacks.
     """
-    joints = {m.joint(j).name for j in range(m.njnt)}
-    actuators = {m.actuator(a).name for a in range(m.nu)}
-    named = [(j, "joint", joints) for j, _ in law.acts]
+    known = {
+        "joint": {m.joint(j).name for j in range(m.njnt)},
+        "actuator": {m.actuator(a).name for a in range(m.nu)},
+    }
+    named = [("joint", joint) for joint, _ in law.acts]
     for term in law.terms:
         for kind, name in sorted(term.names):
-            of = ("actuator", actuators) if kind == "ctrl" else ("joint", joints)
-            named.append((name, *of))
-    for name, kind, known in named:
-        if name not in known:
-            raise UserError(f'{FOUND_LAW}: the model has no {kind} "{name}"')
+            named.append(("actuator" if kind == "ctrl" else "joint", name))
+    for kind, name in named:
+        if name not in known[kind]:
+            raise UserError(
+                f'{FOUND_LAW}: the model has no {kind} "{name}"'
+                f"{nearest(name, known[kind])}"
+            )
 
 
 def read_law(acts: Mapping[str, float], terms: Sequence[str]) -> FoundLaw:

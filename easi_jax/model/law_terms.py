@@ -112,6 +112,12 @@ class Term:
         """As people read it: without widths, names without brackets."""
         return _shown(self.tree)
 
+    @property
+    def is_sum(self) -> bool:
+        """Whether it takes brackets as a factor."""
+        tree = self.tree
+        return isinstance(tree, ast.BinOp) and isinstance(tree.op, ast.Add | ast.Sub)
+
     def unit(self, of: Callable[[str, str], str]) -> dict[str, float]:
         """Powers of rad, m, s and ctrl in its unit; ``of`` tells the length of a
         joint's position, "rad" or "m", or that of a command."""
@@ -139,7 +145,7 @@ def _check(node: ast.expr, text: str) -> None:
 
     if _named(node) is not None or (isinstance(node, ast.Name) and node.id == "time"):
         return
-    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+    if isinstance(node, ast.expr) and _number(node) is not None:
         return
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
         _check(node.operand, text)
@@ -168,9 +174,8 @@ def _check(node: ast.expr, text: str) -> None:
 
 
 def _number(node: ast.expr) -> float | None:
-    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
-        return float(node.value)
-    return None
+    value: Any = node.value if isinstance(node, ast.Constant) else None
+    return float(value) if type(value) in (int, float) else None
 
 
 def _named(node: ast.AST) -> tuple[str, str] | None:

@@ -170,7 +170,8 @@ def registered(own: Sequence[OwnEffect]) -> Iterator[None]:
     Raises:
         UserError: what is wrong with one of them.
     """
-    tables: tuple[dict[str, Any], ...] = (OWN_LAWS, NUMBERS, EFFECT_TABLE, CATALOG)
+    tables: list[dict[str, Any]] = [OWN_LAWS, NUMBERS, EFFECT_TABLE]
+    tables += [CATALOG]
     before = [dict(table) for table in tables]
     try:
         for effect in own:

@@ -209,6 +209,8 @@ class GapResult:
         record_next: what to record to tell names apart, a sentence for each pair.
         not_in_model_xml: what MJCF has no word for; None where it was not written.
         retrained: None where no policy was.
+        known_effects: where laws were found, the held-out gap that the effects of the
+            catalog leave without them; else None.
     """
 
     model: str
@@ -238,6 +240,7 @@ class GapResult:
     record_next: tuple[str, ...] = ()
     not_in_model_xml: tuple[str, ...] | None = None
     retrained: Retrained | None = None
+    known_effects: float | None = None
 
     def times_floor(self, gap: float) -> float:
         """A gap in units of that of a perfect model."""

@@ -48,6 +48,7 @@ def gap_json(result: GapResult) -> dict[str, Any]:
             "after_95": r.after.interval,
             "floor": r.floor,
             "open": "" in r.open,
+            **({} if r.known_effects is None else {"known_effects": r.known_effects}),
         },
         "unexplained_share": r.share(r.after.gap, r.floor),
         "gap_si": {row[0]: _channel_json(r, *row) for row in _channels(r)},
@@ -154,6 +155,11 @@ def headline(r: GapResult) -> list[str]:
             lines.append(
                 f"These data cannot tell it from {', '.join(e.indistinguishable)}."
             )
+    if r.known_effects is not None:
+        lines.append(
+            "The effects that are known by name leave a gap of "
+            f"{number(r.known_effects, 3)} without that law."
+        )
     if r.verdict == "unexplained":
         lines.append(
             f"A gap of {number(r.after.gap, 3)} remains "
