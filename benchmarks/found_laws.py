@@ -2,9 +2,8 @@
 
     python -m benchmarks.found_laws
 
-Machines of one to three joints (``tests/gap_cases/laws.py``: separate physics, at a
-finer step) hide one of eight laws, sized 3 to 30 times the sensor noise; controls of
-equal size hide what the table has. Each is a line of ``results/found_laws.jsonl``.
+Machines of one to three joints (``tests/gap_cases/laws.py``: separate physics) hide
+one of eight laws, sized 3 to 30 times the sensor noise; controls of equal size hide what the table has. Each is a line of ``results/found_laws.jsonl``.
 
 A law is right where the force that was found (laws, effects of the table and refitted
 parameters together: `|v|` beside a damping is a damping that differs by direction) goes
@@ -81,7 +80,7 @@ def solve(cell: Cell) -> dict[str, Any]:
         seconds = time.perf_counter() - begin
         gap_json = json.loads((out / "gap.json").read_text())
         (held,) = gap_json["held_out"][:1]
-        match = correlation(case, out, held)
+        match = None if cell.control else correlation(case, out, held)
     effects = gap_json["effects"]
     return {
         **answer,

@@ -37,8 +37,10 @@ def write_all(
     outcome: "Outcome",
 ) -> tuple["GapResult", bool]:
     """Writes everything; returns the result, and whether every part of it was made."""
+    from easi_jax.gap.law_curves import law_curves
     from easi_jax.gap.summary import error_map, error_places, telling_traces
     from easi_jax.io.report.gap_report import (
+        law_picture,
         map_picture,
         steps_picture,
         traces_picture,
@@ -61,6 +63,10 @@ def write_all(
     def traces() -> "Picture":
         return traces_picture(telling_traces(outcome, m, problem.held[0]))
 
+    def laws() -> "Picture | None":
+        curves = law_curves(result, m, problem.held)
+        return law_picture(curves) if curves else None
+
     left = extras.attempt(
         "model.xml", lambda: _write_model(folder, problem, result), None
     )
@@ -69,6 +75,7 @@ def write_all(
     )
     result = dataclasses.replace(result, not_in_model_xml=left, where=where)
     drawn("the gap, step by step", lambda: steps_picture(result))
+    drawn("the law that was found", laws)
     drawn("where and when", map_of_errors)
     drawn("measured and predicted", traces)
     advice = extras.attempt(

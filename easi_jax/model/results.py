@@ -166,6 +166,24 @@ class Traces:
 
 
 @dataclass(frozen=True)
+class LawCurve:
+    """The force of a law that was found, over motion that no fit has seen.
+
+    Attributes:
+        law: its formula.
+        against: what it is shown against, with its unit.
+        x, force: ``(T,)``.
+        unit: of the force.
+    """
+
+    law: str
+    against: str
+    x: np.ndarray
+    force: np.ndarray
+    unit: str
+
+
+@dataclass(frozen=True)
 class Retrained:
     """Returns of policies in the repaired model, by seed.
 

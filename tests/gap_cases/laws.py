@@ -1,7 +1,7 @@
 """Machines with a law that no table has, and controls without any; plain MuJoCo.
 
-A law is a generalized force that plain functions compute between the steps of a finer
-simulation than the model's. Its size is set so that it moves predictions by a wanted
+A law is a generalized force that plain functions compute between the steps of a
+simulation by MuJoCo. Its size is set so that it moves predictions by a wanted
 multiple of the sensor noise.
 """
 
@@ -15,8 +15,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-STEP = 0.002  # s, of the model
-FINER = 4  # steps of the machine in one of the model's
+STEP = 0.002  # s, of the model and of the machine
 ROW = 0.01  # s
 RUNS = 3
 NOISE = 3e-4  # rad or m
@@ -47,7 +46,8 @@ def _model(name: str, body: str, joints: tuple[str, ...], gear: float) -> str:
 
 
 _THREE = ("base", "upper", "fore")
-_CART = """<body><joint name="cart" type="slide" axis="1 0 0" damping="0.8"/>
+_CART = """<body><joint name="cart" type="slide" axis="1 0 0" damping="0.8"
+stiffness="9"/>
 <geom size="0.1" mass="1.5"/></body>"""
 MACHINES = {
     "pendulum": _model("pendulum", _chain(("hinge",)), ("hinge",), 1.5),
@@ -237,7 +237,6 @@ def draw_law(seed: int, folder: Path, control: bool = False) -> dict:
     floors = float(np.exp(rng.uniform(np.log(3), np.log(30))))
     xml = MACHINES[machine]
     m = mujoco.MjModel.from_xml_string(xml)
-    m.opt.timestep = STEP / FINER
     size = _sized(m, law, floors, seed)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "model.xml").write_text(xml)

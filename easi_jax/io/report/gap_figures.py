@@ -20,7 +20,9 @@ from easi_jax.io.report.figure_style import (
     with_unit,
 )
 from easi_jax.io.report.numbers import compact, number
+from easi_jax.model.results import LawCurve
 
+_DOTS = 1_500  # of a law, at most
 _DASHES: Any = {"color": VERMILION, "lw": 1.3, "ls": (0, (4, 2))}
 
 
@@ -99,6 +101,19 @@ def gap_steps(
     axis.set_xlabel("gap on held-out data (share of the motion)")
     axis.set_ylim(-0.6, len(labels) - 0.1)
     axis.grid(visible=False, axis="y")
+    return svg(figure)
+
+
+@styled
+def law_curves(curves: Sequence[LawCurve]) -> str:
+    """The force of each law against what it depends on, a dot a row."""
+    figure, axes = grid(len(curves), min(len(curves), 2), 2.6)
+    for axis, c in zip(axes, curves, strict=True):
+        some = np.linspace(0, len(c.x) - 1, min(len(c.x), _DOTS)).astype(int)
+        axis.plot(c.x[some], c.force[some], ".", ms=2, color=BLUE)
+        axis.set_xlabel(c.against)
+        axis.set_ylabel(f"missing force [{c.unit}]")
+        axis.set_title(c.law)
     return svg(figure)
 
 

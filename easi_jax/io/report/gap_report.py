@@ -4,7 +4,12 @@ from collections.abc import Iterator, Sequence
 from statistics import median
 from typing import Any
 
-from easi_jax.io.report.gap_figures import gap_steps, residual_maps, traces
+from easi_jax.io.report.gap_figures import (
+    gap_steps,
+    law_curves,
+    residual_maps,
+    traces,
+)
 from easi_jax.io.report.html import Picture, Report, Table
 from easi_jax.io.report.numbers import (
     measured,
@@ -19,6 +24,7 @@ from easi_jax.model.results import (
     ErrorMap,
     GapFigures,
     GapResult,
+    LawCurve,
     NamedEffect,
     Retrained,
     Traces,
@@ -375,6 +381,17 @@ def steps_picture(r: GapResult) -> Picture:
         "noise floor as a line",
         "Root mean square error of open-loop predictions of data that no fit has seen, "
         "as a share of the motion; the line on the last bar is its 95 % interval.",
+    )
+
+
+def law_picture(curves: Sequence[LawCurve]) -> Picture:
+    """What force is missing, against what."""
+    return Picture(
+        "The law that was found",
+        law_curves(curves),
+        "The force of each law that was found against what it depends on, a dot for "
+        "each row of the held-out data",
+        "What the law adds to the model, over motion that no fit has seen.",
     )
 
 

@@ -1,0 +1,98 @@
+"""Laws that nobody listed, from motion to a formula."""
+
+from collections.abc import Callable, Iterator
+
+import mujoco
+import numpy as np
+import pytest
+
+from easi_jax.data.recording import Run
+from easi_jax.data.windows import fitted_velocity
+from easi_jax.gap.analysis import Analysis, proposed_laws
+from easi_jax.gap.offered_terms import offered
+from easi_jax.model.found_laws import FOUND_LAW, public_name
+from easi_jax.model.joint_space import Configuration
+from easi_jax.model.own_effects import registered
+from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation import engine
+
+DT, STEPS, NOISE = 0.01, 4, 3e-4
+ONE = """<mujoco><option timestep="0.0025"/><worldbody><body>
+<joint name="j" axis="0 1 0" damping="0.05"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.5"/></body></worldbody>
+<actuator><motor name="m" joint="j"/></actuator></mujoco>"""
+
+
+@pytest.fixture(autouse=True)
+def catalog() -> Iterator[None]:
+    with registered([]):
+        yield
+
+
+def recorded(m: mujoco.MjModel, seed: int, force: Callable) -> Run:
+    rng, d, c = np.random.default_rng(seed), mujoco.MjData(m), Configuration.of(m)
+    t = DT * np.arange(400)
+    rate, phase = rng.uniform(2, 10, 3), rng.uniform(0, 6, 3)
+    ctrl = 0.4 * np.sin(rate * t[:, None] + phase).sum(1)[:, None]
+    q = []
+    for u in ctrl:
+        q.append(d.qpos + NOISE * rng.normal(size=m.nq))
+        d.ctrl[:] = u
+        for _ in range(STEPS):
+            d.qfrc_applied[:] = force(d)
+            mujoco.mj_step(m, d)
+    qpos = np.array(q)
+    speed = fitted_velocity(qpos, DT, c)
+    return Run(f"r{seed}", "made", DT, t, qpos, speed, False, ctrl, c)
+
+
+def analysis(force: Callable) -> Analysis:
+    """Without any effect of the catalog, so that it takes seconds."""
+    m = mujoco.MjModel.from_xml_string(ONE)
+    runs = [recorded(m, k, force) for k in range(3)]
+    noise = np.array([NOISE, 1.0])
+    given = m, ParameterSpace(()), runs[:2], runs[2:], noise, 0.2
+    return Analysis(*given, only=[])
+
+
+@pytest.mark.slow
+def test_a_cubic_spring_is_found_and_confirmed() -> None:
+    with engine.using("mujoco"):
+        a = analysis(lambda d: -0.3 * d.qpos**3)
+        outcome = a.run()
+    (found,) = outcome.found
+    assert public_name(found.place.effect) == FOUND_LAW
+    assert found.values["c1"][0] == pytest.approx(-0.3, rel=0.02)
+    assert found.values["c1"][2] == "N m/rad^3"
+    assert outcome.verdict == "explained" and a.final is not a
+    assert outcome.known_effects is not None
+    assert outcome.after.gap < 0.2 * outcome.known_effects
+
+
+@pytest.mark.parametrize(
+    ("force", "text"),
+    [
+        (lambda d: 0.05 * np.abs(d.qvel), "abs(qvel.j)"),
+        (lambda d: 0.15 * d.ctrl * np.abs(d.ctrl), "ctrl.m*abs(ctrl.m)"),
+    ],
+)
+def test_terms_are_proposed(force: Callable, text: str) -> None:
+    with engine.using("mujoco"):
+        a = analysis(force)
+        proposed = proposed_laws(a, a._chosen().model)
+    assert proposed[0].law.terms[0].text == text
+
+
+def test_nothing_is_proposed_where_nothing_is_left() -> None:
+    with engine.using("mujoco"):
+        a = analysis(lambda d: 0.0 * d.qpos)
+        assert proposed_laws(a, a._chosen().model) == []
+
+
+def test_what_the_table_has_is_not_offered() -> None:
+    m = mujoco.MjModel.from_xml_string(ONE)
+    with engine.using("mujoco"):
+        scales = analysis(lambda d: 0.0 * d.qpos).data.scales
+    texts = [t.term.text for t in offered(m, scales)]
+    assert len(set(texts)) == len(texts) > 40
+    assert not {"qpos.j", "qvel.j"} & {*texts}
