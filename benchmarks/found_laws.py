@@ -3,7 +3,8 @@
     python -m benchmarks.found_laws
 
 Machines of one to three joints (``tests/gap_cases/laws.py``: separate physics) hide
-one of eight laws, sized 3 to 30 times the sensor noise; controls of equal size hide what the table has. Each is a line of ``results/found_laws.jsonl``.
+one of eight laws, sized 3 to 30 times the sensor noise; controls of equal size hide
+what the table has. Each is a line of ``results/found_laws.jsonl``.
 
 A law is right where the force that was found (laws, effects of the table and refitted
 parameters together: `|v|` beside a damping is a damping that differs by direction) goes
@@ -23,6 +24,8 @@ from benchmarks._cells import Share, run_cells
 from benchmarks._common import RESULTS
 from train._command import main
 
+LIKE = 0.9  # correlation of a force that is right
+CLOSED = 1.25  # floors
 GOALS = {"law right": 0.7, "half of the gap": 0.8, "false laws at most": 0.05}
 
 

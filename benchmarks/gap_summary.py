@@ -9,6 +9,8 @@ from typing import Any
 
 from benchmarks._common import markdown_table, short
 from benchmarks._page import Section, each_of, load, met, table
+from benchmarks.found_laws import CLOSED, LIKE
+from benchmarks.found_laws import GOALS as LAW_GOALS
 from benchmarks.gap_real import MACHINES
 from benchmarks.gap_score import (
     GOALS,
@@ -302,6 +304,42 @@ def _horizons(found: dict[str, Any]) -> list[str]:
     ]
 
 
+def _laws(rows: list[Any]) -> list[str]:
+    """Laws that no table has: found, and where there is none."""
+    hidden = [r for r in rows if not r["control"]]
+    controls = [r for r in rows if r["control"]]
+    lines = []
+    for law in sorted({r["law"] for r in hidden}):
+        mine = [r for r in hidden if r["law"] == law]
+        right = sum(r["correlation"] >= LIKE for r in mine)
+        told = sum(bool(r["laws"]) for r in mine)
+        lines.append((law, len(mine), right, told, sum(map(_halved, mine))))
+    right = sum(r["correlation"] >= LIKE for r in hidden)
+    halved = sum(map(_halved, hidden))
+    false = sum(bool(r["laws"]) for r in controls)
+    share = LAW_GOALS["law right"], LAW_GOALS["half of the gap"]
+    most = LAW_GOALS["false laws at most"]
+    return [
+        f"`python -m benchmarks.found_laws`: {len(hidden)} hidden laws, "
+        f"{len(controls)} controls of equal size. The force that was found goes with "
+        f"the hidden one (correlation {LIKE:g}) in {right} (goal {share[0]:.0%}: "
+        f"{met(right >= share[0] * len(hidden))}); the gap is at most half of what the "
+        f"table leaves, or closed, in {halved} (goal {share[1]:.0%}: "
+        f"{met(halved >= share[1] * len(hidden))}); a law on {false} controls (goal "
+        f"{most:.0%} at most: {met(false <= most * len(controls))}).",
+        markdown_table(
+            ("law", "cases", "right", "law named", "gap halved or closed"), lines
+        ),
+    ]
+
+
+def _halved(r: dict[str, Any]) -> bool:
+    gap = r["gap"]
+    if gap["after"] <= CLOSED * gap["floor"]:
+        return True
+    return "known_effects" in gap and gap["after"] <= 0.5 * gap["known_effects"]
+
+
 _FIRST = next(iter(HIDDEN))
 SECTIONS = (
     Section("## Hidden effects", "gap_cases.jsonl", "gap", _cases),
@@ -325,6 +363,7 @@ SECTIONS = (
         "gap_horizons",
         _horizons,
     ),
+    Section("### Laws that no table has", "found_laws.jsonl", "found_laws", _laws),
     Section("## Effects in real recordings", "gap_real_*.json", "gap_real", _real),
     Section("## Time of train.gap", "gap_times.jsonl", "gap_times", _times),
     *(

@@ -50,9 +50,9 @@ _CART = """<body><joint name="cart" type="slide" axis="1 0 0" damping="0.8"
 stiffness="9"/>
 <geom size="0.1" mass="1.5"/></body>"""
 MACHINES = {
-    "pendulum": _model("pendulum", _chain(("hinge",)), ("hinge",), 1.5),
+    "pendulum": _model("pendulum", _chain(("hinge",)), ("hinge",), 0.7),
     "cart": _model("cart", _CART, ("cart",), 8.0),
-    "arm2": _model("arm2", _chain(("shoulder", "elbow")), ("shoulder", "elbow"), 4.0),
+    "arm2": _model("arm2", _chain(("shoulder", "elbow")), ("shoulder", "elbow"), 2.4),
     "arm3": _model(
         "arm3", _chain(("base", "upper", "fore")), ("base", "upper", "fore"), 8.0
     ),
@@ -199,11 +199,10 @@ def _moved(
     return np.array(q), np.array(v), np.array(f)
 
 
-def _sized(m: mujoco.MjModel, law: Law, floors: float, seed: int) -> float:
-    """How large a law has to be to move predictions by so many times the noise."""
-    rng = np.random.default_rng(seed)
-    rows = 30 * HORIZON
-    ctrl = _commands(m, rng, rows)
+def _sized(m: mujoco.MjModel, law: Law, floors: float, ctrl: np.ndarray) -> float:
+    """How large a law has to be to move predictions of a run by so many times the
+    noise."""
+    rows = len(ctrl)
     size = 0.01
     for _ in range(6):
         q, v, _ = _moved(m, ctrl, law, size)
@@ -237,19 +236,19 @@ def draw_law(seed: int, folder: Path, control: bool = False) -> dict:
     floors = float(np.exp(rng.uniform(np.log(3), np.log(30))))
     xml = MACHINES[machine]
     m = mujoco.MjModel.from_xml_string(xml)
-    size = _sized(m, law, floors, seed)
+    rows = [int(n) for n in rng.integers(800, 1600, RUNS)]
+    sent = [_commands(m, rng, n) for n in rows]
+    size = _sized(m, law, floors, sent[0])
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "model.xml").write_text(xml)
     hidden = {}
-    for run in range(1, RUNS + 1):
-        rows = int(rng.integers(800, 1600))
-        ctrl = _commands(m, rng, rows)
+    for run, ctrl in enumerate(sent, 1):
         q, _, f = _moved(m, ctrl, law, size)
         hidden[f"run{run}"] = f
         read = q + NOISE * rng.normal(size=q.shape)
         head = ["time", *(f"qpos.{m.joint(j).name}" for j in range(m.njnt))]
         head += [f"ctrl.{m.actuator(a).name}" for a in range(m.nu)]
-        table = np.column_stack([ROW * np.arange(rows), read, ctrl])
+        table = np.column_stack([ROW * np.arange(len(ctrl)), read, ctrl])
         lines = [",".join(f"{x:.9g}" for x in row) for row in table]
         (folder / f"run{run}.csv").write_text("\n".join([",".join(head), *lines, ""]))
     np.savez(folder / "hidden.npz", **hidden)

@@ -22,6 +22,7 @@ from easi_jax.io.models.completed import as_read
 from easi_jax.io.models.mjcf import mujoco_warnings, ways
 from easi_jax.model.effect_catalog import CATALOG
 from easi_jax.model.effect_numbers import EffectEntry
+from easi_jax.model.found_laws import public_name
 from easi_jax.model.joint_space import joint_name
 
 _ASSETS = "assets"  # folder beside the model
@@ -103,7 +104,7 @@ def _repaired(
         except (ValueError, mujoco.FatalError):
             added = None
         if added is None:
-            left.append(f"{e.effect}@{e.at}" if e.at else e.effect)
+            left.append(public_name(f"{e.effect}@{e.at}" if e.at else e.effect))
             spec = before
         else:
             off += added
