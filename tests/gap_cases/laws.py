@@ -22,15 +22,15 @@ NOISE = 3e-4  # rad or m
 HORIZON = 20  # rows, over which the size of a law is measured
 STICTION = 0.02  # speed over which a sign turns
 
-_LINK = """<body pos="{0} 0 0"><joint name="{1}" axis="0 1 0" damping="{2}"/>
-<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="{3}"/>{4}</body>"""
+_LINK = """<body pos="0 0 {0}"><joint name="{1}" axis="0 1 0" damping="{2}"/>
+<geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="{3}"/>{4}</body>"""
 
 
 def _chain(names: tuple[str, ...]) -> str:
     inner = ""
     for k in reversed(range(len(names))):
         damping, mass = 0.06 / (k + 1), 0.8 / (k + 1)
-        inner = _LINK.format(0.3 if k else 0, names[k], damping, mass, inner)
+        inner = _LINK.format(-0.3 if k else 0, names[k], damping, mass, inner)
     return inner
 
 
@@ -50,9 +50,9 @@ _CART = """<body><joint name="cart" type="slide" axis="1 0 0" damping="0.8"
 stiffness="9"/>
 <geom size="0.1" mass="1.5"/></body>"""
 MACHINES = {
-    "pendulum": _model("pendulum", _chain(("hinge",)), ("hinge",), 0.7),
+    "pendulum": _model("pendulum", _chain(("hinge",)), ("hinge",), 0.6),
     "cart": _model("cart", _CART, ("cart",), 8.0),
-    "arm2": _model("arm2", _chain(("shoulder", "elbow")), ("shoulder", "elbow"), 2.4),
+    "arm2": _model("arm2", _chain(("shoulder", "elbow")), ("shoulder", "elbow"), 0.9),
     "arm3": _model(
         "arm3", _chain(("base", "upper", "fore")), ("base", "upper", "fore"), 8.0
     ),
