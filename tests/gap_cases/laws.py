@@ -53,9 +53,7 @@ MACHINES = {
     "pendulum": _model("pendulum", _chain(("hinge",)), ("hinge",), 0.6),
     "cart": _model("cart", _CART, ("cart",), 8.0),
     "arm2": _model("arm2", _chain(("shoulder", "elbow")), ("shoulder", "elbow"), 0.9),
-    "arm3": _model(
-        "arm3", _chain(("base", "upper", "fore")), ("base", "upper", "fore"), 8.0
-    ),
+    "arm3": _model("arm3", _chain(_THREE), _THREE, 1.2),
 }
 
 
