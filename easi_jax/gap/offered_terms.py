@@ -76,8 +76,8 @@ def _along(m: mujoco.MjModel, s: Scales, name: str) -> Iterator[Offered]:
         return Offered(acts, Term(text), parts)
 
     yield term(f"abs({v})", _PLAIN)
-    yield term(f"{v}**3", _PLAIN)
-    yield term(f"{v}**2", _PLAIN)
+    yield term(f"{v}**3", _TWO)
+    yield term(f"{v}**2", _TWO)
     for k in (2, 3):
         yield term(f"{q}**{k}", _PLAIN)
     yield term(f"abs({q})", _PLAIN)

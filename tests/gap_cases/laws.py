@@ -7,6 +7,7 @@ multiple of the sensor noise.
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -142,7 +143,8 @@ def _damping(s: State) -> np.ndarray:
 
 
 def _friction(s: State) -> np.ndarray:
-    return np.r_[-_sign(float(s.v[0])), np.zeros(len(s.v) - 1)]
+    """MuJoCo's own, which holds; see `_moved`."""
+    return np.zeros(len(s.v))
 
 
 def _constant(s: State) -> np.ndarray:
@@ -177,6 +179,9 @@ def _moved(
     start: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Positions, speeds and the law's forces in each row."""
+    if law is _friction:
+        m = copy.copy(m)
+        m.dof_frictionloss[0] = size
     d = mujoco.MjData(m)
     if start is not None:
         d.qpos[:], d.qvel[:] = start
