@@ -1,5 +1,9 @@
 """What laws remember in the rows of a recording, and the time of those rows."""
 
+from typing import Any
+
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -30,12 +34,21 @@ def memory_path(memory: Memory, known: Known, dt: float) -> np.ndarray:
     `easi_jax.model.own_laws.first_states` has it."""
     target, rate = (np.asarray(x, float) for x in memory.follows(known))
     target, rate = np.broadcast_arrays(target, rate)
-    left = np.exp(-rate * dt)
-    out = np.zeros(len(target))
-    out[0] = target[0] if memory.kind == "lag" else 0.0
-    for k in range(1, len(out)):
-        out[k] = target[k - 1] + (out[k - 1] - target[k - 1]) * left[k - 1]
-    return out
+    first = target[0] if memory.kind == "lag" else 0.0
+    path = _followed(first, target[:-1], np.exp(-rate[:-1] * dt))
+    return np.concatenate([[first], np.asarray(path, float)])
+
+
+@jax.jit
+def _followed(first: Any, target: Any, left: Any) -> jax.Array:
+    """States after each row, of which a share ``left`` stays."""
+
+    def row(state: Any, now: Any) -> Any:
+        goal, share = now
+        state = goal + (state - goal) * share
+        return state, state
+
+    return jax.lax.scan(row, jnp.asarray(first, target.dtype), (target, left))[1]
 
 
 def law_states(m: mujoco.MjModel, run: Run) -> np.ndarray:
