@@ -20,6 +20,7 @@ from easi_jax.gap.model_comparison import HELPS, better, probability, rank, simp
 from easi_jax.gap.screening import expanded, screened, shortlist
 from easi_jax.gap.table import Place, covered, does
 from easi_jax.model.effect_catalog import Scales
+from easi_jax.model.found_laws import law_of
 from easi_jax.model.joint_space import is_hinge, scalar_dofs
 from easi_jax.model.parameters import ParameterSpace
 
@@ -55,7 +56,12 @@ class Places:
         only: Collection[str] | None = None,
     ) -> None:
         self.m = m
-        self.everywhere = places(m, scales)
+        # Laws of an earlier analysis are none of this one's, unless it asks for them.
+        self.everywhere = [
+            p
+            for p in places(m, scales)
+            if law_of(p.effect) is None or p.key in (only or ())
+        ]
         self.offered = [
             p
             for p in self.everywhere

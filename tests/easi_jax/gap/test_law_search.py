@@ -9,9 +9,11 @@ import pytest
 from easi_jax.data.recording import Run
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.gap.analysis import Analysis, proposed_laws
+from easi_jax.gap.effect_search import Places
 from easi_jax.gap.offered_terms import offered
-from easi_jax.model.found_laws import FOUND_LAW, public_name
+from easi_jax.model.found_laws import FOUND_LAW, FoundLaw, add_law, public_name
 from easi_jax.model.joint_space import Configuration
+from easi_jax.model.law_terms import Term
 from easi_jax.model.own_effects import registered
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import engine
@@ -87,6 +89,15 @@ def test_nothing_is_proposed_where_nothing_is_left() -> None:
     with engine.using("mujoco"):
         a = analysis(lambda d: 0.0 * d.qpos)
         assert proposed_laws(a, a._chosen().model) == []
+
+
+def test_laws_of_an_earlier_analysis_are_not_offered() -> None:
+    with engine.using("mujoco"):
+        a = analysis(lambda d: 0.0 * d.qpos)
+        name = add_law(FoundLaw((("j", 1.0),), (Term("qpos.j**3"),)))
+        given = a.m, a.space, a.data.scales
+        assert not [p for p in Places(*given).known if p.startswith(name)]
+        assert f"{name}@j" in Places(*given, only=[f"{name}@j"]).known
 
 
 def test_what_the_table_has_is_not_offered() -> None:
