@@ -16,13 +16,13 @@ from easi_jax.model.results import GapResult, LawCurve
 
 def law_curves(r: GapResult, m: mujoco.MjModel, runs: Sequence[Run]) -> list[LawCurve]:
     """One for each law, over all rows of some runs."""
+    laws = [(e, law) for e in r.effects if (law := law_of(e.effect)) is not None]
+    if not laws:
+        return []
     names = Law("", (), 0, (), joints_of(m), actuators_of(m))
     rows = [(known_rows(names, run), run.dt) for run in runs]
     out = []
-    for e in r.effects:
-        law = law_of(e.effect)
-        if law is None:
-            continue
+    for e, law in laws:
         values = [e.values[n][0] for n in law.numbers]
         force = [_force(law, values, known, dt) for known, dt in rows]
         against, x = _against(law, m, [known for known, _ in rows])

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from easi_jax.errors import UserError
-from easi_jax.gap import summary
+from easi_jax.gap import law_curves, summary
 from easi_jax.io.report import gap_report
 from easi_jax.io.report.html import Picture, Report, Table
 from easi_jax.io.runs.folder import RunFolder
@@ -22,6 +22,7 @@ PARTS = {
     "model.xml": (_gap_results, "_write_model"),
     "where the error sits": (summary, "error_places"),
     'the picture "the gap, step by step"': (gap_report, "steps_picture"),
+    'the picture "the law that was found"': (law_curves, "law_curves"),
     'the picture "where and when"': (summary, "error_map"),
     'the picture "measured and predicted"': (summary, "telling_traces"),
     "what to record next": (_gap_results, "_record_next"),
