@@ -2,12 +2,12 @@
 
 A law is a generalized force along a joint, or along a sum of joints, that is linear in
 its numbers ``c1``, ``c2``, ...: one for each term (`easi_jax.model.law_terms`). Its
-name is ``found_law`` to people and files; within a process each has one of its own.
+name is ``found_law`` to people and files; within the catalog each has one of its own.
 """
 
-import functools
 import math
 import re
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -63,7 +63,7 @@ class FoundLaw:
 
     @property
     def name(self) -> str:
-        """Within this process."""
+        """In the catalog, and in addresses of its numbers."""
         return f"{FOUND_LAW}_{_number_of(self)}"
 
     def force(self, now: Now, p: Any) -> dict[str, Any]:
@@ -123,13 +123,10 @@ def _factor(term: Term) -> str:
     return f"({term.shown})" if term.is_sum else term.shown
 
 
-@functools.cache
 def _number_of(law: FoundLaw) -> int:
-    """A number for each law, in the order in which they come up."""
-    return next(_numbers)
-
-
-_numbers = iter(range(1, 1 << 30))
+    """The same for the same law, in every process."""
+    text = repr((law.acts, [term.text for term in law.terms]))
+    return zlib.crc32(text.encode())
 
 
 def law_of(effect: str) -> FoundLaw | None:
@@ -141,7 +138,7 @@ _LAWS: dict[str, FoundLaw] = {}
 
 
 def public_name(text: str) -> str:
-    """What people and files read in place of names of this process."""
+    """What people and files read in place of names of the catalog."""
     return _INTERNAL.sub(FOUND_LAW, text)
 
 

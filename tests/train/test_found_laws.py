@@ -40,5 +40,5 @@ def test_a_law_is_found_named_and_searched(tmp_path: Path) -> None:
 
     file = ("--effects", out / "effects.yaml", "--generations", 3)
     command(easi, *given, *file, "--out", tmp_path / "easi")
-    found = read(tmp_path / "easi" / "results.json")["parameters"]
+    found = read(tmp_path / "easi" / "distribution.json")["parameters"]
     assert f"found_law@{law['at']}.c1" in [p["name"] for p in found]

@@ -53,7 +53,9 @@ def test_a_coupling_spring_is_found_and_searched(made: dict, capsys) -> None:
     assert "--effects-from" in refused(capsys, easi, *given(folder), *file, *out)
     own = ("--effects-from", EXAMPLES / "coupling_spring.py")
     command(easi, *given(folder), *file, *own, *out)
-    names = [p["name"] for p in read(folder / "easi" / "results.json")["parameters"]]
+    names = [
+        p["name"] for p in read(folder / "easi" / "distribution.json")["parameters"]
+    ]
     assert "coupling_spring.stiffness" in names
 
 

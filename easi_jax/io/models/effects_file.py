@@ -165,7 +165,7 @@ def _entry(path: str, i: int, item: Any) -> EffectEntry:
 
 
 def _with_law(where: str, item: dict[str, Any]) -> dict[str, Any]:
-    """A law's entry by its name in this process, columns likewise."""
+    """A law's entry by its name in the catalog, columns likewise."""
     acts, terms = item.get("acts"), item.get("terms")
     if not isinstance(acts, dict) or not isinstance(terms, list):
         raise UserError(
