@@ -104,13 +104,13 @@ def correlation(case: Path, out: Path, held: str) -> float:
     import yaml
 
     from easi_jax import read_log
-    from easi_jax.data.law_states import known_rows, memory_path
+    from easi_jax.data.law_states import known_rows, term_path
     from easi_jax.model.law_terms import Term
-    from easi_jax.model.own_laws import Law, actuators_of, joints_of
+    from easi_jax.model.own_laws import names_alone
 
     m = mujoco.MjModel.from_xml_path(str(case / "model.xml"))
     (run,) = read_log(case / f"{held}.csv", m).runs
-    law = Law("", (), 0, (), joints_of(m), actuators_of(m))
+    law = names_alone(m)
     known, dofs = known_rows(law, run), law.dofs
     found = np.zeros((len(run), m.nv))
     told = yaml.safe_load((out / "effects.yaml").read_text())
@@ -122,9 +122,7 @@ def correlation(case: Path, out: Path, held: str) -> float:
         if e["effect"] == "found_law":
             force = np.zeros(len(run))
             for k, text in enumerate(e["terms"], 1):
-                term = Term(text)
-                memory = tuple(memory_path(x, known, run.dt) for x in term.memories)
-                force += c[f"c{k}"] * np.asarray(term.value(known, memory))
+                force += c[f"c{k}"] * term_path(Term(text), known, run.dt)
             for joint, share in e["acts"].items():
                 found[:, dofs[joint]] += share * force
             continue

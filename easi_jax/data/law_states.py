@@ -10,7 +10,7 @@ import numpy as np
 from easi_jax.data.recording import Run
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.model import effects
-from easi_jax.model.law_terms import Known, Memory
+from easi_jax.model.law_terms import Known, Memory, Term
 from easi_jax.model.own_laws import Law
 
 _SMALL = 1e5  # s; single precision tells 10 ms apart until then
@@ -39,6 +39,12 @@ def memory_path(memory: Memory, known: Known, dt: float) -> np.ndarray:
     return np.concatenate([[first], np.asarray(path, float)])
 
 
+def term_path(term: Term, known: Known, dt: float) -> np.ndarray:
+    """A term in all rows, ``(T,)``, what it remembers included."""
+    memory = tuple(memory_path(x, known, dt) for x in term.memories)
+    return np.asarray(term.value(known, memory), float)
+
+
 @jax.jit
 def _followed(first: Any, target: Any, left: Any) -> jax.Array:
     """States after each row, of which a share ``left`` stays."""
@@ -53,9 +59,8 @@ def _followed(first: Any, target: Any, left: Any) -> jax.Array:
 
 def law_states(m: mujoco.MjModel, run: Run) -> np.ndarray:
     """States of all laws of a model in the rows of a run, ``(T, S)``."""
-    paths = [
-        memory_path(memory, known_rows(law, run), run.dt)
-        for law in effects.none(m).laws
-        for memory in law.memories
-    ]
-    return np.stack(paths, 1) if paths else np.zeros((len(run), 0))
+    memories = [(law, x) for law in effects.laws_of(m) for x in law.memories]
+    if not memories:
+        return np.zeros((len(run), 0))
+    known = known_rows(memories[0][0], run)  # names of the model, as all laws have them
+    return np.stack([memory_path(x, known, run.dt) for _, x in memories], 1)

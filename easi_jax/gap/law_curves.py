@@ -5,12 +5,12 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from easi_jax.data.law_states import known_rows, memory_path
+from easi_jax.data.law_states import known_rows, term_path
 from easi_jax.data.recording import Run
 from easi_jax.model.found_laws import FoundLaw, law_of
 from easi_jax.model.joint_space import tangent_units
 from easi_jax.model.law_terms import Known
-from easi_jax.model.own_laws import Law, actuators_of, joints_of
+from easi_jax.model.own_laws import names_alone
 from easi_jax.model.results import GapResult, LawCurve
 
 
@@ -19,7 +19,7 @@ def law_curves(r: GapResult, m: mujoco.MjModel, runs: Sequence[Run]) -> list[Law
     laws = [(e, law) for e in r.effects if (law := law_of(e.effect)) is not None]
     if not laws:
         return []
-    names = Law("", (), 0, (), joints_of(m), actuators_of(m))
+    names = names_alone(m)
     rows = [(known_rows(names, run), run.dt) for run in runs]
     out = []
     for e, law in laws:
@@ -35,8 +35,7 @@ def _force(
 ) -> np.ndarray:
     total = np.zeros(np.shape(known.time))
     for value, term in zip(values, law.terms, strict=True):
-        memory = tuple(memory_path(x, known, dt) for x in term.memories)
-        total = total + value * np.asarray(term.value(known, memory), float)
+        total = total + value * term_path(term, known, dt)
     return total
 
 

@@ -23,7 +23,7 @@ from easi_jax.gap.offered_terms import Offered, offered
 from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.model.found_laws import FoundLaw
 from easi_jax.model.law_terms import Known, Memory, Term
-from easi_jax.model.own_laws import Law, actuators_of, joints_of
+from easi_jax.model.own_laws import joints_of, names_alone
 
 _MOST = 4  # terms
 _SURE = 2.5  # standard errors between blocks: one of some hundred terms is the best
@@ -206,8 +206,7 @@ class _Motion:
 
     def __init__(self, at: Fitting, linear: LinearResponse) -> None:
         m, windows, rows = at.data.m, at.windows, linear.rows
-        # A law of no effect, which knows names.
-        law = Law("", (), 0, (), joints_of(m), actuators_of(m))
+        law = names_alone(m)
         self.dofs = law.dofs
         self._dt, self._run = at.data.dt, windows.run
         self._runs = {r: known_rows(law, at.data.runs[r]) for r in set(windows.run)}

@@ -170,27 +170,35 @@ def none(m: mujoco.MjModel) -> Effects:
     )
 
 
-def _own(m: mujoco.MjModel) -> dict[str, Any]:
-    """What owners wrote, without strength."""
+def laws_of(m: mujoco.MjModel) -> tuple[Law, ...]:
+    """What owners wrote, and laws that were found, in a model."""
     if not OWN_LAWS:
-        return {}
+        return ()
     laws: list[Law] = []
-    neutral: list[float] = []
     dofs = {name: dof for name, _, dof in joints_of(m)}
     sites = {"joint": dofs, "model": {"": 0}}
     sites["actuator"] = {name: a for a, name in enumerate(actuators_of(m))}
-    states = 0
+    row = states = 0
     for own in OWN_LAWS.values():
         mine = [(name, at) for name, at in sites[own.on].items() if own.fits(name)]
         if own.names <= {*dofs, *sites["actuator"]}:
-            what = (own.name, own.numbers, len(neutral), tuple(mine))
+            what = (own.name, own.numbers, row, tuple(mine))
             about = (joints_of(m), actuators_of(m))
             does = (own.force, own.command, own.reading, own.memories)
             laws.append(Law(*what, *about, *does, states))
             states += len(own.memories)
-        neutral += [NUMBERS[f"{own.name}.{n}"].neutral for n in own.numbers]
+        row += len(own.numbers)
+    return tuple(laws)
+
+
+def _own(m: mujoco.MjModel) -> dict[str, Any]:
+    """What owners wrote, without strength."""
+    if not OWN_LAWS:
+        return {}
+    columns = (f"{own.name}.{n}" for own in OWN_LAWS.values() for n in own.numbers)
+    neutral = [NUMBERS[column].neutral for column in columns]
     known = jnp.broadcast_to(jnp.array(neutral)[:, None], (len(neutral), widest(m)))
-    return {OWN: known.astype(jnp.float32), "laws": tuple(laws)}
+    return {OWN: known.astype(jnp.float32), "laws": laws_of(m)}
 
 
 _STATIC = fields_that_act("model")
