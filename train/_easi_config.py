@@ -38,6 +38,19 @@ class _Sources:
     """Mapping file (YAML) for logs with foreign column names."""
     robot: str | None = None
     """Built-in robot that the logs are of, in place of --model and --parameters."""
+    policy: str | None = None
+    """What controlled the robot that the logs are of, where nobody measured where its
+    base was: a run folder with policies, a policy.onnx of train.export, or commands (it
+    is sent what the log was sent, from --model or --robot). It is simulated under its
+    controller, and short pieces of what it measures are compared (docs/method.md)."""
+    policy_seed: int | None = None
+    """Seed of the run folder's policy; its first where not given."""
+    observed: tuple[str, ...] = ()
+    """What the policy was asked for while the logs were recorded, NAME=NUMBER for
+    entries of its observation: command.forward=1.4 command.sideways=0 command.turn=0
+    for go2."""
+    sampled: bool = False
+    """The policy drew its actions at random; not given: it acted by its mode."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -28,7 +28,7 @@ def run(config: Any) -> None:
         overwrite=config.overwrite,
     ) as folder:
         from easi_jax.devices.distributed import started
-        from easi_jax.estimation.from_runs import ready_finish
+        from easi_jax.estimation.from_runs import ready_finish, search_data
         from easi_jax.estimation.held_out import ready_errors
         from train._log_results import sound, write
 
@@ -37,7 +37,8 @@ def run(config: Any) -> None:
                 problem, search, config.refine, config.restarts or 0, say
             )
         )
-        states = _search(folder, config, search, problem, seeds)
+        data = search_data(problem)
+        states = searched(folder, config, search, data, problem.notes, seeds)
         several = len(seeds) > 1
         errors = started(lambda: ready_errors(problem, search.space, several))
         estimates, outliers = finish()(states.result_mean, states.result_cov)
@@ -47,14 +48,7 @@ def run(config: Any) -> None:
             *(folder, problem, search.space, search.config.generations),
             *(list(good.values()), list(good), errors(), lost),
         )
-    from easi_jax.io.report.parameters import parameter_table
-
-    show_table(f"Parameters of {problem.name}", *parameter_table(report.parameters))
-    errors = report.tables[0]
-    show_table(errors.title, errors.columns, errors.rows)
-    for note in (*report.undetermined, *problem.notes):
-        say(f"note: {note}")
-    say(f"report: {config.out / 'report.html'}")
+    show(problem.name, report, problem.notes, config.out)
 
 
 def _settings(config: Any, problem: "Problem") -> Any:
@@ -82,24 +76,28 @@ def _settings(config: Any, problem: "Problem") -> Any:
     return replayed(problem, chosen)
 
 
-def _search(
-    folder: Any, config: Any, search: Any, problem: "Problem", seeds: Sequence[int]
+def searched(
+    folder: Any,
+    config: Any,
+    search: Any,
+    data: Any,
+    notes: list[str],
+    seeds: Sequence[int],
 ) -> Any:
+    """The search of each of ``seeds`` to its end, in chunks that are resumed."""
     import jax
 
     from easi_jax.devices.runtime import fast_loops, quick_compile
-    from easi_jax.estimation.from_runs import search_data
     from easi_jax.pipeline.stages import seed_keys
     from easi_jax.simulation.compile_time import expected
     from train._stages import jit_chunks, run_stage, search_check, search_rows
 
-    data = search_data(problem)
     keys = seed_keys(list(seeds))
     advance = jit_chunks(
         lambda states, data, n: jax.lax.map(lambda s: search.run(s, data, n), states),
         fast_loops() | quick_compile(),
     )
-    states = run_stage(
+    return run_stage(
         folder,
         "search",
         search.config.generations,
@@ -107,8 +105,19 @@ def _search(
         lambda: jax.lax.map(lambda k: search.init(k, data), keys),
         lambda states, n: advance(states, data, n),
         search_rows(seeds, search.space.names, search.space.to_si),
-        problem.notes,
+        notes,
         search_check(seeds, search.space.names, search.config.population),
-        seconds=expected(problem.simulator),
+        seconds=expected(search.simulator),
     )
-    return states
+
+
+def show(name: str, report: Any, notes: Sequence[str], out: Any) -> None:
+    """Says what was found, and where the report is."""
+    from easi_jax.io.report.parameters import parameter_table
+
+    show_table(f"Parameters of {name}", *parameter_table(report.parameters))
+    errors = report.tables[0]
+    show_table(errors.title, errors.columns, errors.rows)
+    for note in (*report.undetermined, *notes):
+        say(f"note: {note}")
+    say(f"report: {out / 'report.html'}")

@@ -22,7 +22,7 @@ def read_problem(config: Any) -> "Problem":
     """
     from easi_jax.estimation.problem import checked_horizon, problem_of
 
-    name, mj_model, space = _model_and_space(config)
+    name, mj_model, space = model_and_space(config)
     found = found_in(read_given(config).effects, str(config.effects))
     runs = read_runs(config, mj_model, checked_horizon(config.horizon))
     return problem_of(
@@ -60,7 +60,7 @@ def read_runs(config: Any, mj_model: Any, horizon: float) -> "MeasuredRuns":
     return measured_runs(mj_model, log, held, horizon)
 
 
-def _model_and_space(config: Any) -> tuple[str, Any, Any]:
+def model_and_space(config: Any) -> tuple[str, Any, Any]:
     from easi_jax.errors import UserError
     from easi_jax.io.models.parameter_file import read_parameter_file
     from easi_jax.model.parameters import ParameterSpace

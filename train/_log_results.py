@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from train._results import (
     distribution_json,
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from easi_jax.io.report.html import Report
     from easi_jax.io.runs.folder import RunFolder
     from easi_jax.model.parameters import ParameterSpace
+    from easi_jax.model.results import HeldOutErrors, SeedResult
 
 
 def sound(
@@ -62,14 +63,43 @@ def write(
 
     from easi_jax.estimation.held_out import held_out_errors
     from easi_jax.estimation.relative import seed_results
-    from easi_jax.io.report.logs_report import logs_report
-    from easi_jax.io.runs.versions import versions
 
     results = seed_results(problem.sensing, space, estimates)
     means = [found.distribution.mean for found in estimates]
     errors = held_out_errors(problem, space, means, ready)
-    best = errors.best
     seen = np.flatnonzero(np.isfinite(problem.noise))
+    noise = {problem.simulator.state_names[i]: problem.noise[i].item() for i in seen}
+    given = folder, problem.name, space, generations
+    more = problem.notes, noise, "--data ..."
+    return write_found(*given, results, seeds, errors, diverged, *more)
+
+
+def write_found(
+    folder: "RunFolder",
+    name: str,
+    space: "ParameterSpace",
+    generations: int,
+    results: Sequence["SeedResult"],
+    seeds: Sequence[int],
+    errors: "HeldOutErrors",
+    diverged: Mapping[int, str],
+    notes: Sequence[str],
+    noise: Mapping[str, float],
+    options: str,
+    **more: Any,
+) -> "Report":
+    """Writes what each of ``seeds`` found, as `write`.
+
+    Args:
+        name: of the model.
+        noise: standard deviation of each number that was measured.
+        options: of the command, for the report.
+        more: further entries of distribution.json.
+    """
+    from easi_jax.io.report.logs_report import logs_report
+    from easi_jax.io.runs.versions import versions
+
+    best = errors.best
     folder.write_json(
         "distribution.json",
         distribution_json(
@@ -80,8 +110,7 @@ def write(
             held_out={
                 "what": errors.what,
                 "horizon": errors.horizon,
-                "measure": "RMS over all steps of all windows, open loop from the "
-                "measured position and fitted velocity, windows every half horizon",
+                "measure": errors.measure,
                 "channels": errors.channels,
                 "units": errors.units,
                 "before": errors.before,
@@ -89,22 +118,23 @@ def write(
                 "noise_floor": errors.floor[best],
             },
             diverged={str(seed): why for seed, why in diverged.items()},
+            **more,
         ),
     )
     report = logs_report(
-        problem.name,
+        name,
         space,
         seeds,
         results,
         errors,
         partial(history_figure, folder, space, seeds[best], None, generations),
         lost_simulations(folder),
-        problem.noise[seen].tolist(),
-        [problem.simulator.state_names[i] for i in seen],
-        command="python -m train.easi --data ...",
+        list(noise.values()),
+        list(noise),
+        command=f"python -m train.easi {options}",
         notes=[
             *(f"seed {s} has no result: {why}" for s, why in diverged.items()),
-            *problem.notes,
+            *notes,
         ],
         config=folder.config,
         versions=versions(),

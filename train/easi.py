@@ -19,16 +19,21 @@ def run(config: Config) -> None:
         raise UserError(f"--restarts is {config.restarts}: give 0 or more")
     if config.data and config.warm_start:
         raise UserError("--warm-start goes without --data: logs have no training")
-    if config.data and config.env:
+    if config.data and config.env and not config.policy:
         raise UserError("--env goes without --data: give --model and --parameters")
     if config.data:
-        from train import _from_logs
+        from train import _from_logs, _from_policy
 
         if config.target_effects:
             raise UserError("--target-effects goes without --data: logs have their own")
-        _from_logs.run(config)
+        for option in ("policy_seed", "observed", "sampled"):
+            if getattr(config, option) and not config.policy:
+                flag = "--" + option.replace("_", "-")
+                raise UserError(f"{flag} goes with --policy: give the policy, too")
+        (_from_policy if config.policy else _from_logs).run(config)
         return
-    for option in ("model", "parameters", "mapping", "held_out", "robot"):
+    only = ("model", "parameters", "mapping", "held_out", "robot", "policy", "observed")
+    for option in only:
         if getattr(config, option):
             flag = "--" + option.replace("_", "-")
             raise UserError(f"{flag} goes with --data LOG: give the measured logs too")

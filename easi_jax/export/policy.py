@@ -4,9 +4,11 @@ Both take observations ``(batch, obs_size)`` and return ``action`` in [-1, 1], a
 where the environment says how, ``ctrl``, what the actuators are sent.
 """
 
+import dataclasses
+import importlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -19,6 +21,7 @@ from easi_jax.rl.networks import PolicyParams, act
 from easi_jax.simulation.action_map import ActionMap
 
 _OPSET = 17
+_PRODUCER = "easi-jax"
 
 
 @dataclass(frozen=True)
@@ -61,13 +64,8 @@ def to_onnx(
     Raises:
         UserError: the package ``onnx`` is missing.
     """
-    try:
-        import onnx
-        from onnx import helper, numpy_helper
-    except ImportError:
-        raise UserError(
-            "ONNX needs the package onnx: pip install easi-jax[export]"
-        ) from None
+    onnx, helper = _onnx("helper")
+    numpy_helper = _onnx("numpy_helper")[1]
     constants, nodes = [], []
 
     def constant(name: str, value: Any) -> str:
@@ -107,13 +105,64 @@ def to_onnx(
         constants,
     )
     opset = [helper.make_opsetid("", _OPSET)]
-    model = helper.make_model(graph, opset_imports=opset, producer_name="easi-jax")
+    model = helper.make_model(graph, opset_imports=opset, producer_name=_PRODUCER)
     model.ir_version = 8  # of that opset; older runtimes read it
     helper.set_model_props(
-        model, {k: json.dumps(v) for k, v in asdict(interface).items()}
+        model, {k: json.dumps(v) for k, v in dataclasses.asdict(interface).items()}
     )
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString()
+
+
+def from_onnx(content: bytes, name: str) -> tuple[PolicyParams, Interface]:
+    """The policy that `to_onnx` wrote, whose mode alone it holds, and its interface.
+
+    Args:
+        content: of the file ``name``.
+
+    Raises:
+        UserError: not one of ours; the package ``onnx`` is missing.
+    """
+    onnx, numpy_helper = _onnx("numpy_helper")
+    other = UserError(f"{name} is not a policy that train.export wrote as ONNX")
+    try:
+        model = onnx.load_model_from_string(content)
+    except Exception as error:  # what protobuf raises has no common class
+        raise other from error
+    known = {t.name: numpy_helper.to_array(t) for t in model.graph.initializer}
+    told = {p.key: p.value for p in model.metadata_props}
+    fields = {f.name for f in dataclasses.fields(Interface)}
+    layers = sum(key.startswith("kernel") for key in known)
+    parts = {f"{what}{i}" for what in ("kernel", "bias") for i in range(layers)}
+    whole = layers and {"mean", "std", *parts} <= known.keys() and fields <= told.keys()
+    if model.producer_name != _PRODUCER or not whole:
+        raise other
+    network = {}
+    for i in range(layers):
+        layer = {what: known[f"{what}{i}"] for what in ("kernel", "bias")}
+        if i == layers - 1:  # the scales of actions, which the mode has no use for
+            layer = {k: np.concatenate([x, 0 * x], -1) for k, x in layer.items()}
+        network[f"hidden_{i}"] = jax.tree.map(jnp.asarray, layer)
+    mean, std = jnp.asarray(known["mean"]), jnp.asarray(known["std"])
+    values = {k: json.loads(told[k]) for k in fields}
+    names = (tuple(values[k]) for k in ("observation", "action", "ctrl"))
+    interface = Interface(str(values["robot"]), float(values["dt"]), *names)
+    return PolicyParams(mean, std, {"params": network}), interface
+
+
+def _onnx(part: str) -> tuple[Any, Any]:
+    """The package ``onnx`` and one of its modules.
+
+    Raises:
+        UserError: it is missing.
+    """
+    try:
+        import onnx
+    except ImportError:
+        raise UserError(
+            "ONNX needs the package onnx: pip install easi-jax[export]"
+        ) from None
+    return onnx, importlib.import_module(f"onnx.{part}")
 
 
 def _tensor(helper: Any, onnx: Any, name: str, size: int) -> Any:
@@ -177,7 +226,7 @@ def policy_files(
             known = ", ".join(FORMS)
             raise UserError(f'no form "{form}" (known: {known}){nearest(form, FORMS)}')
     files: dict[str, str | bytes] = {
-        "policy.json": to_json({**asdict(interface), **told})
+        "policy.json": to_json({**dataclasses.asdict(interface), **told})
     }
     if "onnx" in forms:
         files["policy.onnx"] = to_onnx(policy, interface, action_map)

@@ -39,6 +39,19 @@ def regular_file(path: Path) -> None:
         raise UserError(f"{path} is a pipe or a device, not a file")
 
 
+def read_bytes(path: Path) -> bytes:
+    """What a file holds.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    try:
+        regular_file(path)
+        return path.read_bytes()
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {os_reason(error)}") from error
+
+
 def atomic_write(path: Path, data: str | bytes) -> None:
     """Writes ``path`` so that it holds the old content or the new, never a part.
 

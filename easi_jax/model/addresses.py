@@ -27,6 +27,9 @@ from easi_jax.model.quantities import Entry, Inert, Quantity, direct_solref, val
 
 TABLE: Mapping[str, Mapping[str, Quantity]] = {**MODEL_TABLE, "effect": EFFECT_TABLE}
 
+# Of what sensors read, not of a model: a search has such numbers beside a model's.
+READING = "reading"
+
 _OBJECTS = {
     "joint": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
     "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nu"),
@@ -87,6 +90,9 @@ def split(address: str) -> tuple[str, str, str]:
         UserError: not of the form ``kind.NAME.quantity``, unknown kind or quantity.
     """
     kind, _, rest = address.partition(".")
+    if kind == READING:
+        name, _, quantity = rest.rpartition(".")
+        return kind, name, quantity
     if kind not in TABLE:
         raise UserError(
             f'address "{address}": unknown kind "{kind}" (known: '
@@ -125,6 +131,11 @@ def places(m: mujoco.MjModel, address: str) -> tuple[tuple[str, str, int], ...]:
             with the reason.
     """
     kind, name, quantity = split(address)
+    if kind == READING:
+        raise UserError(
+            f'address "{address}": it is in what sensors read, not in the model '
+            f"(known: {', '.join(TABLE)})"
+        )
     row = TABLE[kind][quantity]
     at = EFFECT_TABLE[quantity].on if kind == "effect" else kind
     if at in ("option", "model"):

@@ -86,6 +86,11 @@ def is_scalar(m: Any, j: int) -> bool:
     return _kind(m, j) in (_Joint.mjJNT_HINGE, _Joint.mjJNT_SLIDE)
 
 
+def is_free(m: Any, j: int) -> bool:
+    """Whether joint ``j`` is a free joint."""
+    return _kind(m, j) == _Joint.mjJNT_FREE
+
+
 def is_hinge(m: Any, j: int) -> bool:
     """Whether joint ``j`` is a hinge."""
     return _kind(m, j) == _Joint.mjJNT_HINGE

@@ -408,6 +408,7 @@ class HeldOutErrors:
         floor: of each seed's model, were it perfect.
         fit: of each seed, the error on its own data, which chooses the seed shown;
             empty of a single one.
+        measure: how they are measured, in words.
     """
 
     what: str
@@ -418,6 +419,10 @@ class HeldOutErrors:
     after: list[list[float]]
     floor: list[list[float]]
     fit: list[float]
+    measure: str = (
+        "RMS over all steps of all windows, open loop from the measured position and "
+        "fitted velocity, windows every half horizon"
+    )
 
     @property
     def best(self) -> int:

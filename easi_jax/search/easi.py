@@ -19,6 +19,7 @@ from easi_jax.devices.mesh import make_mesh, sharded_map
 from easi_jax.errors import UserError
 from easi_jax.model.distribution import gaussian
 from easi_jax.model.joint_space import widths
+from easi_jax.model.parameters import Parameter, ParameterSpace
 from easi_jax.search import discriminator as critic
 from easi_jax.search.config import SearchConfig
 from easi_jax.search.evolution import make_strategy
@@ -110,6 +111,7 @@ class Search:
         trainer: ``step(state, distribution) -> (state, info)`` of policy training,
             for ``policy_updates_per_generation``.
         mesh: devices to spread the population over (default: all).
+        more: numbers that are searched besides the simulator's, none of its model.
     """
 
     def __init__(
@@ -120,6 +122,7 @@ class Search:
         act: Callable[..., jax.Array] | None = None,
         trainer: Callable[..., Any] | None = None,
         mesh: Mesh | None = None,
+        more: tuple[Parameter, ...] = (),
     ) -> None:
         if not simulator.space.size:
             raise UserError("no parameters to search for: name at least one")
@@ -130,7 +133,8 @@ class Search:
         self.simulator, self.config, self.env, self.act = simulator, config, env, act
         self.trainer = trainer if config.policy_updates_per_generation else None
         self.mesh = mesh or make_mesh()
-        self.space = simulator.space.with_scale(config.log_scale)
+        every = ParameterSpace((*simulator.space.parameters, *more))
+        self.space = every.with_scale(config.log_scale)
         self.strategy = make_strategy(
             config.strategy,
             config.population,
@@ -157,16 +161,9 @@ class Search:
         k_es, k_critic, k_run = jax.random.split(key, 3)
         mean, std = jnp.full(n, 0.5), jnp.full(n, 12.0**-0.5)
         cov = jnp.diag(std**2)
-        seg = data.segments
-
-        def inputs(s: Segments) -> tuple[jax.Array, jax.Array]:
-            outcome = self._outcome(s, (s.next_qpos, s.next_qvel))
-            return open_loop.features(self.simulator, s), outcome
-
-        width = sum(x.shape[1] for x in jax.eval_shape(inputs, seg))
         return SearchState(
             strategy=self.strategy.init(k_es, mean, std),
-            critic=critic.init(self.critic_config, k_critic, width),
+            critic=critic.init(self.critic_config, k_critic, self._width(data)),
             mean=mean,
             cov=cov,
             result_mean=mean,
@@ -175,6 +172,15 @@ class Search:
             key=k_run,
             training=training if self.trainer else (),
         )
+
+    def _width(self, data: SearchData) -> int:
+        """How many numbers the discriminator sees."""
+
+        def inputs(s: Segments) -> tuple[jax.Array, jax.Array]:
+            outcome = self._outcome(s, (s.next_qpos, s.next_qvel))
+            return open_loop.features(self.simulator, s), outcome
+
+        return sum(x.shape[1] for x in jax.eval_shape(inputs, data.segments))
 
     def run(
         self, state: SearchState, data: SearchData, generations: int
@@ -331,7 +337,7 @@ class Search:
         count = data.segments.count
         seg = data.segments
         if c.segments < count:
-            seg = seg.take(_pick(k_pick, seg.weight, c.segments))
+            seg = seg.take(pick(k_pick, seg.weight, c.segments))
         m, n = seg.qpos.shape[0], theta.shape[0]
         # What is simulated gets the noise that what is measured has: in its start
         # (the log's start is off by it) and in its end, the same for everybody.
@@ -409,7 +415,7 @@ class Search:
             trajectories, self.mesh, (theta, keys), data.policy, model
         )
         count = min(c.real_batch, data.segments.count)
-        real = data.segments.take(_pick(k_pick, data.segments.weight, count))
+        real = data.segments.take(pick(k_pick, data.segments.weight, count))
         return real, self._reference(model, real), fake, reference
 
     # -- discriminator inputs ------------------------------------------------
@@ -451,7 +457,7 @@ class Search:
             )
         if c.standardize_inputs:
             known = self._outcome(data.segments, ())
-            mid, std = _moments(known, data.segments.weight)
+            mid, std = moments(known, data.segments.weight)
             return (real - mid) / std, (fake - mid) / std
         return real, fake
 
@@ -473,7 +479,7 @@ class Search:
         if not self.config.standardize_inputs:
             return lambda seg: open_loop.features(self.simulator, seg)
         known = open_loop.features(self.simulator, data.segments)
-        mid, std = _moments(known, data.segments.weight)
+        mid, std = moments(known, data.segments.weight)
         return lambda seg: (open_loop.features(self.simulator, seg) - mid) / std
 
 
@@ -484,7 +490,7 @@ def _pace(config: SearchConfig) -> float:
     return _USUAL_UPDATES / config.discriminator_updates
 
 
-def _pick(key: jax.Array, weight: jax.Array, count: int) -> jax.Array:
+def pick(key: jax.Array, weight: jax.Array, count: int) -> jax.Array:
     """``count`` different rows among those of weight above zero.
 
     Where there are fewer, some come twice: rows are drawn by their Gumbel keys.
@@ -495,7 +501,7 @@ def _pick(key: jax.Array, weight: jax.Array, count: int) -> jax.Array:
     return rows[jnp.arange(count) % good]
 
 
-def _moments(x: jax.Array, weight: jax.Array) -> tuple[jax.Array, jax.Array]:
+def moments(x: jax.Array, weight: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Weighted mean and standard deviation ``(F,)`` of ``(M, F)``; 1 for constants."""
     w = weight / jnp.maximum(weight.sum(), 1.0)
     mid = w @ x

@@ -107,6 +107,24 @@ def steps(model: Any, state: Any, arrived: jax.Array) -> Any:
     return _after(model, state, out, sensed)
 
 
+def steps_sensed(
+    model: Any, state: Any, arrived: jax.Array
+) -> tuple[Any, jax.Array] | None:
+    """`steps`, and what ``model.sense`` reads in the first and the last of them,
+    ``(2, size)``, by one call of MuJoCo; None where it takes more."""
+    if _varies(model):
+        return None
+    changed, qfrc, xfrc = _steady(model)
+    out, _, sensed = native.run(
+        *(changed, state, arrived, qfrc, xfrc),
+        read=_reading(model),
+        pairs=_pairs(model),
+        edge=_edge(model),
+        each=True,
+    )
+    return _after(model, state, out, sensed[0, 1]), sensed[0]
+
+
 def replay(
     model: Any, state: Any, arrived: jax.Array, steps: Any = None
 ) -> tuple[jax.Array, jax.Array, jax.Array] | None:

@@ -29,10 +29,11 @@ def policy_rollout(
 
     Returns:
         Segments with horizon 1, ``(steps, 1, ...)``, weight 1 where the transition
-        counts. Without ``auto_reset`` the trajectory ends at termination and later
-        weights are 0. With it, as in EASI's reference, the
-        state after a termination is that of the next episode, and the transition
-        across is kept.
+        counts, with what sensors read where each step begins, where the simulator
+        reads some (`easi_jax.simulation.reading`). Without ``auto_reset`` the
+        trajectory ends at termination and later weights are 0. With it, as in EASI's
+        reference, the state after a termination is that of the next episode, and the
+        transition across is kept.
     """
     k_reset, k_run = jax.random.split(key)
 
@@ -57,6 +58,7 @@ def policy_rollout(
             weight=alive,
             past=sent if past else (),
             act=state.physics.act if state.physics.act.size else (),
+            sensed=_read(new.physics),
             time=state.physics.time,
             hidden=state.physics.hidden,
         )
@@ -73,6 +75,12 @@ def policy_rollout(
     init = (first, jnp.ones(()), (sent, jnp.zeros((), bool)))
     _, out = jax.lax.scan(step, init, jax.random.split(k_run, steps))
     return out
+
+
+def _read(physics: Any) -> Any:
+    """What sensors read at the beginning of the step that led here, ``(1, N)``."""
+    read = getattr(physics, "read", ())
+    return () if isinstance(read, tuple) else read[None]
 
 
 def collect(

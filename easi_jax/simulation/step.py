@@ -50,6 +50,8 @@ class Physics:
         time: of the recording or episode, where owners' effects may ask for it, ``()``
             [s].
         hidden: what laws remember, ``(S,)``; likewise.
+        read: what the sensors of a log read where the step that led here began
+            (`easi_jax.simulation.reading`), ``(N,)``; () where none are asked for.
     """
 
     qpos: jax.Array
@@ -62,6 +64,7 @@ class Physics:
     rest: Any = ()
     time: Any = ()
     hidden: Any = ()
+    read: Any = ()
 
     if TYPE_CHECKING:  # made by flax
 
@@ -278,6 +281,10 @@ def arrived_sensed(
 ) -> tuple[Physics, jax.Array]:
     """`arrived_step`, and what is sensed in its first and its last physics step,
     ``(2, sense_size)``."""
+    if isinstance(model.mjx, NativeModel):
+        at_once = native_step.steps_sensed(model, state, arrived)
+        if at_once is not None:
+            return at_once
 
     def step(s: Physics, u: jax.Array) -> tuple[Physics, jax.Array]:
         s = arrived_step(model, s, u[None])

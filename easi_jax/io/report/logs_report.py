@@ -100,16 +100,15 @@ def error_table(errors: HeldOutErrors) -> Table:
     columns = (errors.before, errors.after[errors.best], errors.floor[errors.best])
     return Table(
         f"{TITLE} over {number(errors.horizon, 3)} s",
-        ("joint", "unit", "model as given", "identified", "noise floor"),
+        ("channel", "unit", "model as given", "identified", "noise floor"),
         [
             (name, shown_unit(unit), *(number(x, 3) for x in values))
             for name, unit, *values in zip(
                 errors.channels, errors.units, *columns, strict=True
             )
         ],
-        f"On {errors.what}, which the fit has not seen. RMS over all steps of all "
-        "windows, open loop from the measured state. The noise floor is what a perfect "
-        "model would have.",
+        f"On {errors.what}, which the fit has not seen. {errors.measure}. The noise "
+        "floor is what a perfect model would have.",
     )
 
 

@@ -1,0 +1,326 @@
+"""Parameters by a linear emulator of what sensors read next.
+
+The end of a search on logs that pair with no simulation
+(`easi_jax.search.unpaired`). Individuals near the search's mean are simulated, and what
+they read next is regressed on what they read before, alone and times how far their
+parameters are from the middle: a prediction of the next reading that is linear in the
+parameters. Least squares on the measured pieces then gives the parameters, their
+information, and what is left. This is indirect inference (Gourieroux, Monfort and
+Renault 1993) with a linear auxiliary model, both sides with the same noise, so that
+what noise does to a regression is the same in both.
+
+Slopes are estimated, too, and their noise would count as information. Two halves of the
+individuals give two estimates of them, and only what both agree on counts, as in
+two-sample instrumental variables.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from easi_jax.search.unpaired import (
+    Pieces,
+    Simulations,
+    linear_prediction,
+)
+
+ROUNDS = 5  # of simulation and fit: two approach, the others are averaged
+_AVERAGED = 3
+_INDIVIDUALS = 512  # of a round
+_NARROWEST, _NARROWER = 0.1, 0.7  # spread of a round, unit coordinates; from the last
+_WIDER = 3.0  # standard deviations of what is known, that a round spreads
+_FARTHEST = 1.5  # spreads of a round, that its fit may move: linear no farther
+_RIDGES = (1e-3, 1e-2, 1e-1, 1.0)  # of which one half chooses what predicts the other
+_RIDGE = 1e-5  # of the regression without parameters, which has rows in plenty
+_OUTLIER = 4.0  # standard deviations
+_BLOCKS = 20  # of the log, whose scatter says how sure the fit is
+_BEYOND = 0.5  # of the initial range, that a round may lie outside of it
+PRIOR = 12.0  # information of a uniform initial range, unit coordinates
+
+
+@dataclass(frozen=True)
+class Matched:
+    """Parameters that a fit found, unit coordinates of the search's space.
+
+    Attributes:
+        mean, cov: with the initial range as prior, ``(n,)``, ``(n, n)``.
+        hessian: information of the log, ``(n, n)``.
+        excess: mean square of what the emulator leaves of the log, in units of what it
+            leaves of simulations; about 1 where the robot is like the model.
+        lost: individuals that did not stay finite and on their feet.
+    """
+
+    mean: np.ndarray
+    cov: np.ndarray
+    hessian: np.ndarray
+    excess: float
+    lost: int
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """What one emulator says of pieces; as `Matched`."""
+
+    mean: np.ndarray
+    cov: np.ndarray
+    hessian: np.ndarray
+    excess: float
+
+
+@dataclass(frozen=True)
+class _Emulator:
+    """A prediction of the next reading that is linear in the parameters.
+
+    Attributes:
+        middle: of the parameters, ``(n,)``.
+        shown, left: of `_regressed`.
+        slopes: two estimates of how what is left changes with them, ``(n, F, C)``.
+    """
+
+    middle: np.ndarray
+    shown: Callable[[np.ndarray], np.ndarray]
+    left: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    slopes: list[np.ndarray]
+
+    @staticmethod
+    def of(unit: np.ndarray, read: Pieces, sound: np.ndarray) -> "_Emulator | None":
+        """Of individuals ``unit (N, n)``, what they ``read (N, K, ...)`` and which are
+        ``sound (N,)``; None where too few are."""
+        weight = read.weight * sound[:, None]
+        of_each = weight.sum(1)
+        if (of_each > 0).sum() < 2 * unit.shape[1] + 2:
+            return None
+        shown, left = _regressed(read.before, read.change, weight)
+        middle = of_each @ unit / of_each.sum()
+        given = shown(read.before), left(read.before, read.change), weight
+        return _Emulator(middle, shown, left, _slopes(unit - middle, *given))
+
+    def fit(self, pieces: Pieces) -> _Fit:
+        """The parameters of ``pieces (K, ...)`` by least squares."""
+        x, r = self.shown(pieces.before), self.left(pieces.before, pieces.change)
+        counts, n = pieces.weight, len(self.middle)
+        one, other = (
+            np.einsum("kf,afc->kac", x, v, optimize=True) for v in self.slopes
+        )
+        information = np.einsum("kac,kbc,k->ab", one, other, counts, optimize=True)
+        values, vectors = np.linalg.eigh(0.5 * (information + information.T))
+        information = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        score = np.einsum("kac,kc,k->ka", 0.5 * (one + other), r, counts, optimize=True)
+        blocks = np.array([b.sum(0) for b in np.array_split(score, _BLOCKS)])
+        scatter = np.cov(blocks, rowvar=False).reshape(n, n) * _BLOCKS
+        prior = PRIOR * np.eye(n)
+        inverse = np.linalg.inv(information + prior)
+        step = inverse @ (score.sum(0) + PRIOR * (0.5 - self.middle))
+        cov = inverse @ (scatter + prior) @ inverse
+        excess = float((counts @ r**2).sum() / (counts.sum() * r.shape[1]))
+        return _Fit(self.middle + step, cov, information, excess)
+
+
+def matched(
+    simulated: Simulations,
+    pieces: Pieces,
+    mean: np.ndarray,
+    key: jax.Array,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Matched:
+    """The fit, from where a search has ended.
+
+    The last rounds are averaged, and corrected by what they say of simulations of the
+    very parameters that they found: so the estimate on the log is that on simulations,
+    which is what indirect inference asks for.
+
+    Args:
+        simulated: individuals of the search.
+        pieces: of the log.
+        mean: where the search has ended, unit coordinates, ``(n,)``.
+        key: of the individuals and their simulations.
+        tell: takes a line on how far it is.
+    """
+    real = jax.tree.map(lambda x: np.asarray(x, float), pieces)
+    low, high = (np.asarray(x, float) for x in simulated.search.space.unit_bounds)
+    low, high = np.maximum(low, -_BEYOND), np.minimum(high, 1 + _BEYOND)
+    center = np.clip(np.asarray(mean, float), 0, 1)
+    n, spread = len(center), np.full(len(center), PRIOR**-0.5)
+    found, lost = list[tuple[_Emulator, _Fit]](), 0
+    for k in range(ROUNDS):
+        k_draw, k_roll = jax.random.split(jax.random.fold_in(key, k))
+        z = np.asarray(jax.random.normal(k_draw, (_INDIVIDUALS, n)), float)
+        unit = np.clip(center + spread * z, low, high)
+        read, sound = simulated(unit, k_roll)
+        lost += int((~sound).sum())
+        emulator = _Emulator.of(unit, read, sound)
+        if emulator is None:
+            break
+        fit = emulator.fit(real)
+        found.append((emulator, fit))
+        tell(f"linear emulator: round {k + 1} of {ROUNDS}")
+        moved = np.clip(fit.mean - center, -_FARTHEST * spread, _FARTHEST * spread)
+        center = np.clip(center + moved, low, high)
+        known = _WIDER * np.sqrt(np.diag(fit.cov))
+        spread = np.clip(known, _NARROWEST, np.maximum(_NARROWER * spread, _NARROWEST))
+    if not found:
+        nan = np.full((n, n), np.nan)
+        return Matched(nan[0], nan, np.zeros((n, n)), np.nan, lost)
+    last = found[-_AVERAGED:]
+    unit = np.clip(np.mean([fit.mean for _, fit in last], axis=0), low, high)
+    again = _told_again(simulated, [e for e, _ in last], unit, len(real.weight), key)
+    return _corrected([fit for _, fit in last], again, unit, (low, high), lost)
+
+
+def _told_again(
+    simulated: Simulations,
+    emulators: Sequence[_Emulator],
+    unit: np.ndarray,
+    size: int,
+    key: jax.Array,
+) -> np.ndarray:
+    """What each emulator says of logs of ``size`` pieces that simulations of ``unit
+    (n,)`` make, ``(R, L, n)``; L is 0 where none of them makes one."""
+    k_own = jax.random.fold_in(key, ROUNDS)
+    read, sound = simulated(np.tile(unit, (simulated.size, 1)), k_own)
+    good = [x[sound] for x in (read.before, read.change, read.weight)]
+    flat = [x.reshape(-1, *x.shape[2:]) for x in good]
+    count = len(flat[-1]) // size or int(sound.any())
+    logs = [Pieces(*(x[i * size : (i + 1) * size] for x in flat)) for i in range(count)]
+    said = [[e.fit(log).mean for log in logs] for e in emulators]
+    return np.array(said).reshape(len(emulators), count, len(unit))
+
+
+def _corrected(
+    fits: Sequence[_Fit],
+    again: np.ndarray,
+    unit: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray],
+    lost: int,
+) -> Matched:
+    """Rounds together, less what they err by on simulations of ``unit``; their scatter
+    after that is the emulators' own error."""
+    means, cov = (
+        np.array([f.mean for f in fits]),
+        np.mean([f.cov for f in fits], axis=0),
+    )
+    if again.size:
+        means = means - (again.mean(1) - unit)
+        of_logs = again.mean(0)
+        if len(of_logs) > 1:
+            cov = cov + np.cov(of_logs, rowvar=False).reshape(cov.shape) / len(of_logs)
+    if len(fits) > 1:
+        cov = cov + np.diag(means.var(0, ddof=1)) / len(fits)
+    hessian = np.mean([f.hessian for f in fits], axis=0)
+    excess = float(np.mean([f.excess for f in fits]))
+    return Matched(np.clip(means.mean(0), *bounds), cov, hessian, excess, lost)
+
+
+def _regressed(
+    before: np.ndarray, change: np.ndarray, weight: np.ndarray
+) -> tuple[Callable[..., np.ndarray], Callable[..., np.ndarray]]:
+    """How ``before (..., F)`` is shown to a regression, standardized beside a one, and
+    what its prediction leaves of ``change (..., C)``, whitened."""
+    x, y, w = (a.reshape(-1, *a.shape[2:]) for a in (before, change, weight))
+    total = w.sum()
+    mid = w @ x / total
+    std = np.sqrt(w @ (x - mid) ** 2 / total)
+    std = np.where(std > 1e-9, std, 1.0)
+
+    def shown(b: np.ndarray) -> np.ndarray:
+        z = np.clip((b - mid) / std, -_OUTLIER, _OUTLIER)
+        return np.concatenate([z, np.ones((*z.shape[:-1], 1))], -1)
+
+    z = shown(x)
+    weighed = (z * w[:, None]).T
+    ridge = _RIDGE * total * np.eye(z.shape[1])
+    slope = np.linalg.solve(weighed @ z + ridge, weighed @ y)
+    r = y - z @ slope
+    cov = (r * w[:, None]).T @ r / total
+    # What never changes, such as a foot in the air, is predicted without an error.
+    size = np.sqrt(np.maximum(np.diag(cov), 1e-12 * max(cov.max(), 1e-30)))
+    whiten = np.linalg.inv(
+        np.linalg.cholesky(cov / np.outer(size, size) + 1e-6 * np.eye(len(cov)))
+    )
+
+    def left(b: np.ndarray, c: np.ndarray) -> np.ndarray:
+        out = ((c - shown(b) @ slope) / size) @ whiten.T
+        return np.clip(out, -_OUTLIER, _OUTLIER)
+
+    return shown, left
+
+
+def _slopes(
+    off: np.ndarray, x: np.ndarray, r: np.ndarray, weight: np.ndarray
+) -> list[np.ndarray]:
+    """How what is left changes with parameters, ``(n, F, C)``, by two halves of the
+    individuals, with the ridge with which they predict each other best."""
+    halves = [np.arange(len(off)) % 2 == h for h in (0, 1)]
+    sums = [_sums(off[h], x[h], r[h], weight[h]) for h in halves]
+    best, found = -np.inf, []
+    for ridge in _RIDGES:
+        slopes = [_solved(*s, ridge) for s in sums]
+        told = sum(
+            _told(off[h], x[h], r[h], weight[h], v)
+            for h, v in zip(halves, slopes[::-1], strict=True)
+        )
+        if told > best:
+            best, found = told, slopes
+    return found
+
+
+def _sums(
+    off: np.ndarray, x: np.ndarray, r: np.ndarray, weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations of a regression on ``off (N, n)`` times ``x (N, K, F)``."""
+    weighed = x * weight[..., None]
+    each = np.einsum("nkf,nkg->nfg", weighed, x, optimize=True)
+    with_r = np.einsum("nkf,nkc->nfc", weighed, r, optimize=True)
+    size = off.shape[1] * x.shape[-1]
+    gram = np.einsum("na,nb,nfg->afbg", off, off, each, optimize=True)
+    right = np.einsum("na,nfc->afc", off, with_r, optimize=True)
+    return gram.reshape(size, size), right
+
+
+def _solved(gram: np.ndarray, right: np.ndarray, ridge: float) -> np.ndarray:
+    size = len(gram)
+    more = ridge * np.trace(gram) / size * np.eye(size)
+    return np.linalg.solve(gram + more, right.reshape(size, -1)).reshape(right.shape)
+
+
+def _told(
+    off: np.ndarray, x: np.ndarray, r: np.ndarray, weight: np.ndarray, v: np.ndarray
+) -> float:
+    """By how much slopes ``v`` lower the squared error of individuals they were not
+    fitted to."""
+    predicted = np.einsum("na,nkf,afc->nkc", off, x, v, optimize=True)
+    return float(((r**2 - (r - predicted) ** 2) * weight[..., None]).sum())
+
+
+def one_row_errors(
+    simulated: Simulations,
+    unit: np.ndarray,
+    held: Pieces,
+    key: jax.Array,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of predictions of the next reading, RMS of each channel ``(C,)``: of a
+    log's pieces ``held``, and of simulations themselves, which is the least; not a
+    number where too few simulations stay on their feet.
+
+    The prediction is that of least squares in simulations of one machine, ``unit (n,)``
+    in unit coordinates.
+    """
+    read, sound = simulated(np.tile(unit, (simulated.size, 1)), key)
+    weight = read.weight * sound[:, None]
+    half = np.arange(simulated.size) % 2 == 0
+    if not (weight[half].any() and weight[~half].any()):
+        nothing = np.full(read.change.shape[-1], np.nan)
+        return nothing, nothing
+    given = (x[half] for x in (read.before, read.change, weight))
+    flat = (jnp.asarray(x.reshape(-1, *x.shape[2:])) for x in given)
+    predicted = linear_prediction(*flat)
+
+    def rms(p: Pieces, w: np.ndarray) -> np.ndarray:
+        off = np.asarray(p.change - np.asarray(predicted(jnp.asarray(p.before)))) ** 2
+        return np.sqrt((off * w[..., None]).reshape(-1, off.shape[-1]).sum(0) / w.sum())
+
+    own = Pieces(read.before[~half], read.change[~half], read.weight[~half])
+    return rms(held, np.asarray(held.weight)), rms(own, weight[~half])
