@@ -29,6 +29,10 @@ def run(config: Any) -> None:
     from train._from_logs import searched, show
 
     search, data = problem.search(settings), problem.data()
+    simulated = Simulations(search, data)
+    keys = [jax.random.fold_in(k, 1) for k in seed_keys(list(seeds))]
+    if problem.policy is not None:
+        check_commands(problem, search, simulated, keys[0])
     with RunFolder.open(
         config.out,
         read_given(config).recorded(config),
@@ -36,10 +40,6 @@ def run(config: Any) -> None:
         resume=config.resume,
         overwrite=config.overwrite,
     ) as folder:
-        simulated = Simulations(search, data)
-        keys = [jax.random.fold_in(k, 1) for k in seed_keys(list(seeds))]
-        if problem.policy is not None:
-            check_commands(problem, search, simulated, keys[0])
         states = searched(folder, config, search, data, problem.notes, seeds)
         report = _finished(folder, config, problem, simulated, states, seeds, keys)
     show(problem.name, report, problem.notes, config.out)

@@ -105,10 +105,19 @@ class _Emulator:
         one, other = (
             np.einsum("kf,afc->kac", x, v, optimize=True) for v in self.slopes
         )
-        information = np.einsum("kac,kbc,k->ab", one, other, counts, optimize=True)
-        values, vectors = np.linalg.eigh(0.5 * (information + information.T))
-        information = (vectors * np.maximum(values, 0.0)) @ vectors.T
-        score = np.einsum("kac,kc,k->ka", 0.5 * (one + other), r, counts, optimize=True)
+        both = 0.5 * (one + other)
+
+        def products(v: np.ndarray, w: np.ndarray) -> np.ndarray:
+            return np.einsum("kac,kbc,k->ab", v, w, counts, optimize=True)
+
+        agreed, whole = products(one, other), products(both, both)
+        values, vectors = np.linalg.eigh(0.5 * (agreed + agreed.T))
+        agreed = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        # A score that slopes make which are noise varies as much as one that slopes
+        # make which are not, and says nothing: it counts by the share that is agreed.
+        share = agreed @ np.linalg.pinv(whole, rcond=1e-9, hermitian=True)
+        score = np.einsum("kac,kc,k->ka", both, r, counts, optimize=True) @ share.T
+        information = 0.5 * (share @ agreed + agreed @ share.T)
         blocks = np.array([b.sum(0) for b in np.array_split(score, _BLOCKS)])
         scatter = np.cov(blocks, rowvar=False).reshape(n, n) * _BLOCKS
         prior = PRIOR * np.eye(n)

@@ -21,6 +21,7 @@ from easi_jax.io.runs import checkpoints
 from easi_jax.pipeline.stages import Pipeline, PipelineConfig, seed_keys
 from easi_jax.rl.networks import act
 from easi_jax.search.easi import SearchState
+from easi_jax.simulation.rollout import policy_rollout
 from tests.commands import command, refused
 from tests.tiny_robot.env import XML, Tiny
 from train import easi, evaluate, export, pipeline, udr
@@ -323,3 +324,89 @@ def test_export_says_what_is_wrong(
     out = ("--env", ENV, "--out", tmp_path / "out")
     assert said in refused(capsys, export, chain / words[0], *words[1:], *out)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture(scope="module")
+def log(chain: Path) -> Path:
+    """What the policy's robot measured where its gear is 1.2, not 2."""
+    known = load_policies(chain / "udr", env_file=ENV)
+    env = known["env"]
+    policy = jax.tree.map(lambda x: x[0], known["policies"])
+    rollout = jax.jit(
+        lambda theta, key: policy_rollout(
+            *(env, env.model(theta), lambda obs, k: act(policy, obs, k), key, 600)
+        )
+    )
+    seg = rollout(jnp.array([1.2, 0.1]), jax.random.key(3))
+    rng = np.random.default_rng(0)
+    columns = {
+        "time": env.dt * np.arange(600),
+        "qpos.hinge": np.asarray(seg.qpos[:, 0]) + 1e-4 * rng.standard_normal(600),
+        "qvel.hinge": np.asarray(seg.qvel[:, 0]) + 1e-3 * rng.standard_normal(600),
+        "ctrl.motor": np.asarray(seg.ctrl[:, 0, 0]),
+    }
+    np.savez(chain / "log.npz", **columns)
+    return chain / "log.npz"
+
+
+FROM_POLICY = (
+    *("--population", 16, "--generations", 2, "--set", "rollout_steps=120"),
+    *("real_batch=64", "discriminator_updates=2", "--sampled", "--env", ENV),
+)
+
+
+def test_a_run_folders_policy_identifies_its_robot(chain: Path, log: Path) -> None:
+    out = chain / "from_policy"
+    given = ("--data", log, "--policy", chain / "udr", "--out", out)
+    command(easi, *given, *FROM_POLICY)
+    told = json.loads((out / "distribution.json").read_text())
+    gear = told["parameters"][0]["name"], told["seeds"]["0"]["mean"][0]
+    std = told["seeds"]["0"]["std"][0]
+    assert gear[0] == "gear" and abs(gear[1] - 1.2) < max(3 * std, 0.1)
+    assert std < 0.2
+
+
+def test_a_policy_that_did_not_send_the_logs_commands_is_told(
+    chain: Path, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = dict(np.load(log))
+    content["ctrl.motor"] = content["ctrl.motor"] + 7.0
+    np.savez(tmp_path / "log.npz", **content)
+    given = ("--policy", chain / "udr", "--out", tmp_path / "out", *FROM_POLICY)
+    said = refused(capsys, easi, "--data", tmp_path / "log.npz", *given)
+    assert "the policy does not fit the log's commands: motor was sent" in said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--policy-seed", 4), "has no policy of seed 4: it holds seeds [0]"),
+        (("--observed", "hing=1"), 'did you mean "hinge"'),
+        (("--observed", "hinge"), "write NAME=NUMBER"),
+        (("--robot", "go2"), "a run knows its robot"),
+    ],
+)
+def test_what_does_not_go_with_a_policy_is_one_line(
+    chain: Path,
+    log: Path,
+    tmp_path: Path,
+    options: tuple[object, ...],
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "out"
+    given = ("--data", log, "--policy", chain / "udr", "--out", out, *FROM_POLICY)
+    assert said in refused(capsys, easi, *given, *options)
+    assert not out.exists()
+
+
+def test_rows_that_no_controller_made_are_told(
+    chain: Path, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = dict(np.load(log))
+    content["time"] = 0.7 * content["time"]
+    np.savez(tmp_path / "log.npz", **content)
+    given = ("--policy", chain / "udr", "--out", tmp_path / "out", *FROM_POLICY)
+    said = refused(capsys, easi, "--data", tmp_path / "log.npz", *given)
+    assert "a row every 0.014 s, and the controller acts every 0.02 s" in said

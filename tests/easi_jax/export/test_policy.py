@@ -18,7 +18,9 @@ from benchmarks.export import (
     observations,
     onnx_session,
 )
-from easi_jax.export.policy import interface_of, to_onnx, to_stablehlo
+from easi_jax.errors import UserError
+from easi_jax.export.policy import from_onnx, interface_of, to_onnx, to_stablehlo
+from easi_jax.rl.networks import act
 from easi_jax.simulation.env import start
 from envs import REGISTRY, load, make
 
@@ -40,6 +42,29 @@ def test_onnx_is_the_policy(name: str) -> None:
     for key, value in want.items():
         np.testing.assert_allclose(got[key], value, atol=1e-5, err_msg=key)
     assert np.ptp(want["action"], axis=0).min() > 0.1, "the policy does something"
+
+
+def test_onnx_is_read_back() -> None:
+    """The policy's mode, and its interface."""
+    env = make("go2")
+    policy, told = drawn_policy(env), interface_of(env)
+    read, said = from_onnx(to_onnx(policy, told, env.action_map), "policy.onnx")
+    assert said == told
+    obs = observations(env, policy)[:50]
+    want, got = (act(p, obs, deterministic=True) for p in (policy, read))
+    np.testing.assert_allclose(got, want, atol=1e-6)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a policy", "another"])
+def test_what_is_no_policy_of_ours_is_refused(content: bytes | str) -> None:
+    if content == "another":
+        x = onnx.helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1])
+        same = onnx.helper.make_node("Identity", ["x"], ["y"])
+        y = onnx.helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, [1])
+        graph = onnx.helper.make_graph([same], "other", [x], [y])
+        content = onnx.helper.make_model(graph).SerializeToString()
+    with pytest.raises(UserError, match=r"^p.onnx is not a policy that train.export"):
+        from_onnx(content, "p.onnx")  # type: ignore[arg-type]
 
 
 def test_stablehlo_is_the_policy() -> None:
