@@ -138,7 +138,7 @@ def identified(
         return read_json(path)
     begun = time.monotonic()
     searched = env if cell.robot == "cartpole" else walker()
-    by = _by_command if _PRESETS[cell.method] == "default" else _by_controller
+    by = _by_command if _PRESETS[cell.method] == "default" else by_controller
     found = by(cell, place, searched, policy, twin, logs)
     std = np.sqrt(np.diag(found["unit_cov"]))
     searched = with_effects(searched, place)
@@ -231,7 +231,7 @@ def with_effects(env: Any, place: Path) -> Any:
     return env_with(env, parsed_effects(read_yaml(path), str(path)))
 
 
-def _by_controller(
+def by_controller(
     cell: Cell, place: Path, env: Any, policy: Any, twin: Any, logs: list[Any]
 ) -> dict[str, Any]:
     """The reference's recipe: the controller runs in the simulation too."""
