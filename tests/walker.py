@@ -46,6 +46,32 @@ PARAMETERS = """parameters:
 DT = 0.02
 
 
+def in_a_stand(seconds: float = 8.0, kp: float = 26.0, kv: float = 0.8) -> str:
+    """A log of the joints, as text, of the robot with its base held."""
+    machine = _with_gains(
+        mujoco.MjModel.from_xml_string(XML.replace('<freejoint name="root"/>', "")),
+        *(kp, kv),
+    )
+    data, rng = mujoco.MjData(machine), np.random.default_rng(9)
+    names = ("qpos", "qvel", "ctrl")
+    lines = [",".join(["time", *(f"{k}.{leg}" for k in names for leg in _LEGS)])]
+    for k in range(round(seconds / DT)):
+        t = k * DT
+        data.ctrl = 0.3 * np.sin(np.arange(2, 6) * t) + 0.1 * np.sign(np.sin(3 * t))
+        noisy = data.qpos + 1e-4 * rng.standard_normal(4)
+        speed = data.qvel + 1e-2 * rng.standard_normal(4)
+        row = np.concatenate([[t], noisy, speed, data.ctrl])
+        lines.append(",".join(f"{x:.8g}" for x in row))
+        mujoco.mj_step(machine, data, round(DT / machine.opt.timestep))
+    return "\n".join(lines) + "\n"
+
+
+def _with_gains(m: mujoco.MjModel, kp: float, kv: float) -> mujoco.MjModel:
+    m.actuator_gainprm[:, 0], m.actuator_biasprm[:, 1] = kp, -kp
+    m.actuator_biasprm[:, 2] = -kv
+    return m
+
+
 def walk(
     seconds: float = 12.0,
     kp: float = 26.0,
@@ -56,8 +82,7 @@ def walk(
     """The model as given, and a log of one with other gains; its base is hidden
     unless it is ``kept``."""
     model, machine = (mujoco.MjModel.from_xml_string(XML) for _ in range(2))
-    machine.actuator_gainprm[:, 0], machine.actuator_biasprm[:, 1] = kp, -kp
-    machine.actuator_biasprm[:, 2] = -kv
+    machine = _with_gains(machine, kp, kv)
     data, rng = mujoco.MjData(machine), np.random.default_rng(seed)
     rows = []
     phase = np.array([0.0, np.pi, np.pi, 0.0])

@@ -49,6 +49,9 @@ class _Sources:
     """What the policy was asked for while the logs were recorded, NAME=NUMBER for
     entries of its observation: command.forward=1.4 command.sideways=0 command.turn=0
     for go2."""
+    stand: tuple[Path, ...] = ()
+    """With --policy: logs of the same robot's joints in a stand, its base held. What
+    they say of the parameters is known when the walk is fitted."""
     sampled: bool = False
     """The policy drew its actions at random; not given: it acted by its mode."""
 

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from train._command import say
 from train._effects import found_in, read_given
+from train._stand import known_from_stand, stand_problem
 
 if TYPE_CHECKING:
+    from easi_jax.estimation.problem import Problem
     from easi_jax.estimation.unpaired_runs import UnpairedProblem
 
 COMMANDS = "commands"  # for --policy: send what the log was sent
@@ -19,6 +21,7 @@ def run(config: Any) -> None:
     """Reads, searches, fits and reports; ``config`` is that of ``train.easi``."""
     _check_options(config)
     problem, settings = read_problem(config)
+    stand = stand_problem(config, problem.env) if config.stand else None
     seeds = config.seeds or (0,)
     import jax
 
@@ -41,7 +44,8 @@ def run(config: Any) -> None:
         overwrite=config.overwrite,
     ) as folder:
         states = searched(folder, config, search, data, problem.notes, seeds)
-        report = _finished(folder, config, problem, simulated, states, seeds, keys)
+        given = problem, simulated, stand
+        report = _finished(folder, config, *given, states, seeds, keys)
     show(problem.name, report, problem.notes, config.out)
 
 
@@ -59,6 +63,8 @@ def _check_options(config: Any) -> None:
                 f"{flag} goes without --policy: where a robot is simulated under its "
                 "controller, no piece starts at a row of the log"
             )
+    if config.stand and not config.refine:
+        raise UserError("--stand goes without --no-refine: the fit has use for it")
 
 
 # -- what is asked -------------------------------------------------------------------
@@ -146,7 +152,7 @@ def _controlled(config: Any) -> tuple[Any, Any]:
     from easi_jax.io.models.parameter_file import read_parameter_file
 
     path = Path(config.policy)
-    if config.model is not None:
+    if config.model is not None and not config.stand:
         raise UserError(
             "--model goes with --policy commands: a policy brings its robot, or give "
             "it with --robot or --env"
@@ -243,6 +249,7 @@ def _finished(
     config: Any,
     problem: "UnpairedProblem",
     simulated: Any,
+    stand: "Problem | None",
     states: Any,
     seeds: Sequence[int],
     keys: Sequence[Any],
@@ -258,7 +265,14 @@ def _finished(
     found = {}
     for k, seed in enumerate(seeds):
         end = states.result_mean[k], states.result_cov[k]
-        found[seed] = found_of(simulated, pieces, *end, keys[k], config.refine, say)
+        more = {}
+        if stand is not None:
+            n = slice(stand.simulator.space.size)
+            notes = problem.notes if k == 0 else []
+            own = search.config.log_scale, end[0][n], end[1][n, n]
+            more["known"] = known_from_stand(stand, *own, notes)
+        given = simulated, pieces, *end, keys[k], config.refine, say
+        found[seed] = found_of(*given, **more)
     good = {s: f for s, f in found.items() if np.isfinite(f.mean).all()}
     lost = {s: "too few simulations stay on their feet" for s in seeds if s not in good}
     if not good:

@@ -26,7 +26,7 @@ def run(config: Config) -> None:
 
         if config.target_effects:
             raise UserError("--target-effects goes without --data: logs have their own")
-        for option in ("policy_seed", "observed", "sampled"):
+        for option in ("policy_seed", "observed", "sampled", "stand"):
             if getattr(config, option) and not config.policy:
                 flag = "--" + option.replace("_", "-")
                 raise UserError(f"{flag} goes with --policy: give the policy, too")

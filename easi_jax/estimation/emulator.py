@@ -42,11 +42,34 @@ PRIOR = 12.0  # information of a uniform initial range, unit coordinates
 
 
 @dataclass(frozen=True)
+class Known:
+    """What is known of parameters before a log is read, unit coordinates.
+
+    Attributes:
+        mean: ``(n,)``.
+        information: ``(n, n)``.
+    """
+
+    mean: np.ndarray
+    information: np.ndarray
+
+    def beside(self, more: int) -> "Known":
+        """The same, and ``more`` numbers of which the initial range is known."""
+        n = len(self.mean)
+        information = PRIOR * np.eye(n + more)
+        information[:n, :n] = self.information
+        return Known(np.r_[self.mean, np.full(more, 0.5)], information)
+
+
+NOTHING = Known(np.zeros(0), np.zeros((0, 0)))
+
+
+@dataclass(frozen=True)
 class Matched:
     """Parameters that a fit found, unit coordinates of the search's space.
 
     Attributes:
-        mean, cov: with the initial range as prior, ``(n,)``, ``(n, n)``.
+        mean, cov: with what was known before, ``(n,)``, ``(n, n)``.
         hessian: information of the log, ``(n, n)``.
         excess: mean square of what the emulator leaves of the log, in units of what it
             leaves of simulations; about 1 where the robot is like the model.
@@ -78,15 +101,19 @@ class _Emulator:
         middle: of the parameters, ``(n,)``.
         shown, left: of `_regressed`.
         slopes: two estimates of how what is left changes with them, ``(n, F, C)``.
+        known: of the parameters before.
     """
 
     middle: np.ndarray
     shown: Callable[[np.ndarray], np.ndarray]
     left: Callable[[np.ndarray, np.ndarray], np.ndarray]
     slopes: list[np.ndarray]
+    known: Known
 
     @staticmethod
-    def of(unit: np.ndarray, read: Pieces, sound: np.ndarray) -> "_Emulator | None":
+    def of(
+        unit: np.ndarray, read: Pieces, sound: np.ndarray, known: Known
+    ) -> "_Emulator | None":
         """Of individuals ``unit (N, n)``, what they ``read (N, K, ...)`` and which are
         ``sound (N,)``; None where too few are."""
         weight = read.weight * sound[:, None]
@@ -96,7 +123,7 @@ class _Emulator:
         shown, left = _regressed(read.before, read.change, weight)
         middle = of_each @ unit / of_each.sum()
         given = shown(read.before), left(read.before, read.change), weight
-        return _Emulator(middle, shown, left, _slopes(unit - middle, *given))
+        return _Emulator(middle, shown, left, _slopes(unit - middle, *given), known)
 
     def fit(self, pieces: Pieces) -> _Fit:
         """The parameters of ``pieces (K, ...)`` by least squares."""
@@ -120,9 +147,9 @@ class _Emulator:
         information = 0.5 * (share @ agreed + agreed @ share.T)
         blocks = np.array([b.sum(0) for b in np.array_split(score, _BLOCKS)])
         scatter = np.cov(blocks, rowvar=False).reshape(n, n) * _BLOCKS
-        prior = PRIOR * np.eye(n)
+        prior = self.known.information
         inverse = np.linalg.inv(information + prior)
-        step = inverse @ (score.sum(0) + PRIOR * (0.5 - self.middle))
+        step = inverse @ (score.sum(0) + prior @ (self.known.mean - self.middle))
         cov = inverse @ (scatter + prior) @ inverse
         excess = float((counts @ r**2).sum() / (counts.sum() * r.shape[1]))
         return _Fit(self.middle + step, cov, information, excess)
@@ -134,6 +161,7 @@ def matched(
     mean: np.ndarray,
     key: jax.Array,
     tell: Callable[[str], None] = lambda _: None,
+    known: Known = NOTHING,
 ) -> Matched:
     """The fit, from where a search has ended.
 
@@ -147,6 +175,7 @@ def matched(
         mean: where the search has ended, unit coordinates, ``(n,)``.
         key: of the individuals and their simulations.
         tell: takes a line on how far it is.
+        known: of the first parameters; of the others the initial range is known.
     """
     real = jax.tree.map(lambda x: np.asarray(x, float), pieces)
     low, high = (np.asarray(x, float) for x in simulated.search.space.unit_bounds)
@@ -154,13 +183,14 @@ def matched(
     center = np.clip(np.asarray(mean, float), 0, 1)
     n, spread = len(center), np.full(len(center), PRIOR**-0.5)
     found, lost = list[tuple[_Emulator, _Fit]](), 0
+    known = known.beside(n - len(known.mean))
     for k in range(ROUNDS):
         k_draw, k_roll = jax.random.split(jax.random.fold_in(key, k))
         z = np.asarray(jax.random.normal(k_draw, (_INDIVIDUALS, n)), float)
         unit = np.clip(center + spread * z, low, high)
         read, sound = simulated(unit, k_roll)
         lost += int((~sound).sum())
-        emulator = _Emulator.of(unit, read, sound)
+        emulator = _Emulator.of(unit, read, sound, known)
         if emulator is None:
             break
         fit = emulator.fit(real)
@@ -168,8 +198,8 @@ def matched(
         tell(f"linear emulator: round {k + 1} of {ROUNDS}")
         moved = np.clip(fit.mean - center, -_FARTHEST * spread, _FARTHEST * spread)
         center = np.clip(center + moved, low, high)
-        known = _WIDER * np.sqrt(np.diag(fit.cov))
-        spread = np.clip(known, _NARROWEST, np.maximum(_NARROWER * spread, _NARROWEST))
+        wide = _WIDER * np.sqrt(np.diag(fit.cov))
+        spread = np.clip(wide, _NARROWEST, np.maximum(_NARROWER * spread, _NARROWEST))
     if not found:
         nan = np.full((n, n), np.nan)
         return Matched(nan[0], nan, np.zeros((n, n)), np.nan, lost)

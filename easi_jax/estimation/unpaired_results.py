@@ -8,7 +8,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from easi_jax.estimation.emulator import PRIOR, Matched, matched, one_row_errors
+from easi_jax.estimation.emulator import (
+    NOTHING,
+    PRIOR,
+    Known,
+    Matched,
+    matched,
+    one_row_errors,
+)
 from easi_jax.estimation.identifiability import seed_result
 from easi_jax.estimation.unpaired_runs import UnpairedProblem
 from easi_jax.model.parameters import ParameterSpace
@@ -99,12 +106,13 @@ def found_of(
     key: jax.Array,
     refined: bool,
     tell: Callable[[str], None],
+    known: Known = NOTHING,
 ) -> Found:
     """What a search at ``mean (n,)``, ``cov (n, n)`` found, with the fit after it where
     ``refined``; the other arguments as for `easi_jax.estimation.emulator.matched`."""
     if not refined:
         return Found(np.asarray(mean, float), np.asarray(cov, float), None)
-    fit = matched(simulated, pieces, np.asarray(mean, float), key, tell)
+    fit = matched(simulated, pieces, np.asarray(mean, float), key, tell, known)
     return Found(fit.mean, fit.cov, fit)
 
 

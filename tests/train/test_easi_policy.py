@@ -8,7 +8,7 @@ import pytest
 
 from easi_jax.io.logs.reader import write_log
 from tests.commands import command, read, refused
-from tests.walker import PARAMETERS, XML, walk
+from tests.walker import PARAMETERS, XML, in_a_stand, walk
 from train import easi
 
 TRUTH = {"kp": 26.0, "kv": 0.8}
@@ -74,6 +74,21 @@ def test_says_so_in_its_report(found: Path) -> None:
     assert "gravity.orientation.x" in text
 
 
+def test_a_log_in_a_stand_is_known_when_the_walk_is_fitted(
+    found: Path, files: Path, tmp_path: Path
+) -> None:
+    """Values are surer with it, and true."""
+    stand = tmp_path / "stand.csv"
+    stand.write_text(in_a_stand(**TRUTH))
+    out = tmp_path / "run"
+    command(easi, *arguments(files, "--out", out, "--stand", stand))
+    alone, both = (read(f / "distribution.json")["seeds"]["0"] for f in (found, out))
+    for i, truth in enumerate(TRUTH.values()):
+        assert both["std"][i] < 0.7 * alone["std"][i]
+        assert abs(both["mean"][i] - truth) < max(3 * both["std"][i], 0.05 * truth)
+    assert "in the stand: " in (out / "report.html").read_text()
+
+
 def test_a_killed_search_goes_on_to_the_same_result(
     found: Path, files: Path, tmp_path: Path
 ) -> None:
@@ -103,6 +118,8 @@ def test_a_killed_search_goes_on_to_the_same_result(
         (["--held-base"], "--held-base goes without --policy"),
         (["--observed", "speed=1"], "--observed goes with a policy"),
         (["--sampled"], "--sampled goes with a policy"),
+        (["--stand", "nowhere.csv"], "nowhere.csv"),
+        (["--stand", "stand.csv", "--no-refine"], "--stand goes without --no-refine"),
         (["--set", "policy_updates_per_generation=2"], "no policy is trained from"),
         (["--set", "rollout_steps=40"], "rollout_steps is 40"),
         (["--set", "rollout_steps=5000"], "too few to send 5000 commands"),
@@ -130,6 +147,7 @@ def test_wrong_options_are_one_line(
         (["--policy", "commands"], "--data needs --model"),
         (["--robot", "go2", "--observed", "a=1"], "--observed goes with --policy"),
         (["--policy-seed", "1", "--robot", "go2"], "--policy-seed goes with --policy"),
+        (["--stand", "s.csv", "--robot", "go2"], "--stand goes with --policy"),
     ],
 )
 @pytest.mark.fault("wrong options and files")
