@@ -30,6 +30,7 @@ from benchmarks import (
     scaling_summary,
     slow_tests,
     strangers,
+    walking,
     where_tests_spend,
 )
 from benchmarks._common import RESULTS, markdown_table
@@ -406,6 +407,7 @@ SECTIONS = (
         *("## Real Go2 in a stand", "go2_in_air.json", "go2_in_air"),
         go2_in_air.paragraphs,
     ),
+    *walking.SECTIONS,
     Section(*("## MuJoCo's features", "parity.json", "parity", parity.paragraphs)),
     *commands.SECTIONS,
     Section(
