@@ -187,7 +187,7 @@ def solve(cell: Cell, udr: Path) -> dict[str, Any]:
     found["log_ratio"] = dict(zip(names, off.tolist(), strict=True))
     spread = found.get("log_std", 0.0)
     found["error"] = float(np.sqrt(np.mean(off**2 + np.square(spread))))
-    return {"truth": truth, "logged": [len(r.steps) for r in given[2]], **found}
+    return {"truth": truth, "logged": [int(r.steps.sum()) for r in given[2]], **found}
 
 
 def _effects(env: Any, folder: Path) -> Path:
