@@ -330,6 +330,21 @@ def _laws(rows: list[Any]) -> list[str]:
         markdown_table(
             ("law", "cases", "right", "law named", "gap halved or closed"), lines
         ),
+        *_law_time(rows),
+    ]
+
+
+def _law_time(rows: list[Any]) -> list[str]:
+    """What laws cost beside the rest, where that was measured."""
+    timed = [r for r in rows if "law_seconds" in r]
+    if not timed:
+        return []
+    share = [r["law_seconds"] / (r["seconds"] - r["law_seconds"]) for r in timed]
+    median, most = np.median(share), np.quantile(share, 0.9)
+    return [
+        f"Of {len(timed)} cases the search for laws took {median:.0%} of the time of "
+        f"the rest (median; nine in ten at most {most:.0%}; goal "
+        f"{LAW_GOALS['time']:.0%}: {met(median <= LAW_GOALS['time'])})."
     ]
 
 

@@ -265,6 +265,7 @@ class Analysis:
         self.tell("compiling the predictions ...")
         notes = self._read_early()
         chosen = self._chosen()
+        listed = time.perf_counter()
         proposed = proposed_laws(self, chosen.model)
         poorer: _Chosen | None = None
         laws: list[str] = []
@@ -280,6 +281,7 @@ class Analysis:
             richer = other._chosen()
             if any(p.key in laws for p in richer.model.places):
                 self.final, poorer, chosen = other, chosen, richer
+        beyond = time.perf_counter() - listed
         outcome = self.final._stated(chosen)
         if poorer is not None and any(f.place.key in laws for f in outcome.found):
             x = self.search.at.plain(poorer.model.fit.x)
@@ -290,6 +292,7 @@ class Analysis:
             notes=[*notes, *chosen.notes, *outcome.notes],
             disagreeing=self.final.disagreeing(outcome),
             seconds=time.perf_counter() - began,
+            law_seconds=beyond,
         )
 
     def _chosen(self) -> _Chosen:

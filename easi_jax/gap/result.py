@@ -118,6 +118,7 @@ class Outcome:
     notes: list[str] = field(default_factory=list)
     disagreeing: dict[str, float] = field(default_factory=dict)
     seconds: float = 0.0
+    law_seconds: float = 0.0
     horizon: float = 0.0
     start: float = 0.0
     known_effects: float | None = None

@@ -67,6 +67,7 @@ def gap_result(
         horizon=o.horizon,
         disagreeing=o.disagreeing,
         seconds=o.seconds,
+        law_seconds=o.law_seconds,
         start=o.start,
         known_effects=o.known_effects,
         bounded=_named(c.names, np.append(o.floor_is_bound, False)),

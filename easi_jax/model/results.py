@@ -215,7 +215,7 @@ class GapResult:
         horizon: of the predictions [s].
         disagreeing: runs that the model predicts far worse than the others, with how
             many times.
-        seconds: that it took.
+        seconds: that it took; ``law_seconds`` of these went into laws.
         start: time on either side of a start that it is fitted to [s].
         open: channels whose error is surely beyond 1.25 times their floor; the empty
             name stands for all together.
@@ -250,6 +250,7 @@ class GapResult:
     disagreeing: Mapping[str, float]
     seconds: float
     start: float = 0.0
+    law_seconds: float = 0.0
     open: tuple[str, ...] = ()
     undecided: tuple[str, ...] = ()
     bounded: tuple[str, ...] = ()

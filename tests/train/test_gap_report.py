@@ -101,7 +101,7 @@ def test_gap_json_holds_every_key_of_the_format() -> None:
         *("schema", "verdict", "effects", "refitted", "gap", "unexplained_share"),
         *("gap_si", "undecided", "horizon_seconds", "start_seconds", "not_finite"),
         *("ignored", "held_out", "where", "disagreeing_runs", "record_next", "notes"),
-        *("seconds", "not_in_model_xml", "retrained"),
+        *("seconds", "law_seconds", "not_in_model_xml", "retrained"),
     ]
     (named,) = told["effects"]
     assert named == {

@@ -69,6 +69,7 @@ def gap_json(result: GapResult) -> dict[str, Any]:
         "record_next": r.record_next,
         "notes": r.notes,
         "seconds": r.seconds,
+        "law_seconds": r.law_seconds,
         "not_in_model_xml": r.not_in_model_xml,
     }
     if r.retrained is not None:
