@@ -336,6 +336,8 @@ def _laws(rows: list[Any]) -> list[str]:
 
 def _law_time(rows: list[Any]) -> list[str]:
     """What laws cost beside the rest, where that was measured."""
+    import numpy as np
+
     timed = [r for r in rows if "law_seconds" in r]
     if not timed:
         return []
