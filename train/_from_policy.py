@@ -20,7 +20,7 @@ COMMANDS = "commands"  # for --policy: send what the log was sent
 def run(config: Any) -> None:
     """Reads, searches, fits and reports; ``config`` is that of ``train.easi``."""
     _check_options(config)
-    problem, settings = read_problem(config)
+    problem, settings, robot = read_problem(config)
     stand = stand_problem(config, problem.env) if config.stand else None
     seeds = config.seeds or (0,)
     import jax
@@ -34,11 +34,10 @@ def run(config: Any) -> None:
     search, data = problem.search(settings), problem.data()
     simulated = Simulations(search, data)
     keys = [jax.random.fold_in(k, 1) for k in seed_keys(list(seeds))]
-    if problem.policy is not None:
-        check_commands(problem, search, simulated, keys[0])
+    check_commands(problem, search, simulated, keys[0])
     with RunFolder.open(
         config.out,
-        read_given(config).recorded(config),
+        {**read_given(config).recorded(config), **robot},
         command="train.easi",
         resume=config.resume,
         overwrite=config.overwrite,
@@ -54,7 +53,6 @@ def _check_options(config: Any) -> None:
 
     for flag, given in (
         ("--horizon", config.horizon is not None),
-        ("--noise", bool(config.noise)),
         ("--held-base", config.held_base),
         ("--restarts", config.restarts is not None),
     ):
@@ -70,15 +68,20 @@ def _check_options(config: Any) -> None:
 # -- what is asked -------------------------------------------------------------------
 
 
-def read_problem(config: Any) -> "tuple[UnpairedProblem, Any]":
-    """Reads and checks everything; nothing is written yet. The search's settings, too.
+def read_problem(config: Any) -> "tuple[UnpairedProblem, Any, dict[str, Any]]":
+    """Reads and checks everything; nothing is written yet. The search's settings, and
+    what says which robot it is, too.
 
     Raises:
         UserError: whatever is wrong with the files or the options.
     """
     from easi_jax.errors import UserError
     from easi_jax.estimation.problem import HORIZON
-    from easi_jax.estimation.unpaired_runs import at_control_step, unpaired_problem
+    from easi_jax.estimation.unpaired_runs import (
+        at_control_step,
+        command_step,
+        unpaired_problem,
+    )
     from easi_jax.simulation.sent_commands import SentCommands
     from easi_jax.simulation.simulator import Simulator
     from train._log_problem import read_runs
@@ -86,11 +89,11 @@ def read_problem(config: Any) -> "tuple[UnpairedProblem, Any]":
 
     sends = config.policy == COMMANDS
     if sends:
-        env, policy = _machine(config)
+        env, policy, robot = *_machine(config), {}
     else:
-        env, policy = _controlled(config)
+        env, policy, robot = _controlled(config)
     given = dataclasses.replace(config, unmeasured=_unmeasured(config, env.mj_model))
-    runs = read_runs(given, env.mj_model, HORIZON)
+    runs = _true(read_runs(given, env.mj_model, HORIZON), env.mj_model, config)
     settings = search_config(
         config.preset,
         config.set,
@@ -108,11 +111,28 @@ def read_problem(config: Any) -> "tuple[UnpairedProblem, Any]":
         )
     if sends:
         name, mj_model, space, fixed = env.name, env.mj_model, env.space, env.fixed
-        simulator = Simulator(mj_model, space, runs.fit[0].dt, fixed=fixed)
+        step = command_step(max(runs.fit, key=len))
+        simulator = Simulator(mj_model, space, step, fixed=fixed)
         rows = at_control_step(runs.fit, simulator.dt)
         env = SentCommands(name, simulator, rows, settings.rollout_steps)
     observed = dict(_observed(text) for text in config.observed)
-    return unpaired_problem(env, policy, runs, observed, config.sampled), settings
+    given = observed, config.sampled, config.noise
+    problem = unpaired_problem(env, policy, runs, settings.rollout_steps, *given)
+    return problem, settings, robot
+
+
+def _true(runs: Any, m: Any, config: Any) -> Any:
+    """Runs rid of what ``--effects`` says of the readings of joints."""
+    from easi_jax.data.cleaning import true_readings
+
+    entries = found_in(read_given(config).effects, str(config.effects)).entries
+    told = [
+        f"{e.effect}@{e.at}: taken out of the logs' readings"
+        for e in entries
+        if e.of_readings
+    ]
+    fit, held = (true_readings(m, r, entries) for r in (runs.fit, runs.held))
+    return dataclasses.replace(runs, fit=fit, held=held, notes=[*runs.notes, *told])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,8 +150,8 @@ def _machine(config: Any) -> tuple[Any, None]:
     from easi_jax.model.found_effects import joined
     from train._log_problem import model_and_space
 
-    for flag in ("observed", "sampled", "policy_seed"):
-        if getattr(config, flag):
+    for flag in ("observed", "sampled", "policy_seed", "env"):
+        if getattr(config, flag) not in (None, False, ()):
             raise UserError(
                 f"--{flag.replace('_', '-')} goes with a policy, and --policy "
                 f"{COMMANDS} has none"
@@ -144,12 +164,12 @@ def _machine(config: Any) -> tuple[Any, None]:
     return _Machine(name, mj_model, space, fixed), None
 
 
-def _controlled(config: Any) -> tuple[Any, Any]:
-    """The robot, with the parameters and effects that are searched, and its policy."""
-    import copy
-
+def _controlled(config: Any) -> tuple[Any, Any, dict[str, Any]]:
+    """The robot, with the parameters and effects that are searched, its policy, and
+    its name and options."""
     from easi_jax.errors import UserError
     from easi_jax.io.models.parameter_file import read_parameter_file
+    from easi_jax.simulation.with_effects import env_with_space
 
     path = Path(config.policy)
     if config.model is not None and not config.stand:
@@ -158,7 +178,7 @@ def _controlled(config: Any) -> tuple[Any, Any]:
             "it with --robot or --env"
         )
     opened = _of_file if path.suffix == ".onnx" else _of_run
-    env, policy = opened(config, path)
+    env, policy, option = opened(config, path)
     space = env.space
     if config.parameters is not None:
         own = read_parameter_file(config.parameters, env.mj_model)
@@ -168,13 +188,11 @@ def _controlled(config: Any) -> tuple[Any, Any]:
         space = dataclasses.replace(own, parameters=(*own.parameters, *rest))
     if config.start is not None:
         space = space.scaled(*config.start)
-    out = copy.copy(env)
-    out.simulator = env.simulator.rebuilt(space=space)
-    out.space = space
-    return out, policy
+    out = env_with_space(env, space)
+    return out, policy, {"robot": env.name, "option": option}
 
 
-def _of_run(config: Any, path: Path) -> tuple[Any, Any]:
+def _of_run(config: Any, path: Path) -> tuple[Any, Any, Sequence[str]]:
     import jax
 
     from easi_jax.errors import UserError
@@ -188,10 +206,11 @@ def _of_run(config: Any, path: Path) -> tuple[Any, Any]:
     if seed not in seeds:
         raise UserError(f"{path} has no policy of seed {seed}: it holds seeds {seeds}")
     at = seeds.index(seed)
-    return known["env"], jax.tree.map(lambda x: x[at], known["policies"])
+    policy = jax.tree.map(lambda x: x[at], known["policies"])
+    return known["env"], policy, known["option"]
 
 
-def _of_file(config: Any, path: Path) -> tuple[Any, Any]:
+def _of_file(config: Any, path: Path) -> tuple[Any, Any, Sequence[str]]:
     from easi_jax.errors import UserError
     from easi_jax.export.policy import from_onnx, interface_of
     from easi_jax.io.files import read_bytes
@@ -207,13 +226,14 @@ def _of_file(config: Any, path: Path) -> tuple[Any, Any]:
     env = open_env(config.robot or told.robot, config.env)
     env = robots(env, read_given(config))[0]
     mine = interface_of(env)
-    for what in ("observation", "action"):
+    for what in ("observation", "action", "dt"):
         if getattr(mine, what) != getattr(told, what):
+            word = "control step" if what == "dt" else what
             raise UserError(
-                f"{path} is a policy of {told.robot} whose {what} is another than that "
+                f"{path} is a policy of {told.robot} whose {word} is another than that "
                 f"of {env.name}: give its robot with --robot or --env"
             )
-    return env, policy
+    return env, policy, ()
 
 
 def _unmeasured(config: Any, m: Any) -> tuple[str, ...]:

@@ -159,8 +159,8 @@ def load_policies(
         given: effects that the robot has; the run's own where there are none.
 
     Returns:
-        ``env``, ``seeds``, ``training``, ``method``, ``policies`` ``(S, ...)``, and the
-        effects that ``env`` has, ``given``.
+        ``env``, its ``option``, ``seeds``, ``training``, ``method``, ``policies`` ``(S,
+        ...)``, and the effects that ``env`` has, ``given``.
 
     Raises:
         UserError: no finished run, or none of that method.
@@ -206,6 +206,7 @@ def load_policies(
         raise UserError(f"{folder} has lost its policies: run it again")
     return {
         "env": env,
+        "option": tuple(result.get("option", ())),
         "seeds": seeds,
         "training": training,
         "method": chosen,

@@ -27,14 +27,14 @@ def run(config: Config) -> None:
         if config.target_effects:
             raise UserError("--target-effects goes without --data: logs have their own")
         for option in ("policy_seed", "observed", "sampled", "stand"):
-            if getattr(config, option) and not config.policy:
+            if getattr(config, option) not in (None, False, ()) and not config.policy:
                 flag = "--" + option.replace("_", "-")
                 raise UserError(f"{flag} goes with --policy: give the policy, too")
         (_from_policy if config.policy else _from_logs).run(config)
         return
-    only = ("model", "parameters", "mapping", "held_out", "robot", "policy", "observed")
-    for option in only:
-        if getattr(config, option):
+    only = ("model", "parameters", "mapping", "held_out", "robot", "policy")
+    for option in (*only, "policy_seed", "observed", "sampled", "stand"):
+        if getattr(config, option) not in (None, False, ()):
             flag = "--" + option.replace("_", "-")
             raise UserError(f"{flag} goes with --data LOG: give the measured logs too")
     _from_target(config)

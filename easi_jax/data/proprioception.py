@@ -90,6 +90,14 @@ class Proprioception:
         return out
 
     @cached_property
+    def touches(self) -> np.ndarray:
+        """Channels that say whether something touches, ``(C,)`` bool."""
+        out = np.zeros(len(self), bool)
+        for part in self.parts:
+            out[self.of_sensor[part.name]] = part.how == _TOUCH
+        return out
+
+    @cached_property
     def kinds(self) -> dict[str, slice]:
         """Channels that are read alike: positions, speeds, and each sensor."""
         p, v = len(self.positions), len(self.speeds)
@@ -99,7 +107,7 @@ class Proprioception:
     def channels(self, qpos: jax.Array, qvel: jax.Array, read: Any) -> jax.Array:
         """Channels ``(..., C)`` of states ``(..., nq)``, ``(..., nv)`` and of what
         sensors read there, ``(..., N)``."""
-        own = [qpos[..., np.array(self.positions)]]
+        own = [qpos[..., np.array(self.positions, int)]]
         if self.speeds:
             own.append(qvel[..., np.array(self.speeds)])
         made = (_made(p.how, read[..., p.at], self.weight) for p in self.parts)

@@ -15,7 +15,7 @@ two-sample instrumental variables.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +37,9 @@ _RIDGES = (1e-3, 1e-2, 1e-1, 1.0)  # of which one half chooses what predicts the
 _RIDGE = 1e-5  # of the regression without parameters, which has rows in plenty
 _OUTLIER = 4.0  # standard deviations
 _BLOCKS = 20  # of the log, whose scatter says how sure the fit is
-_BEYOND = 0.5  # of the initial range, that a round may lie outside of it
+BEYOND = 0.5  # of the initial range, that a round may lie outside of it
+_LEAST = 0.1  # share of what an information says, that scores scatter
+_UNITS = 2  # rounds in which a fit learns how much it leaves
 PRIOR = 12.0  # information of a uniform initial range, unit coordinates
 
 
@@ -128,7 +130,7 @@ class _Emulator:
     def fit(self, pieces: Pieces) -> _Fit:
         """The parameters of ``pieces (K, ...)`` by least squares."""
         x, r = self.shown(pieces.before), self.left(pieces.before, pieces.change)
-        counts, n = pieces.weight, len(self.middle)
+        counts = pieces.weight
         one, other = (
             np.einsum("kf,afc->kac", x, v, optimize=True) for v in self.slopes
         )
@@ -145,14 +147,31 @@ class _Emulator:
         share = agreed @ np.linalg.pinv(whole, rcond=1e-9, hermitian=True)
         score = np.einsum("kac,kc,k->ka", both, r, counts, optimize=True) @ share.T
         information = 0.5 * (share @ agreed + agreed @ share.T)
-        blocks = np.array([b.sum(0) for b in np.array_split(score, _BLOCKS)])
-        scatter = np.cov(blocks, rowvar=False).reshape(n, n) * _BLOCKS
-        prior = self.known.information
-        inverse = np.linalg.inv(information + prior)
-        step = inverse @ (score.sum(0) + prior @ (self.known.mean - self.middle))
+        prior, off = self.known.information, self.known.mean - self.middle
+        # In units of what is left of these pieces, not of those of individuals, in
+        # which their different parameters are, too.
+        excess = 1.0
+        for _ in range(_UNITS):
+            inverse = np.linalg.inv(information / excess + prior)
+            step = inverse @ (score.sum(0) / excess + prior @ off)
+            rest = r - np.einsum("kac,a->kc", both, step, optimize=True)
+            excess = float((counts @ rest**2).sum() / (counts.sum() * r.shape[1]))
+            excess = max(excess, 1e-12)
+        scatter = _scattered(score / excess, information / excess)
         cov = inverse @ (scatter + prior) @ inverse
-        excess = float((counts @ r**2).sum() / (counts.sum() * r.shape[1]))
         return _Fit(self.middle + step, cov, information, excess)
+
+
+def _scattered(score: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """Covariance ``(n, n)`` of the sum of scores ``(K, n)`` of pieces: along each
+    principal direction of their ``information`` as much as sums over blocks of the log
+    scatter. That is less than it where noise of readings is what is left, since what a
+    row is off by the next one takes back."""
+    values, vectors = np.linalg.eigh(information)
+    count = min(_BLOCKS, len(score))
+    blocks = np.array([b.sum(0) for b in np.array_split(score, count)])
+    along = ((blocks - blocks.mean(0)) @ vectors).var(0, ddof=1) * count
+    return (vectors * np.maximum(along, _LEAST * values)) @ vectors.T
 
 
 def matched(
@@ -179,8 +198,8 @@ def matched(
     """
     real = jax.tree.map(lambda x: np.asarray(x, float), pieces)
     low, high = (np.asarray(x, float) for x in simulated.search.space.unit_bounds)
-    low, high = np.maximum(low, -_BEYOND), np.minimum(high, 1 + _BEYOND)
-    center = np.clip(np.asarray(mean, float), 0, 1)
+    low, high = np.maximum(low, -BEYOND), np.minimum(high, 1 + BEYOND)
+    center = np.clip(np.asarray(mean, float), low, high)
     n, spread = len(center), np.full(len(center), PRIOR**-0.5)
     found, lost = list[tuple[_Emulator, _Fit]](), 0
     known = known.beside(n - len(known.mean))
@@ -205,8 +224,9 @@ def matched(
         return Matched(nan[0], nan, np.zeros((n, n)), np.nan, lost)
     last = found[-_AVERAGED:]
     unit = np.clip(np.mean([fit.mean for _, fit in last], axis=0), low, high)
-    again = _told_again(simulated, [e for e, _ in last], unit, len(real.weight), key)
-    return _corrected([fit for _, fit in last], again, unit, (low, high), lost)
+    size = len(real.weight)
+    again, more = _told_again(simulated, [e for e, _ in last], unit, size, key)
+    return _corrected([fit for _, fit in last], again, more, unit, (low, high), lost)
 
 
 def _told_again(
@@ -215,37 +235,35 @@ def _told_again(
     unit: np.ndarray,
     size: int,
     key: jax.Array,
-) -> np.ndarray:
-    """What each emulator says of logs of ``size`` pieces that simulations of ``unit
-    (n,)`` make, ``(R, L, n)``; L is 0 where none of them makes one."""
+) -> tuple[np.ndarray, float]:
+    """What each emulator says of simulations of ``unit (n,)``, ``(R, n)``, and how long
+    the log of ``size`` pieces is beside them. What was known is that they are ``unit``,
+    so that only what an emulator errs by is told."""
     k_own = jax.random.fold_in(key, ROUNDS)
     read, sound = simulated(np.tile(unit, (simulated.size, 1)), k_own)
-    good = [x[sound] for x in (read.before, read.change, read.weight)]
-    flat = [x.reshape(-1, *x.shape[2:]) for x in good]
-    count = len(flat[-1]) // size or int(sound.any())
-    logs = [Pieces(*(x[i * size : (i + 1) * size] for x in flat)) for i in range(count)]
-    said = [[e.fit(log).mean for log in logs] for e in emulators]
-    return np.array(said).reshape(len(emulators), count, len(unit))
+    if not sound.any():
+        return np.tile(unit, (len(emulators), 1)), 0.0
+    good = (x[sound] for x in (read.before, read.change, read.weight))
+    log = Pieces(*(x.reshape(-1, *x.shape[2:]) for x in good))
+    said = [
+        replace(e, known=Known(unit, e.known.information)).fit(log).mean
+        for e in emulators
+    ]
+    return np.array(said), size / max(len(log.weight), 1)
 
 
 def _corrected(
     fits: Sequence[_Fit],
     again: np.ndarray,
+    more: float,
     unit: np.ndarray,
     bounds: tuple[np.ndarray, np.ndarray],
     lost: int,
 ) -> Matched:
-    """Rounds together, less what they err by on simulations of ``unit``; their scatter
-    after that is the emulators' own error."""
-    means, cov = (
-        np.array([f.mean for f in fits]),
-        np.mean([f.cov for f in fits], axis=0),
-    )
-    if again.size:
-        means = means - (again.mean(1) - unit)
-        of_logs = again.mean(0)
-        if len(of_logs) > 1:
-            cov = cov + np.cov(of_logs, rowvar=False).reshape(cov.shape) / len(of_logs)
+    """Rounds together, less what they err by on simulations of ``unit``, which are a
+    log, too: ``more`` variance. The scatter of rounds is the emulators' own error."""
+    means = np.array([f.mean for f in fits]) - (again - unit)
+    cov = (1.0 + more) * np.mean([f.cov for f in fits], axis=0)
     if len(fits) > 1:
         cov = cov + np.diag(means.var(0, ddof=1)) / len(fits)
     hessian = np.mean([f.hessian for f in fits], axis=0)

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from easi_jax.estimation.emulator import (
+    BEYOND,
     NOTHING,
     PRIOR,
     Known,
@@ -23,6 +24,7 @@ from easi_jax.model.results import HeldOutErrors, SeedResult
 from easi_jax.search.unpaired import Pieces, Simulations, UnpairedSearch
 
 _LACKING = 1.5  # times the squared error of simulations, that is worth a note
+_EDGE = 1e-3  # unit coordinates
 _SURE = 2.0  # standard deviations, that a delay is told from none
 _MEASURE = (
     "RMS error of the next reading, predicted from the readings and commands of three "
@@ -45,7 +47,10 @@ class Found:
 
     @cached_property
     def information(self) -> np.ndarray:
-        """Of the log, without the initial range, ``(n, n)``."""
+        """Of the log, without the initial range, ``(n, n)``; none of a search alone,
+        whose spread shrinks whatever the log says."""
+        if self.fit is None:
+            return np.zeros_like(self.cov)
         values, vectors = np.linalg.eigh(np.linalg.inv(self.cov))
         return (vectors * np.maximum(values - PRIOR, 0.0)) @ vectors.T
 
@@ -57,7 +62,7 @@ class Found:
         """Of the robot's parameters, whatever the delays of readings are."""
         space = self.space(search)
         n = slice(space.size)
-        mine = Found(self.mean[n], self.cov[n, n], None)
+        mine = Found(self.mean[n], self.cov[n, n], self.fit)
         return seed_result(space, mine.mean, mine.cov, mine.information)
 
     def readings(self, search: UnpairedSearch) -> list[dict[str, Any]]:
@@ -84,7 +89,18 @@ class Found:
                     f"{1e3 * r['std']:.2g} ms)"
                 )
         if self.fit is None:
+            notes.append(
+                "without a fit nothing says what the log determines: spreads are the "
+                "search's own"
+            )
             return notes
+        beyond = np.abs(self.mean - 0.5) > 0.5 + BEYOND - _EDGE
+        notes += [
+            f"{name} ended at the edge of what the fit may reach: widen its initial "
+            "range"
+            for name, at in zip(search.space.names, beyond, strict=True)
+            if at
+        ]
         if self.fit.excess > _LACKING:
             notes.append(
                 f"the log errs from its prediction by {self.fit.excess**0.5:.2g} times "
@@ -129,7 +145,7 @@ def held_out_errors(
     if len(found) > 1:
         mine = problem.pieces(problem.fit)
         each = [one_row_errors(simulated, f.mean, mine, key) for f in found]
-        fits = [float(np.mean((error / floor) ** 2)) for error, floor in each]
+        fits = [_beside(*pair) for pair in each]
     return HeldOutErrors(
         what=problem.held_name,
         horizon=problem.env.dt,
@@ -141,3 +157,11 @@ def held_out_errors(
         fit=fits,
         measure=_MEASURE,
     )
+
+
+def _beside(error: np.ndarray, floor: np.ndarray) -> float:
+    """Mean squared error beside its least, of channels that have one."""
+    seen = floor > 0
+    if not (seen.any() and np.isfinite(error).all()):
+        return np.inf
+    return float(np.mean((error[seen] / floor[seen]) ** 2))

@@ -23,6 +23,7 @@ from easi_jax.search.unpaired import (
     UnpairedData,
     UnpairedSearch,
     centered,
+    compared_steps,
     pieces_of,
     reading_delays,
 )
@@ -42,7 +43,8 @@ class UnpairedProblem:
         env: it; its effects and parameters are searched.
         act: ``act(policy, obs, key) -> action``; ``policy`` its parameters.
         of: channels; ``noise (C,)`` of theirs, and ``delays`` of readings.
-        fit, held: runs at the control step; ``held_name`` which data are held out.
+        fit, held: runs at the control step, cut into stretches that are as long as what
+            is compared of a simulation; ``held_name`` which data are held out.
         notes: what the user should know.
     """
 
@@ -68,26 +70,18 @@ class UnpairedProblem:
         return UnpairedData(self.pieces(self.fit), noise, self.policy)
 
     def pieces(self, runs: Sequence[Run]) -> Pieces:
-        """Pieces of some runs, readings of sensors about their mean in all of them."""
-        of = self.of
-        rows = [jnp.asarray(of.of_run(run), jnp.float32) for run in runs]
-        whole = jnp.concatenate(rows)
-        whole = centered(whole, jnp.ones(len(whole)), of)
-        ends = np.cumsum([len(r) for r in rows])
-        parts = [
-            pieces_of(part, jnp.asarray(run.ctrl, jnp.float32), jnp.ones(len(run)))
-            for part, run in zip(jnp.split(whole, ends[:-1]), runs, strict=True)
-            if len(run) > MEMORY + 1
-        ]
-        return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+        """Pieces of some runs, readings of sensors about their mean in each."""
+        return _pieces(self.of, runs)
 
 
 def unpaired_problem(
     env: Any,
     policy: Any,
     runs: MeasuredRuns,
+    steps: int,
     observed: Mapping[str, float] | None = None,
     sampled: bool = False,
+    noise: Sequence[float] = (),
 ) -> UnpairedProblem:
     """The problem of finding the parameters of ``env`` under which it reads what
     ``runs`` hold.
@@ -97,21 +91,27 @@ def unpaired_problem(
         policy: parameters of its controller; None where its actions are its own
             (`easi_jax.simulation.sent_commands`).
         runs: of a log.
+        steps: control steps of a simulation.
         observed: entries of the observation that were held, by name: what the robot was
             asked to do.
         sampled: whether actions were drawn, in place of the policy's mode.
+        noise: of the channels, standard deviations; empty: those of the runs, which
+            motion makes too large where it is rough from row to row.
 
     Raises:
         UserError: runs at another control step, too short ones, or with nothing to
-            compare; an entry that the observation lacks.
+            compare; an entry that the observation lacks; noise of another size.
     """
-    fit, held = (at_control_step(r, env.dt) for r in (runs.fit, runs.held))
+    length = compared_steps(steps, env.dt)
+    fit, held = (
+        stretches(at_control_step(r, env.dt), length) for r in (runs.fit, runs.held)
+    )
     m = env.mj_model
     of, notes = proprioception(m, [*fit, *held], env.simulator.engine)
-    noise = of.noise(runs.noise, runs.recorded)
+    sizes = _noise_of(of, runs, noise)
     problem = UnpairedProblem(
         *(env.name, env, acting(env, policy, observed or {}, sampled), policy),
-        *(of, noise, reading_delays(of, env.dt)),
+        *(of, sizes, reading_delays(of, env.dt)),
         *(fit, held, runs.held_name, [*runs.notes, *notes]),
     )
     for some, what in ((fit, "to fit"), (held, "held out")):
@@ -122,6 +122,41 @@ def unpaired_problem(
                 f"{_FEWEST * env.dt:.3g} s at least"
             )
     return problem
+
+
+def _noise_of(
+    of: Proprioception, runs: MeasuredRuns, given: Sequence[float]
+) -> np.ndarray:
+    """Noise of channels, ``(C,)``: as given, else that of the runs."""
+    if not len(given):
+        return of.noise(runs.noise, runs.recorded)
+    noise = np.asarray(given, float)
+    if noise.shape != (len(of),) or not (np.isfinite(noise) & (noise >= 0)).all():
+        raise UserError(
+            f"--noise is {list(given)}: with --policy it needs {len(of)} numbers, 0 or "
+            f"more, for {', '.join(of.names)}"
+        )
+    return noise
+
+
+def stretches(runs: Sequence[Run], length: int) -> list[Run]:
+    """Runs cut into stretches of ``length`` rows; a rest of half of that counts."""
+    out = []
+    for run in runs:
+        for first in range(0, len(run), length):
+            part = rows_of(run, first, first + length)
+            if len(part) >= min(len(run), max(length // 2, MEMORY + 2)):
+                out.append(part)
+    return out
+
+
+def _pieces(of: Proprioception, runs: Sequence[Run]) -> Pieces:
+    parts = []
+    for run in (r for r in runs if len(r) > MEMORY + 1):
+        weight = jnp.ones(len(run))
+        rows = centered(jnp.asarray(of.of_run(run), jnp.float32), weight, of)
+        parts.append(pieces_of(rows, jnp.asarray(run.ctrl, jnp.float32), weight))
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
 def acting(
@@ -149,6 +184,12 @@ def acting(
     return chosen
 
 
+def command_step(run: Run) -> float:
+    """The time between two commands of a run [s]: its rows may be denser."""
+    gaps = np.diff(_changes(run))
+    return run.dt * max(1, round(float(np.median(gaps))) if len(gaps) else 1)
+
+
 def at_control_step(runs: Sequence[Run], dt: float) -> list[Run]:
     """Runs with a row for each control step ``dt`` [s]; of rows that are denser those
     are kept in which commands change.
@@ -170,22 +211,33 @@ def at_control_step(runs: Sequence[Run], dt: float) -> list[Run]:
     return out
 
 
+def _changes(run: Run) -> np.ndarray:
+    """Rows in which a new command is sent."""
+    return 1 + np.flatnonzero((np.diff(run.ctrl, axis=0) != 0).any(1))
+
+
 def _thinned(run: Run, count: int) -> Run:
-    """Every ``count``-th row, from the first in which most commands change."""
-    changes = np.r_[False, (np.diff(run.ctrl, axis=0) != 0).any(1)]
-    first = int(np.argmax([changes[k::count].sum() for k in range(count)]))
-    rest = rows_of(run, first, len(run))
-    rows = slice(None, None, count)
+    """A row for each command: where it changes, or else ``count`` after the last, so
+    that clocks may drift."""
+    changes, rows = _changes(run), []
+    at = int(changes[0]) if len(changes) else 0
+    while at < len(run):
+        rows.append(at)
+        due = at + count
+        near = changes[np.abs(changes - due) <= count // 2]
+        at = int(near[np.argmin(np.abs(near - due))]) if len(near) else due
+    rest = rows_of(run, rows[0], len(run))
+    kept = np.array(rows) - rows[0]
     return replace(
         rest,
         dt=run.dt * count,
-        before=rest.before[rows],
-        time=rest.time[rows],
-        qpos=rest.qpos[rows],
-        qvel=rest.qvel[rows],
-        ctrl=rest.ctrl[rows],
+        before=rest.before[::-count][::-1],
+        time=rest.time[kept],
+        qpos=rest.qpos[kept],
+        qvel=rest.qvel[kept],
+        ctrl=rest.ctrl[kept],
         sent=None,
-        sensors={k: v[rows] for k, v in rest.sensors.items()},
+        sensors={k: v[kept] for k, v in rest.sensors.items()},
     )
 
 
@@ -201,11 +253,17 @@ def check_commands(
     unit = jax.random.uniform(key, (simulated.size, search.space.size))
     pieces, sound = simulated(np.asarray(unit), key)
     if sound.sum() < 2:
-        raise UserError(
-            "none of the simulations of the initial range stays finite and on its feet "
-            "under this controller: start from a model that is nearer (--start, "
-            "--parameters), or give the policy that was logged"
+        what = (
+            "when it is only sent the log's commands: give its policy"
+            if problem.policy is None
+            else "under this controller: give the policy that was logged"
         )
+        raise UserError(
+            "hardly any simulation of the initial range stays finite and on its feet "
+            f"{what}, or start from a model that is nearer (--start, --parameters)"
+        )
+    if problem.policy is None:
+        return
     nu = problem.env.mj_model.nu
     sent = pieces.before[sound][..., -nu:][pieces.weight[sound] > 0]
     logged = np.concatenate([run.ctrl for run in problem.fit])

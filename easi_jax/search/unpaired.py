@@ -120,9 +120,10 @@ class Delays:
 
 
 def reading_delays(of: Proprioception, dt: float) -> Delays:
-    """Delays of all kinds of readings but joint positions, up to `_LATE` control steps
-    ``dt`` [s]."""
-    late = {k: at for k, at in of.kinds.items() if k != "qpos"}
+    """Delays, up to `_LATE` control steps ``dt`` [s], of all kinds of readings but
+    joint positions and whether something touches."""
+    kinds = of.kinds.items()
+    late = {k: at for k, at in kinds if k != "qpos" and not of.touches[at].any()}
     ends = 0.0, _LATE * dt
     parameters = [
         Parameter(name, (name,), 0.0, ends, ends, "s", log=False)
@@ -135,8 +136,23 @@ def centered(rows: jax.Array, weight: jax.Array, of: Proprioception) -> jax.Arra
     """Readings ``(T, C)``, those of sensors less their mean over rows that count: how
     far a sensor is off says nothing of the robot."""
     mean = weight @ rows / jnp.maximum(weight.sum(), 1.0)
-    first = min((at.start for at in of.of_sensor.values()), default=rows.shape[1])
-    return rows - jnp.where(jnp.arange(rows.shape[1]) < first, 0.0, mean)
+    sensors = np.arange(len(of)) >= len(of.positions) + len(of.speeds)
+    return rows - jnp.where(sensors & ~of.touches, mean, 0.0)
+
+
+def compared_steps(steps: int, dt: float) -> int:
+    """How many of the control steps ``dt`` [s] of a simulation are compared.
+
+    Raises:
+        UserError: too few.
+    """
+    settled = round(_SETTLED / dt)
+    if steps < settled + MEMORY + 2:
+        raise UserError(
+            f"search rollout_steps is {steps}: the first {settled} ({_SETTLED:g} s) "
+            f"are not compared, so give more than {settled + MEMORY + 1}"
+        )
+    return steps - settled
 
 
 class UnpairedSearch(Search):
@@ -165,13 +181,8 @@ class UnpairedSearch(Search):
             env.simulator, config, env, act, mesh=mesh, more=delays.parameters
         )
         self.of, self.delays = of, delays
-        self.settled = round(_SETTLED / self.simulator.dt)
-        if self.settled + MEMORY + 2 > config.rollout_steps:
-            raise UserError(
-                f"search rollout_steps is {config.rollout_steps}: the first "
-                f"{self.settled} ({_SETTLED:g} s) are not compared, so give more than "
-                f"{self.settled + MEMORY + 1}"
-            )
+        steps = config.rollout_steps
+        self.settled = steps - compared_steps(steps, self.simulator.dt)
 
     def _width(self, data: UnpairedData) -> int:  # type: ignore[override]
         before, change = data.pieces.before, data.pieces.change

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from easi_jax.data.sensor_channels import Sensors, only_read
-from easi_jax.errors import UserError
 from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.step import Physics
+from easi_jax.simulation.with_effects import needs_simulator
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,10 @@ class ReadingSimulator(Simulator):
         )
         self._own = size if own is not None else None
 
+    def rebuilt(self, *args: Any, **more: Any) -> Simulator:
+        """Not of this one: what an environment reads by itself would be lost."""
+        raise NotImplementedError("rebuild the simulator, then let it read sensors")
+
     def start(self, *args: Any, **more: Any) -> Physics:
         """As `Simulator.start`; nothing is read yet."""
         state = super().start(*args, **more)
@@ -87,7 +91,9 @@ class ReadingSimulator(Simulator):
 
     def step(self, model: Any, state: Physics, ctrl: jax.Array) -> Physics:
         """As `Simulator.step`."""
-        after, (first, last) = self.sensed_step(model, state, ctrl)
+        # As steps return it: a scan over them keeps the form of a state.
+        bare = state.replace(sensed=jnp.zeros(self.base.sense_size), read=())
+        after, (first, last) = self.sensed_step(model, bare, ctrl)
         return self._parted(after, first, last)
 
     def _parted(self, state: Physics, first: Any, last: Any) -> Physics:
@@ -105,11 +111,7 @@ def reading_env(env: Any, sensors: Sensors) -> Any:
     """
     if not len(sensors):
         return env
-    if not isinstance(getattr(env, "simulator", None), Simulator):
-        raise UserError(
-            f"{env.name}: readings of sensors need an environment whose `simulator` is "
-            "an easi_jax.simulation.simulator.Simulator"
-        )
+    needs_simulator(env, "readings of sensors")
     out = copy.copy(env)
     out.simulator = ReadingSimulator(env.simulator, sensors)
     return out

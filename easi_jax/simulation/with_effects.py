@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from easi_jax.errors import UserError
 from easi_jax.model.found_effects import FoundEffects, joined
+from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.simulator import Simulator
 
 
@@ -30,19 +31,42 @@ def env_with(env: Any, found: FoundEffects) -> Any:
     """
     if not (found.physical or found.own):
         return env
-    if not isinstance(getattr(env, "simulator", None), Simulator):
-        raise UserError(
-            f"{env.name}: effects need an environment whose `simulator` is an "
-            "easi_jax.simulation.simulator.Simulator"
-        )
+    needs_simulator(env, "effects")
     out = copy.copy(env)
     out.simulator = simulator_with(env.simulator, found)
     out.space = out.simulator.space
+    return _simulated_by_own(out, "effects")
+
+
+def env_with_space(env: Any, space: ParameterSpace) -> Any:
+    """An environment with other parameters; the given one stays as it is.
+
+    Raises:
+        UserError: as `env_with`.
+    """
+    needs_simulator(env, "other parameters")
+    out = copy.copy(env)
+    out.simulator, out.space = env.simulator.rebuilt(space=space), space
+    return _simulated_by_own(out, "other parameters")
+
+
+def needs_simulator(env: Any, what: str) -> None:
+    """Raises UserError where an environment has no simulator of ours, which ``what``
+    needs."""
+    if not isinstance(getattr(env, "simulator", None), Simulator):
+        raise UserError(
+            f"{env.name}: {what} need an environment whose `simulator` is an "
+            "easi_jax.simulation.simulator.Simulator"
+        )
+
+
+def _simulated_by_own(out: Any, what: str) -> Any:
+    """The environment, checked to simulate with its ``simulator``."""
     theta = jnp.asarray(out.space.nominal, jnp.float32)
     model = jax.eval_shape(out.model, theta)
     if getattr(model, "present", None) != out.simulator.base.present:
         raise UserError(
-            f"{env.name}: effects need an environment whose model() is that of its "
+            f"{out.name}: {what} need an environment whose model() is that of its "
             "`simulator` (self.simulator.model(theta))"
         )
     return out

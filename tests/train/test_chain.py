@@ -364,6 +364,12 @@ def test_a_run_folders_policy_identifies_its_robot(chain: Path, log: Path) -> No
     std = told["seeds"]["0"]["std"][0]
     assert gear[0] == "gear" and abs(gear[1] - 1.2) < max(3 * std, 0.1)
     assert std < 0.2
+    model = out.parent / "tiny.xml"
+    model.write_text(XML)
+    command(export, out, "--model", model, "--env", ENV, "--out", out / "export")
+    written = mujoco.MjModel.from_xml_path(str(out / "export" / "model.xml"))
+    assert written.actuator_gear[0, 0] == pytest.approx(gear[1], rel=1e-4)
+    assert "gear" in (out / "export" / "randomization.yaml").read_text()
 
 
 def test_a_policy_that_did_not_send_the_logs_commands_is_told(

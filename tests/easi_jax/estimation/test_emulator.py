@@ -83,7 +83,7 @@ def test_from_the_wrong_end_of_the_range() -> None:
     springs, start = cast(Simulations, Springs()), np.array([0.0, 1.0, 0.5])
     found = matched(springs, log_of(truth, 3), start, jax.random.key(0))
     std = np.sqrt(np.diag(found.cov))[:2]
-    assert (np.abs(found.mean - truth)[:2] < 3 * std).all() and (std < 0.1).all()
+    assert (np.abs(found.mean - truth)[:2] < 3 * std).all() and (std < 0.2).all()
 
 
 def test_the_same_key_gives_the_same_fit() -> None:

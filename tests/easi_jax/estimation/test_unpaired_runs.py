@@ -15,6 +15,8 @@ from easi_jax.errors import UserError
 from easi_jax.estimation.unpaired_runs import (
     acting,
     at_control_step,
+    command_step,
+    stretches,
     unpaired_problem,
 )
 from easi_jax.model.parameters import ParameterSpace
@@ -35,6 +37,16 @@ def test_of_dense_rows_those_are_kept_in_which_commands_change() -> None:
     np.testing.assert_array_equal(thin.qpos, dense.qpos[3::4])
     np.testing.assert_array_equal(thin.sensors["gyro"], dense.sensors["gyro"][3::4])
     np.testing.assert_array_equal(thin.ctrl[:-1, 0] + 1, thin.ctrl[1:, 0])
+
+
+def test_rows_follow_a_clock_that_drifts() -> None:
+    """Commands every 10.05 rows: each row that is kept is one in which they change."""
+    _, run = walk(40.0)
+    number = np.floor(np.arange(len(run)) / 10.05)
+    drifting = replace(run, ctrl=number[:, None] * np.ones(4), dt=DT / 10)
+    assert command_step(drifting) == pytest.approx(DT)
+    (thin,) = at_control_step([drifting], DT)
+    np.testing.assert_array_equal(np.diff(thin.ctrl[:, 0]), 1.0)
 
 
 @pytest.mark.parametrize("share", [0.7, 1.5])
@@ -69,9 +81,10 @@ def test_pieces_cross_no_run_and_offsets_say_nothing() -> None:
         parts = [each, replace(each, name="again")]
         given = MeasuredRuns((each,), pooled_noise([run]), parts, parts, "all", [])
         env = SentCommands("walker", simulator, parts, 75)
-        problem = unpaired_problem(env, None, given)
+        problem = unpaired_problem(env, None, given, 250)
         found.append(problem.data().pieces)
-    count = len(run) - MEMORY - 1
+    # 200 of 250 rows of a simulation are compared: so long are stretches of the log.
+    count = sum(len(part) - MEMORY - 1 for part in stretches([run], 200))
     assert found[0].weight.shape == (2 * count,)
     np.testing.assert_allclose(found[0].before[:count], found[0].before[count:])
     np.testing.assert_allclose(found[0].before, found[1].before, atol=1e-4)
@@ -85,4 +98,4 @@ def test_too_few_rows_are_told() -> None:
         name="walker", dt=DT, mj_model=m, simulator=simulator, action_size=0
     )
     with pytest.raises(UserError, match="47 pieces of 4 rows: record 2 s"):
-        unpaired_problem(env, None, given)
+        unpaired_problem(env, None, given, 250)

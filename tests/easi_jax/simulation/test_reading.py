@@ -1,5 +1,7 @@
 """Sensors of a log, read in simulation where the log's rows are."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -9,6 +11,7 @@ import pytest
 from easi_jax.data.proprioception import proprioception
 from easi_jax.errors import UserError
 from easi_jax.model.parameters import ParameterSpace
+from easi_jax.model.torque_speed import TorqueSpeed
 from easi_jax.simulation.reading import ReadingSimulator, reading_env
 from easi_jax.simulation.rollout import policy_rollout
 from easi_jax.simulation.sent_commands import SentCommands, on_its_feet
@@ -37,6 +40,30 @@ def test_reads_what_mujoco_does_at_the_beginning_of_a_step() -> None:
         mujoco.mj_forward(m, data)
         read = data.sensordata[list(of.sensors.columns)]
         np.testing.assert_allclose(seg.sensed[k, 0], read, rtol=2e-3, atol=2e-3)
+
+
+def test_a_state_keeps_its_form_on_either_engine() -> None:
+    """On MJX, and on native MuJoCo where a call is made each physics step, a step is a
+    scan over states."""
+    m, run = walk(2.0, kept=True)
+    curve = TorqueSpeed(
+        *(jnp.full(4, x) for x in (5.0, 20.0, 9.0, 9.0)), dof=jnp.arange(6, 10)
+    )
+    for engine, torque_speed in (("mjx", None), ("mujoco", curve)):
+        of, _ = proprioception(m, [run], engine)
+        simulator = Simulator(
+            *(m, ParameterSpace(()), DT), torque_speed=torque_speed, engine=engine
+        )
+        env = reading_env(SentCommands("walker", simulator, [run], STEPS), of.sensors)
+
+        def roll(key: jax.Array, env: Any = env) -> Any:
+            def act(obs: jax.Array, key: jax.Array) -> jax.Array:
+                return jnp.zeros(0)
+
+            return policy_rollout(env, env.model(), act, key, STEPS)
+
+        seg = jax.eval_shape(roll, jax.random.key(0))
+        assert seg.sensed.shape == (STEPS, 1, len(of.sensors))
 
 
 def test_needs_a_simulator() -> None:
