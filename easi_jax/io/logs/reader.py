@@ -299,7 +299,8 @@ class _Reader:
         m, columns = self.model, self.columns
         said = ", ".join(f"{given_name(m, j)} ({w})" for j, w in self.hidden.items())
         self.note(
-            f"joints without a reading, whose positions and speeds are unknown: {said}"
+            f"joints without a reading, whose start is unknown in every prediction: "
+            f"{said}"
         )
         apart = apart_from(m, joint_dofs(m, self.hidden))
         if apart:
