@@ -43,7 +43,7 @@ def ppo() -> Ppo:
         learning_rate=3e-3,
         learning_rate_decay=0.1,
         discount=GAMMA,
-        entropy_cost=0.0,
+        entropy_cost=0.01,  # without, half of the seeds stop exploring beside the best
         normalize_observations=False,
         evaluate_every=HALF,
         eval_envs=4,
@@ -90,7 +90,7 @@ def test_actions(trained: Trained, name: str, expected: tuple[float, float]) -> 
     policy = trained.ppo.policy(state_of(trained, name))
     best = act(policy, OBS, deterministic=True)[:, 0]
     # A policy that does not see the observation is 0.5 off. How near one run of so few
-    # updates comes differs between processors, by their rounding (0.01 and 0.14 seen).
+    # updates comes differs between processors, by their rounding (0.01 to 0.12 seen).
     np.testing.assert_allclose(best, expected, atol=0.2)
 
 
