@@ -29,7 +29,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("walker")
     (folder / "walker.xml").write_text(XML)
     (folder / "parameters.yaml").write_text(PARAMETERS)
-    model, run = walk(20.0, **TRUTH, kept=True)
+    model, run = walk(20.0, kp=TRUTH["kp"], kv=TRUTH["kv"], kept=True)
     write_log(folder / "log.csv", model, run)
     without_base(folder / "log.csv")
     return folder

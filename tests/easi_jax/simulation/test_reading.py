@@ -12,6 +12,7 @@ from easi_jax.data.proprioception import proprioception
 from easi_jax.errors import UserError
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.torque_speed import TorqueSpeed
+from easi_jax.simulation.engine import Engine
 from easi_jax.simulation.reading import ReadingSimulator, reading_env
 from easi_jax.simulation.rollout import policy_rollout
 from easi_jax.simulation.sent_commands import SentCommands, on_its_feet
@@ -49,7 +50,9 @@ def test_a_state_keeps_its_form_on_either_engine() -> None:
     curve = TorqueSpeed(
         *(jnp.full(4, x) for x in (5.0, 20.0, 9.0, 9.0)), dof=jnp.arange(6, 10)
     )
-    for engine, torque_speed in (("mjx", None), ("mujoco", curve)):
+    kinds: tuple[tuple[Engine, TorqueSpeed | None], ...]
+    kinds = ("mjx", None), ("mujoco", curve)
+    for engine, torque_speed in kinds:
         of, _ = proprioception(m, [run], engine)
         simulator = Simulator(
             *(m, ParameterSpace(()), DT), torque_speed=torque_speed, engine=engine
@@ -99,16 +102,16 @@ def test_reading_leaves_an_environments_own_reading_alone() -> None:
     m, run = walk(2.0)
     of, _ = proprioception(m, [run], "mujoco")
 
+    class Height:
+        fields, size = ("xipos",), 1
+
+        def __call__(self, xipos: np.ndarray) -> np.ndarray:
+            return xipos[:, 1, 2:]
+
     class Own:
         """The height of the base's center, of either engine."""
 
-        class native:  # noqa: N801
-            fields, size = ("xipos",), 1
-
-            def __call__(self, xipos: np.ndarray) -> np.ndarray:
-                return xipos[:, 1, 2:]
-
-        native = native()
+        native = Height()
 
         def __call__(self, m: object, d: object) -> jax.Array:
             return d.xipos[1, 2:]  # type: ignore[attr-defined]
