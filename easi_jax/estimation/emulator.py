@@ -16,7 +16,6 @@ two-sample instrumental variables.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +38,6 @@ _RIDGE = 1e-5  # of the regression without parameters, which has rows in plenty
 _OUTLIER = 4.0  # standard deviations
 _BLOCKS = 20  # of the log, whose scatter says how sure the fit is
 BEYOND = 0.5  # of the initial range, that a round may lie outside of it
-_CHANCE = 2.0  # standard deviations of a mean square, that may be chance
 _LEAST = 0.1  # share of what an information says, that scores scatter
 _UNITS = 2  # rounds in which a fit learns how much it leaves
 PRIOR = 12.0  # information of a uniform initial range, unit coordinates
@@ -75,32 +73,26 @@ class Matched:
     Attributes:
         mean, cov: with what was known before, ``(n,)``, ``(n, n)``.
         hessian: information of the log, ``(n, n)``.
-        lacks: how many times as much of what is left of the log goes with readings and
-            commands as of what is left of simulations, where that is more than chance,
-            else 1. Variances are as many times as large for it.
+        excess: mean square of what the emulator leaves of the log, in units of what it
+            leaves of simulations; about 1 where the robot is like the model.
         lost: individuals that did not stay finite and on their feet.
     """
 
     mean: np.ndarray
     cov: np.ndarray
     hessian: np.ndarray
-    lacks: float
+    excess: float
     lost: int
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """What one emulator says of pieces; as `Matched`.
-
-    Attributes:
-        linked: how much of what is left goes with readings and commands, in units of
-            what would by chance.
-    """
+    """What one emulator says of pieces; as `Matched`."""
 
     mean: np.ndarray
     cov: np.ndarray
     hessian: np.ndarray
-    linked: float
+    excess: float
 
 
 @dataclass(frozen=True)
@@ -167,19 +159,7 @@ class _Emulator:
             excess = max(excess, 1e-12)
         scatter = _scattered(score / excess, information / excess)
         cov = inverse @ (scatter + prior) @ inverse
-        linked = _linked(x, rest, counts) / excess
-        return _Fit(self.middle + step, cov, information, linked)
-
-
-def _linked(x: np.ndarray, rest: np.ndarray, weight: np.ndarray) -> float:
-    """Mean square of what a regression on ``x (K, F)`` predicts of ``rest (K, C)``, for
-    each of its ``F C`` numbers: where a model is right, what is left goes with nothing
-    that is known (the overidentifying restrictions of Sargan and Hansen)."""
-    weighed = (x * weight[:, None]).T
-    gram = weighed @ x
-    gram = gram + _RIDGE * max(np.trace(gram) / len(gram), 1e-30) * np.eye(len(gram))
-    moments = weighed @ rest
-    return float(np.sum(moments * np.linalg.solve(gram, moments)) / moments.size)
+        return _Fit(self.middle + step, cov, information, excess)
 
 
 def _scattered(score: np.ndarray, information: np.ndarray) -> np.ndarray:
@@ -245,24 +225,8 @@ def matched(
     last = found[-_AVERAGED:]
     unit = np.clip(np.mean([fit.mean for _, fit in last], axis=0), low, high)
     size = len(real.weight)
-    again = _told_again(simulated, [e for e, _ in last], unit, size, key)
-    return _corrected([fit for _, fit in last], again, unit, (low, high), lost)
-
-
-class _Again(NamedTuple):
-    """What emulators say of simulations of the parameters that they found.
-
-    Attributes:
-        means: parameters, ``(R, n)``.
-        linked: as of `_Fit`, of simulations as long as the log, ``(R,)``.
-        length: of the log beside the simulations.
-        moments: how many numbers ``linked`` is a mean of.
-    """
-
-    means: np.ndarray
-    linked: np.ndarray
-    length: float
-    moments: int
+    again, more = _told_again(simulated, [e for e, _ in last], unit, size, key)
+    return _corrected([fit for _, fit in last], again, more, unit, (low, high), lost)
 
 
 def _told_again(
@@ -271,49 +235,40 @@ def _told_again(
     unit: np.ndarray,
     size: int,
     key: jax.Array,
-) -> _Again:
-    """What ``emulators`` say of simulations of ``unit (n,)``, beside a log of ``size``
-    pieces. What was known is that they are ``unit``, so that only what an emulator errs
-    by is told."""
+) -> tuple[np.ndarray, float]:
+    """What each emulator says of simulations of ``unit (n,)``, ``(R, n)``, and how long
+    the log of ``size`` pieces is beside them. What was known is that they are ``unit``,
+    so that only what an emulator errs by is told."""
     k_own = jax.random.fold_in(key, ROUNDS)
-    moments = int(np.prod(emulators[0].slopes[0].shape[1:]))
     read, sound = simulated(np.tile(unit, (simulated.size, 1)), k_own)
     if not sound.any():
-        alone = np.tile(unit, (len(emulators), 1))
-        return _Again(alone, np.ones(len(emulators)), 0.0, moments)
+        return np.tile(unit, (len(emulators), 1)), 0.0
     good = (x[sound] for x in (read.before, read.change, read.weight))
     log = Pieces(*(x.reshape(-1, *x.shape[2:]) for x in good))
-    count = max(1, len(log.weight) // size)
-    parts = [jax.tree.map(lambda x, i=i: x[i::count], log) for i in range(count)]
-    parts = [jax.tree.map(lambda x: x[:size], part) for part in parts]
-    told = [replace(e, known=Known(unit, e.known.information)) for e in emulators]
-    return _Again(
-        np.array([e.fit(log).mean for e in told]),
-        np.array([np.mean([e.fit(part).linked for part in parts]) for e in told]),
-        size / max(len(log.weight), 1),
-        moments,
-    )
+    said = [
+        replace(e, known=Known(unit, e.known.information)).fit(log).mean
+        for e in emulators
+    ]
+    return np.array(said), size / max(len(log.weight), 1)
 
 
 def _corrected(
     fits: Sequence[_Fit],
-    again: _Again,
+    again: np.ndarray,
+    more: float,
     unit: np.ndarray,
     bounds: tuple[np.ndarray, np.ndarray],
     lost: int,
 ) -> Matched:
     """Rounds together, less what they err by on simulations of ``unit``, which are a
-    log, too, with a variance of its own. The scatter of rounds is the emulators' own
-    error."""
-    means = np.array([f.mean for f in fits]) - (again.means - unit)
-    lacks = float(np.mean([f.linked for f in fits]) / max(np.mean(again.linked), 1e-12))
-    lacks = lacks if lacks > 1.0 + _CHANCE * np.sqrt(2.0 / again.moments) else 1.0
-    cov = (1.0 + again.length) * np.mean([f.cov for f in fits], axis=0)
-    cov = cov * lacks
+    log, too: ``more`` variance. The scatter of rounds is the emulators' own error."""
+    means = np.array([f.mean for f in fits]) - (again - unit)
+    cov = (1.0 + more) * np.mean([f.cov for f in fits], axis=0)
     if len(fits) > 1:
         cov = cov + np.diag(means.var(0, ddof=1)) / len(fits)
     hessian = np.mean([f.hessian for f in fits], axis=0)
-    return Matched(np.clip(means.mean(0), *bounds), cov, hessian, lacks, lost)
+    excess = float(np.mean([f.excess for f in fits]))
+    return Matched(np.clip(means.mean(0), *bounds), cov, hessian, excess, lost)
 
 
 def _regressed(

@@ -1,7 +1,7 @@
 """What a search on unpaired logs, and the fit after it, say."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -18,12 +18,12 @@ from easi_jax.estimation.emulator import (
     one_row_errors,
 )
 from easi_jax.estimation.identifiability import seed_result
-from easi_jax.estimation.posterior import UNSTATED
 from easi_jax.estimation.unpaired_runs import UnpairedProblem
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.results import HeldOutErrors, SeedResult
 from easi_jax.search.unpaired import Pieces, Simulations, UnpairedSearch
 
+_LACKING = 1.5  # times the squared error of simulations, that is worth a note
 _EDGE = 1e-3  # unit coordinates
 _SURE = 2.0  # standard deviations, that a delay is told from none
 _MEASURE = (
@@ -63,21 +63,7 @@ class Found:
         space = self.space(search)
         n = slice(space.size)
         mine = Found(self.mean[n], self.cov[n, n], self.fit)
-        found = seed_result(space, mine.mean, mine.cov, mine.information)
-        return replace(found, no_region=self.no_region)
-
-    @property
-    def no_region(self) -> str:
-        """Why no region can be stated; empty where one can."""
-        if self.fit is None or not self.fit.lacks**0.5 > UNSTATED:
-            return ""
-        return (
-            "no region is stated: what is left of the log goes with readings and "
-            f"commands {self.fit.lacks**0.5:.2g} times as much as in simulations, so "
-            "the model lacks something. How far values are from the truth cannot be "
-            "said, only that they predict best. train.gap with logs in a stand names "
-            "what is missing; then give --effects"
-        )
+        return seed_result(space, mine.mean, mine.cov, mine.information)
 
     def readings(self, search: UnpairedSearch) -> list[dict[str, Any]]:
         """How late readings come [s], and the standard deviation of that."""
@@ -115,8 +101,12 @@ class Found:
             for name, at in zip(search.space.names, beyond, strict=True)
             if at
         ]
-        if self.no_region:
-            notes.append(self.no_region)
+        if self.fit.excess > _LACKING:
+            notes.append(
+                f"the log errs from its prediction by {self.fit.excess**0.5:.2g} times "
+                "as much as simulations do, so the model lacks something, and "
+                "parameters take up part of that"
+            )
         if self.fit.lost:
             notes.append(
                 f"{self.fit.lost} simulations of the fit fell or were not finite"
