@@ -93,12 +93,19 @@ def record(twin: Any, policy: Any, cell: Cell) -> list[Any]:
     Go2: one walk at `COMMAND` by the policy's mode; where it falls it is set up again
     until the time is full, as people would, at most `TRIES` times.
     """
-    from benchmarks.twin_runs import commanded, play
+    from benchmarks.twin_runs import play
 
     env, seed = twin.env, 2 * cell.seed
     if cell.robot == "cartpole":
         return [play(twin, policy, seed, cell.trajectories, env.episode_length, False)]
-    start, logs, left = commanded(env, [COMMAND]), [], LOGGED
+    return walked(twin, policy, seed)
+
+
+def walked(twin: Any, policy: Any, seed: int) -> list[Any]:
+    """Walks of a Go2 at `COMMAND` until `LOGGED` steps are full; see `record`."""
+    from benchmarks.twin_runs import commanded, play
+
+    start, logs, left = commanded(twin.env, [COMMAND]), [], LOGGED
     for k in range(TRIES):
         log = play(twin, policy, seed + 1000 * k, 1, left, True, start)
         logs.append(log)

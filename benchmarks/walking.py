@@ -30,15 +30,13 @@ import numpy as np
 from benchmarks._cells import Share, run_cells
 from benchmarks._common import RESULTS, commits_of, markdown_table
 from benchmarks._page import Section
+from benchmarks.paper_twin import COMMAND, LOGGED, walked
 from train._command import main
 
 IMU, BASE, PAPER, UDR = "joints and IMU", "with base pose", "paper preset", "UDR range"
 METHODS = (IMU, BASE, PAPER, UDR)
 MACHINES = ("same laws", "twin")
-ROWS = 2000  # control steps of a log: 40 s
-COMMAND = 1.4  # m/s
 OBSERVED = (f"command.forward={COMMAND}", "command.sideways=0", "command.turn=0")
-_TRIES = 20  # starts, if it falls
 _FACTOR = 1.6  # that parameters of the same laws may differ by
 _STEP = 0.004  # s, of delays there: the model's own timestep
 _DELAY = "{{effect: actuator_delay, at: {at}, kind: actuator, columns: {{delay: 0.01}}"
@@ -131,18 +129,10 @@ def machine_of(cell: Cell, env: Any) -> tuple[Any, dict[str, float]]:
 
 def logs_of(cell: Cell, env: Any, policy: Any, folder: Path) -> tuple[Path, Path, Any]:
     """Logs with and without the base, and recordings; ``folder`` holds the logs."""
-    from benchmarks.twin_runs import commanded, play
     from easi_jax.io.logs.reader import write_log
 
     twin = machine_of(cell, env)[0]
-    start, recordings, left = commanded(env, [COMMAND]), [], ROWS
-    for k in range(_TRIES):
-        recordings.append(
-            play(twin, policy, cell.seed + 1000 * k, 1, left, True, start)
-        )
-        left -= int(recordings[-1].steps[0])
-        if left <= 0:
-            break
+    recordings = walked(twin, policy, cell.seed)
     runs = [run for recording in recordings for run in recording.runs(twin)]
     runs = [
         # The unit sits square on the base: what it reads is the base's own.
@@ -294,7 +284,7 @@ def _shown(rows: list[dict[str, Any]]) -> list[str]:
                     f"{np.median([r['seconds'] for r in mine]):.0f}",
                 )
             )
-    logged = ROWS * 0.02
+    logged = LOGGED * 0.02
     return [
         f"`python -m benchmarks.walking`: {logged:g} s of a Go2 at {COMMAND} m/s "
         f"(commits {commits_of(rows)}); seven parameters and the delay of commands. "

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from train._command import say, show_table
 from train._effects import Given, robots, target_name
-from train._robots import save_policies, search_config, target_of, training_chunk
+from train._robots import chosen_search, save_policies, target_of, training_chunk
 from train._stages import (
     as_read_back,
     found_check,
@@ -71,15 +71,8 @@ def ready(
     changes = target_of(env, config.target, given)
     theta = target_parameters((real or env).space, changes)
     steps = steps_of(horizon, env.dt, any(x > 0 for x in config.noise))
-    search = search_config(
-        config.preset,
-        config.set,
-        env.name,
-        strategy=config.strategy,
-        generations=config.generations,
-        population=config.population,
-        horizon=steps if config.preset != "paper" else None,
-    )
+    horizon_steps = steps if config.preset != "paper" else None
+    search = chosen_search(config, env.name, horizon=horizon_steps)
     settings = PipelineConfig(
         search=search,
         training=training,

@@ -55,17 +55,9 @@ def _settings(config: Any, problem: "Problem") -> Any:
     """Search settings; as many pieces a generation as their length lets pay."""
     from easi_jax.errors import UserError
     from easi_jax.estimation.from_runs import replayed
-    from train._robots import search_config
+    from train._robots import chosen_search
 
-    chosen = search_config(
-        config.preset,
-        config.set,
-        strategy=config.strategy,
-        generations=config.generations,
-        population=config.population,
-        source="replay",
-        horizon=problem.piece,
-    )
+    chosen = chosen_search(config, source="replay", horizon=problem.piece)
     if chosen.source != "replay" or chosen.policy_updates_per_generation:
         raise UserError(
             "logs come without their controller: leave source and "

@@ -85,7 +85,7 @@ def read_problem(config: Any) -> "tuple[UnpairedProblem, Any, dict[str, Any]]":
     from easi_jax.simulation.sent_commands import SentCommands
     from easi_jax.simulation.simulator import Simulator
     from train._log_problem import read_runs
-    from train._robots import search_config
+    from train._robots import chosen_search
 
     sends = config.policy == COMMANDS
     if sends:
@@ -94,16 +94,8 @@ def read_problem(config: Any) -> "tuple[UnpairedProblem, Any, dict[str, Any]]":
         env, policy, robot = _controlled(config)
     given = dataclasses.replace(config, unmeasured=_unmeasured(config, env.mj_model))
     runs = _true(read_runs(given, env.mj_model, HORIZON), env.mj_model, config)
-    settings = search_config(
-        config.preset,
-        config.set,
-        env.name,
-        strategy=config.strategy,
-        generations=config.generations,
-        population=config.population,
-        source="policy",
-        innovation_inputs=False,
-    )
+    source = {"source": "policy", "innovation_inputs": False}
+    settings = chosen_search(config, env.name, **source)
     if settings.policy_updates_per_generation or settings.source != "policy":
         raise UserError(
             "no policy is trained from logs: leave source and "
@@ -278,21 +270,22 @@ def _finished(
     import numpy as np
 
     from easi_jax.errors import UserError
+    from easi_jax.estimation.emulator import NOTHING
     from easi_jax.estimation.unpaired_results import found_of, held_out_errors
     from train._log_results import write_found
 
     search, pieces = simulated.search, problem.pieces(problem.fit)
+    known = [NOTHING] * len(seeds)
+    if stand is not None:
+        n = slice(stand.simulator.space.size)
+        ends = states.result_mean[:, n], states.result_cov[:, n, n]
+        log_scale = search.config.log_scale
+        known = known_from_stand(stand, log_scale, *ends, problem.notes)
     found = {}
     for k, seed in enumerate(seeds):
         end = states.result_mean[k], states.result_cov[k]
-        more = {}
-        if stand is not None:
-            n = slice(stand.simulator.space.size)
-            notes = problem.notes if k == 0 else []
-            own = search.config.log_scale, end[0][n], end[1][n, n]
-            more["known"] = known_from_stand(stand, *own, notes)
         given = simulated, pieces, *end, keys[k], config.refine, say
-        found[seed] = found_of(*given, **more)
+        found[seed] = found_of(*given, known[k])
     good = {s: f for s, f in found.items() if np.isfinite(f.mean).all()}
     lost = {s: "too few simulations stay on their feet" for s in seeds if s not in good}
     if not good:

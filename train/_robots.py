@@ -52,6 +52,19 @@ def search_config(
     return make(preset, **chosen)
 
 
+def chosen_search(config: Any, robot: str = "", **changes: Any) -> Any:
+    """`search_config` of a command's `SearchOptions`."""
+    return search_config(
+        config.preset,
+        config.set,
+        robot,
+        strategy=config.strategy,
+        generations=config.generations,
+        population=config.population,
+        **changes,
+    )
+
+
 def _value(setting: str, text: str, like: Any) -> Any:
     from easi_jax.errors import UserError
 

@@ -35,28 +35,25 @@ def stand_problem(config: Any, env: Any) -> "Problem":
     m = load_model(Path(path), config.allow_assets, held, True)
     logs = read_logs(list(config.stand), m, config.mapping, config.unmeasured)
     runs = measured_runs(m, logs, None, HORIZON)
-    fixed = {**getattr(env, "fixed", {}), **getattr(env.simulator, "fixed", {})}
-    return problem_of(
-        f"{env.name} in a stand", m, env.space, runs, found=FoundEffects((), fixed)
-    )
+    found = FoundEffects((), env.simulator.fixed)
+    return problem_of(f"{env.name} in a stand", m, env.space, runs, found=found)
 
 
 def known_from_stand(
-    problem: "Problem", log_scale: bool, mean: Any, cov: Any, notes: list[str]
-) -> "Known":
-    """What logs in a stand say of the parameters, by least squares from where a search
-    has ended.
+    problem: "Problem", log_scale: bool, means: Any, covs: Any, notes: list[str]
+) -> "list[Known]":
+    """What logs in a stand say of the parameters, by least squares from where the
+    search of each seed has ended.
 
     Args:
         problem: of `stand_problem`.
         log_scale: of the search, as `easi_jax.search.config.SearchConfig` has it.
-        mean, cov: its end, unit coordinates, ``(n,)``, ``(n, n)``.
+        means, covs: its ends, unit coordinates, ``(S, n)``, ``(S, n, n)``.
         notes: gets what the user should know.
 
     Raises:
-        UserError: the fit diverged.
+        UserError: a fit diverged.
     """
-    import jax.numpy as jnp
     import numpy as np
 
     from easi_jax.errors import UserError
@@ -71,10 +68,14 @@ def known_from_stand(
     settings = replayed(problem, preset("default", log_scale=log_scale))
     search = Search(problem.simulator, settings)
     finish = ready_finish(problem, search, tell=lambda text: say(f"stand: {text}"))
-    (found,), more = finish(jnp.asarray(mean)[None], jnp.asarray(cov)[None])
-    why = diverged(found, search.space.names)
-    if why:
-        raise UserError(f"the fit to the logs in a stand diverged: {why}")
+    estimates, more = finish(means, covs)
+    known = []
+    for found in estimates:
+        why = diverged(found, search.space.names)
+        if why:
+            raise UserError(f"the fit to the logs in a stand diverged: {why}")
+        center = np.asarray(found.distribution.mean, float)
+        information = np.linalg.inv(covariance(found.distribution))
+        known.append(Known(center, information))
     notes += [f"in the stand: {text}" for text in (*problem.notes, *more)]
-    center = np.asarray(found.distribution.mean, float)
-    return Known(center, np.linalg.inv(covariance(found.distribution)))
+    return known

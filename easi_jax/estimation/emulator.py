@@ -72,7 +72,6 @@ class Matched:
 
     Attributes:
         mean, cov: with what was known before, ``(n,)``, ``(n, n)``.
-        hessian: information of the log, ``(n, n)``.
         excess: mean square of what the emulator leaves of the log, in units of what it
             leaves of simulations; about 1 where the robot is like the model.
         lost: individuals that did not stay finite and on their feet.
@@ -80,7 +79,6 @@ class Matched:
 
     mean: np.ndarray
     cov: np.ndarray
-    hessian: np.ndarray
     excess: float
     lost: int
 
@@ -91,7 +89,6 @@ class _Fit:
 
     mean: np.ndarray
     cov: np.ndarray
-    hessian: np.ndarray
     excess: float
 
 
@@ -159,7 +156,7 @@ class _Emulator:
             excess = max(excess, 1e-12)
         scatter = _scattered(score / excess, information / excess)
         cov = inverse @ (scatter + prior) @ inverse
-        return _Fit(self.middle + step, cov, information, excess)
+        return _Fit(self.middle + step, cov, excess)
 
 
 def _scattered(score: np.ndarray, information: np.ndarray) -> np.ndarray:
@@ -221,7 +218,7 @@ def matched(
         spread = np.clip(wide, _NARROWEST, np.maximum(_NARROWER * spread, _NARROWEST))
     if not found:
         nan = np.full((n, n), np.nan)
-        return Matched(nan[0], nan, np.zeros((n, n)), np.nan, lost)
+        return Matched(nan[0], nan, np.nan, lost)
     last = found[-_AVERAGED:]
     unit = np.clip(np.mean([fit.mean for _, fit in last], axis=0), low, high)
     size = len(real.weight)
@@ -266,9 +263,8 @@ def _corrected(
     cov = (1.0 + more) * np.mean([f.cov for f in fits], axis=0)
     if len(fits) > 1:
         cov = cov + np.diag(means.var(0, ddof=1)) / len(fits)
-    hessian = np.mean([f.hessian for f in fits], axis=0)
     excess = float(np.mean([f.excess for f in fits]))
-    return Matched(np.clip(means.mean(0), *bounds), cov, hessian, excess, lost)
+    return Matched(np.clip(means.mean(0), *bounds), cov, excess, lost)
 
 
 def _regressed(

@@ -71,7 +71,13 @@ class UnpairedProblem:
 
     def pieces(self, runs: Sequence[Run]) -> Pieces:
         """Pieces of some runs, readings of sensors about their mean in each."""
-        return _pieces(self.of, runs)
+        parts = []
+        for run in (r for r in runs if len(r) > MEMORY + 1):
+            rows, weight = self.of.of_run(run), jnp.ones(len(run))
+            rows = centered(jnp.asarray(rows, jnp.float32), weight, self.of)
+            ctrl = jnp.asarray(run.ctrl, jnp.float32)
+            parts.append(pieces_of(rows, ctrl, weight))
+        return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
 def unpaired_problem(
@@ -148,15 +154,6 @@ def stretches(runs: Sequence[Run], length: int) -> list[Run]:
             if len(part) >= min(len(run), max(length // 2, MEMORY + 2)):
                 out.append(part)
     return out
-
-
-def _pieces(of: Proprioception, runs: Sequence[Run]) -> Pieces:
-    parts = []
-    for run in (r for r in runs if len(r) > MEMORY + 1):
-        weight = jnp.ones(len(run))
-        rows = centered(jnp.asarray(of.of_run(run), jnp.float32), weight, of)
-        parts.append(pieces_of(rows, jnp.asarray(run.ctrl, jnp.float32), weight))
-    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
 def acting(

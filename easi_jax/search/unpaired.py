@@ -86,9 +86,8 @@ def linear_prediction(
     """The linear map from ``before (S, F)`` to ``change (S, C)`` of least squared
     error."""
     total = jnp.maximum(weight.sum(), 1.0)
-    mid, out_mid = weight @ before / total, weight @ change / total
-    std = jnp.sqrt(weight @ (before - mid) ** 2 / total)
-    std = jnp.where(std > 1e-9, std, 1.0)
+    mid, std = moments(before, weight)
+    out_mid = weight @ change / total
     x = (before - mid) / std
     gram = (x * weight[:, None]).T @ x / total + _RIDGE * jnp.eye(x.shape[1])
     slope = jnp.linalg.solve(gram, (x * weight[:, None]).T @ (change - out_mid) / total)

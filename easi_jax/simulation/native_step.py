@@ -92,6 +92,11 @@ def _reading(model: Any) -> Any:
     return read
 
 
+def _of_model(model: Any) -> dict[str, Any]:
+    """What every call of MuJoCo is given of a model besides its numbers."""
+    return {"read": _reading(model), "pairs": _pairs(model), "edge": _edge(model)}
+
+
 def steps(model: Any, state: Any, arrived: jax.Array) -> Any:
     """The state after physics steps in which ``arrived (T, nu)`` reaches the
     actuators."""
@@ -100,9 +105,7 @@ def steps(model: Any, state: Any, arrived: jax.Array) -> Any:
     changed, qfrc, xfrc = _steady(model)
     out, _, sensed = native.run(
         *(changed, state, arrived, qfrc, xfrc),
-        read=_reading(model),
-        pairs=_pairs(model),
-        edge=_edge(model),
+        **_of_model(model),
     )
     return _after(model, state, out, sensed)
 
@@ -117,9 +120,7 @@ def steps_sensed(
     changed, qfrc, xfrc = _steady(model)
     out, _, sensed = native.run(
         *(changed, state, arrived, qfrc, xfrc),
-        read=_reading(model),
-        pairs=_pairs(model),
-        edge=_edge(model),
+        **_of_model(model),
         each=True,
     )
     return _after(model, state, out, sensed[0, 1]), sensed[0]
@@ -140,8 +141,8 @@ def replay(
     ctrl = arrived.reshape(h * substeps, nu)
     count = None if steps is None else jnp.asarray(steps * substeps)
     given = changed, state, ctrl, qfrc, xfrc
-    more = {"read": _reading(model), "pairs": _pairs(model), "edge": _edge(model)}
-    _, path, sensed = native.run(*given, every=substeps, count=count, each=True, **more)
+    more = {"every": substeps, "count": count, "each": True, **_of_model(model)}
+    _, path, sensed = native.run(*given, **more)
     return (*path, sensed)
 
 
@@ -200,9 +201,7 @@ def _one(model: Any, state: Any, ctrl: jax.Array) -> Any:
             d = effects.body_resistance(m, d, e)  # type: ignore[arg-type]
     out, _, sensed = native.run(
         *(m, state, d.ctrl[None], d.qfrc_applied, d.xfrc_applied),
-        read=_reading(model),
-        pairs=_pairs(model),
-        edge=_edge(model),
+        **_of_model(model),
     )
     after = _after(model, state, out, sensed).replace(rotor=rotor)
     if isinstance(state.time, tuple):
