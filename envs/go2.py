@@ -29,9 +29,9 @@ ACTION_SCALE = 0.5  # rad of joint target at action 1
 _FX = np.array([1.0, 1.0, -1.0, -1.0])
 _SY = np.array([1.0, -1.0, 1.0, -1.0])
 _UPPER = 0.213  # m, thigh and calf alike
-_FOOT = 0.022  # m, radius
-_SWING = 0.08  # m, height of a swinging foot
-_TOUCH = 0.004  # m above the floor within which a foot counts as touching
+FOOT = 0.022  # m, radius
+SWING = 0.08  # m, height of a swinging foot
+TOUCH = 0.004  # m above the floor within which a foot counts as touching
 
 _CLASSES = {
     f"{joint}_{gain}": f"actuator.*_{joint}.{gain}"
@@ -48,6 +48,8 @@ PARAMETERS = {
     "full": {**_EACH, **_BASE},
 }
 
+REWARDS = ("gait", "command")
+
 
 @dataclass(frozen=True)
 class Commands:
@@ -61,6 +63,24 @@ class Commands:
     """Rate about z [rad/s]."""
     still: float = 0.1
     """Share of episodes without any command to move."""
+
+
+def forward_only(text: str) -> Commands:
+    """Commands to walk forward at speeds ``LOW:HIGH`` [m/s], nothing else.
+
+    Raises:
+        UserError: no such text.
+    """
+    try:
+        low, high = (float(x) for x in text.split(":"))
+    except ValueError:
+        low, high = 1.0, 0.0
+    if not -5.0 <= low <= high <= 5.0:
+        raise UserError(
+            f'forward is "{text}": write LOW:HIGH, two speeds in m/s from -5 to 5'
+        )
+    none = (0.0, 0.0)
+    return Commands(forward=(low, high), sideways=none, turn=none, still=0.0)
 
 
 # Corner and free speed [rad/s], torque driving and braking [N m] of the hip and thigh
@@ -133,6 +153,8 @@ class Go2(Robot):
         commands: Commands | None = None,
         episode_length: int = 200,
         torque_speed: bool = False,
+        rewarded: str = "gait",
+        forward: str = "",
     ) -> None:
         """Builds the robot.
 
@@ -143,17 +165,27 @@ class Go2(Robot):
             commands: what it is asked to do.
             episode_length: control steps.
             torque_speed: let the motors' torque fall with speed, as `MOTOR` says.
+            rewarded: "gait": the command is followed, by a gait as it should be;
+                "command": the command is followed, and nothing else counts (for
+                imitation, which learns its gait from demonstrations).
+            forward: "LOW:HIGH": only forward, at these speeds [m/s]; in place of
+                ``commands``.
 
         Raises:
-            UserError: unknown set of parameters.
+            UserError: unknown set of parameters or reward, or no two speeds.
         """
-        if parameters not in PARAMETERS:
-            raise UserError(
-                f'unknown parameters "{parameters}" (known: {", ".join(PARAMETERS)})'
-                f"{nearest(parameters, PARAMETERS)}"
-            )
+        for what, given, known in (
+            ("parameters", parameters, PARAMETERS),
+            ("rewarded", rewarded, REWARDS),
+        ):
+            if given not in known:
+                raise UserError(
+                    f'unknown {what} "{given}" (known: {", ".join(known)})'
+                    f"{nearest(given, known)}"
+                )
         super().__init__(PARAMETERS[parameters])
-        self.commands = commands or Commands()
+        self.commands = forward_only(forward) if forward else commands or Commands()
+        self.rewarded = rewarded
         self.episode_length = episode_length
         m = self.mj_model
         self._stand = m.key_qpos[0].copy()
@@ -222,13 +254,9 @@ class Go2(Robot):
         physics = self.advance_physics(model, state, action)
         before: Memory = state.memory
         feet = feet_in_world(physics.qpos)
-        touching = feet[:, 2] < _FOOT + _TOUCH
-        memory = Memory(
-            command=before.command,
-            last=action,
-            feet=feet,
-            air=jnp.where(touching, 0.0, before.air + self.dt),
-        )
+        touching = feet[:, 2] < FOOT + TOUCH
+        air = jnp.where(touching, 0.0, before.air + self.dt)
+        memory = before._replace(last=action, feet=feet, air=air)
         obs = self.observe(physics, memory)
         tipped = matrix(physics.qpos[3:7])[2, 2] < 0.5
         failed = tipped | (physics.qpos[2] < 0.15)
@@ -245,43 +273,86 @@ class Go2(Robot):
         before: Memory,
         touching: jax.Array,
     ) -> jax.Array:
-        """At most 1: tracking of the command, less what spoils a gait; not below 0.
+        """At most 1, not below 0: how well the command is followed, less what spoils
+        a gait where that counts, too."""
+        track = self.tracking(physics, memory.command)
+        if self.rewarded == "command":
+            return jnp.maximum(0.0, track / 1.5)
+        moving = jnp.linalg.norm(memory.command) > 0.1
+        landed = touching & (before.air > 0)
+        airtime = jnp.sum((before.air - 0.1) * landed) * moving
+        shift = jnp.linalg.norm(memory.feet[:, :2] - before.feet[:, :2], axis=1)
+        swing = jnp.abs(memory.feet[:, 2] - FOOT - SWING) * jnp.sqrt(shift / self.dt)
+        cost = (
+            self.unsteadiness(model, physics, memory, before, touching)
+            + 0.5 * jnp.sum(swing * ~touching)
+            + jnp.where(moving, 0.0, 0.5)
+            * jnp.sum(jnp.abs(physics.qpos[7:] - self._pose))
+        )
+        return jnp.maximum(0.0, (track + airtime - cost) / 1.5)
 
-        Half of the tracking is progress along the command, which also pays a robot that
-        does not yet move anywhere near it.
+    def tracking(self, physics: Physics, command: jax.Array) -> jax.Array:
+        """At most 1.5: how well a command is followed.
+
+        Half of the speed's part is progress along the command, which also pays a robot
+        that does not yet move anywhere near it.
         """
-        q, v = physics.qpos, physics.qvel
-        rotation = matrix(q[3:7])
-        speed, rate = rotation.T @ v[:3], v[3:6]
-        command = memory.command
-        moving = jnp.linalg.norm(command) > 0.1
+        v = physics.qvel
+        speed = matrix(physics.qpos[3:7]).T @ v[:3]
         near = jnp.exp(-jnp.sum((command[:2] - speed[:2]) ** 2) / 0.25)
         size2 = jnp.sum(command[:2] ** 2)
         progress = jnp.sum(command[:2] * speed[:2]) / jnp.maximum(size2, 0.01)
         progress = jnp.where(size2 > 0.01, jnp.clip(progress, -1.0, 1.0), near)
-        track = 0.5 * (near + progress)
-        turn = jnp.exp(-((command[2] - rate[2]) ** 2) / 0.25)
+        turn = jnp.exp(-((command[2] - v[5]) ** 2) / 0.25)
+        return 0.5 * (near + progress) + 0.5 * turn
+
+    def unsteadiness(
+        self,
+        model: Model,
+        physics: Physics,
+        memory: Memory,
+        before: Memory,
+        touching: jax.Array,
+    ) -> jax.Array:
+        """What a gait of any kind should have little of: bouncing, rolling, tipping,
+        torque, power, jerks, and feet that slide."""
+        q, v = physics.qpos, physics.qvel
+        rotation = matrix(q[3:7])
         gain = model.mjx.actuator_gainprm[:, 0], model.mjx.actuator_biasprm[:, 2]
         target = self.action_map(None, memory.last)
         torque = gain[0] * (target - q[7:]) + gain[1] * v[6:]
         torque = jnp.clip(torque, -self._limit, self._limit)
         shift = jnp.linalg.norm(memory.feet[:, :2] - before.feet[:, :2], axis=1)
-        foot_speed = shift / self.dt
-        landed = touching & (before.air > 0)
-        swing = jnp.abs(memory.feet[:, 2] - _FOOT - _SWING) * jnp.sqrt(foot_speed)
-        airtime = jnp.sum((before.air - 0.1) * landed) * moving
-        cost = (
-            0.5 * speed[2] ** 2
-            + 0.05 * jnp.sum(rate[:2] ** 2)
+        return (
+            0.5 * (rotation.T @ v[:3])[2] ** 2
+            + 0.05 * jnp.sum(v[3:5] ** 2)
             + 5.0 * jnp.sum(rotation[2, :2] ** 2)
             + 1e-4 * jnp.sum(torque**2)
             + 0.01 * jnp.sum((memory.last - before.last) ** 2)
             + 2e-4 * jnp.sum(jnp.abs(torque * v[6:]))
-            + 0.1 * jnp.sum(foot_speed**2 * touching)
-            + 0.5 * jnp.sum(swing * ~touching)
-            + jnp.where(moving, 0.0, 0.5) * jnp.sum(jnp.abs(q[7:] - self._pose))
+            + 0.1 * jnp.sum((shift / self.dt) ** 2 * touching)
         )
-        return jnp.maximum(0.0, (track + 0.5 * turn + airtime - cost) / 1.5)
+
+    def style(self, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+        """What imitation compares, ``(42,)``: how the robot holds itself and moves, not
+        where it goes.
+
+        Joint angles from the standing pose [rad] and speeds [rad/s], feet in the base's
+        frame [m], height of the base [m], gravity's direction there, and the base's
+        roll and pitch rates [rad/s]. Speed over ground and turning belong to the task:
+        commands that nobody demonstrated are not punished.
+        """
+        rotation = matrix(qpos[3:7])
+        return jnp.concatenate(
+            [
+                qpos[7:] - self._pose,
+                qvel[6:],
+                feet_in_base(qpos[7:]).ravel(),
+                qpos[2:3],
+                -rotation[2],
+                qvel[3:5],
+            ]
+        )
 
 
 def feet_in_base(joints: jax.Array) -> jax.Array:

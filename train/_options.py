@@ -62,7 +62,18 @@ class TrainingOptions:
     env_steps: int | None = None
     """Control steps of each training; the robot's preset where not given."""
     algorithm: str | None = None
-    """sac or ppo; the robot's own where not given."""
+    """sac, ppo, or ess_infogail, which imitates --demonstrations (ess_infogail_paper:
+    as published, defects included); the robot's own where not given."""
+    demonstrations: Path | None = None
+    """Log of motion to imitate, made by train.demonstrate or recorded: a run is an
+    episode, and SKILL:NAME as its name labels it."""
+    labelled: float = 1.0
+    """Share of the labelled steps whose label is used."""
+    skills: int | None = None
+    """Skills that the policy has; not given: as many as there are labels, or one."""
+    skill: str = ""
+    """The label of the skill that the finished policy plays, or its number from 0; the
+    first where not given."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,22 +1,86 @@
 """Building a robot's pipeline from what commands are given."""
 
+from collections.abc import Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from train._effects import Given, robots
 
+_IMITATES = ("demonstrations", "labelled", "skills", "skill")
+
 
 def training_config(
-    env: Any, env_steps: int | None = None, algorithm: str | None = None
+    env: Any,
+    env_steps: int | None = None,
+    algorithm: str | None = None,
+    imitated: Mapping[str, Any] = MappingProxyType({}),
 ) -> Any:
-    """Training settings of a robot, with another budget or algorithm where given."""
+    """Training settings of a robot, with another budget or algorithm where given.
+
+    Args:
+        imitated: `TrainingOptions` of imitation by name, as a command or a run folder
+            has them.
+
+    Raises:
+        UserError: no such algorithm, or options of imitation that do not go with it,
+            with the robot, or with each other.
+    """
     from dataclasses import replace
 
+    from easi_jax.errors import UserError
+    from easi_jax.rl.config import EssInfoGailConfig
     from easi_jax.rl.presets import training_preset
 
     config = training_preset(env, algorithm)
-    return config if env_steps is None else replace(config, env_steps=env_steps)
+    if env_steps is not None:
+        config = replace(config, env_steps=env_steps)
+    path = imitated.get("demonstrations")
+    if not isinstance(config, EssInfoGailConfig):
+        if path is not None:
+            raise UserError(
+                "--demonstrations goes with --algorithm ess_infogail: add it"
+            )
+        return config
+    if path is None:
+        raise UserError(
+            "--algorithm ess_infogail imitates: give --demonstrations FILE (python -m "
+            "train.demonstrate makes them)"
+        )
+    return _imitating(config, env, Path(path), imitated)
+
+
+def _imitating(config: Any, env: Any, path: Path, imitated: Mapping[str, Any]) -> Any:
+    """Settings with demonstrations, their labels and skills."""
+    from dataclasses import replace
+
+    from easi_jax.errors import UserError
+    from easi_jax.rl.demonstrations import read_demonstrations
+
+    given = read_demonstrations(path, env, config.frames).some(_MOST_WINDOWS)
+    skills = imitated.get("skills") or max(1, len(given.skills))
+    share = float(imitated.get("labelled", 1.0))
+    if skills > 1:
+        given = given.labelled(share)
+    name = str(imitated.get("skill") or "0")
+    number = int(name) if name.isdecimal() else given.skill(name)
+    if number >= skills:
+        raise UserError(f"--skill {name}: there are {skills} skills, counted from 0")
+    return replace(config, demonstrations=given, skills=skills, skill=number)
+
+
+# Windows of demonstrations that are kept: 36 MB for a Go2, part of each program.
+_MOST_WINDOWS = 100_000
+
+
+def imitation_of(config: Any) -> dict[str, Any]:
+    """Options of imitation of a command or of a run folder, and none where there are no
+    demonstrations."""
+    get = config.get if isinstance(config, dict) else partial(getattr, config)
+    found = {name: get(name) for name in _IMITATES if get(name) is not None}
+    return found if "demonstrations" in found else {}
 
 
 # Gradient steps of the discriminator in a generation, where the reference's recipe has
@@ -205,7 +269,7 @@ def load_policies(
         given = Given(result.get("effects"))
     env = robots(env_of(folder, result, env_file), given)[0]
     seeds = tuple(result["seeds"])
-    training = training_config(env, result["env_steps"], result.get("algorithm", "sac"))
+    training = acting_config(env, result)
     pipe = Pipeline(env, PipelineConfig(training=training))
     keys = jax.random.split(jax.random.key(0), len(seeds))
     target = jax.eval_shape(
@@ -226,6 +290,51 @@ def load_policies(
         "policies": found.state,
         "given": given,
     }
+
+
+def acting_config(env: Any, result: Mapping[str, Any]) -> Any:
+    """Settings of a training with policies of the form that a run's have; what they
+    imitated is not needed to act."""
+    from dataclasses import replace
+
+    from easi_jax.rl.config import EssInfoGailConfig
+    from easi_jax.rl.presets import training_preset
+
+    config = training_preset(env, result.get("algorithm") or "sac")
+    steps = result["env_steps"]
+    config = config if steps is None else replace(config, env_steps=steps)
+    return config.acting() if isinstance(config, EssInfoGailConfig) else config
+
+
+def check_same_demonstrations(folder: Path, training: Any) -> None:
+    """Refuses demonstrations that are not those that a run of ``folder`` imitated.
+
+    Raises:
+        UserError: they are others.
+    """
+    from easi_jax.errors import UserError
+    from easi_jax.io.files import read_json
+
+    given = getattr(training, "demonstrations", None)
+    if given is None:
+        return
+    theirs = read_json(folder / "results.json").get("demonstrations_sha256")
+    if theirs != digest_of(given):
+        raise UserError(
+            f"{given.source} is not what {folder} imitated: put the file back, or run "
+            "train.udr again"
+        )
+
+
+def digest_of(given: Any) -> str:
+    """SHA-256 of what is imitated."""
+    import hashlib
+
+    import numpy as np
+
+    found = hashlib.sha256(np.ascontiguousarray(given.windows).tobytes())
+    found.update(np.ascontiguousarray(given.labels).tobytes())
+    return found.hexdigest()
 
 
 def read_policies(path: Path) -> dict[str, Any]:
@@ -279,7 +388,10 @@ def load_udr(folder: Path, env_file: Path | None = None) -> dict[str, Any]:
     trained, real = robots(env, given)
     if config.get("fixed"):
         trained = real or trained
-    training = training_config(env, config["env_steps"], config.get("algorithm"))
+    training = training_config(
+        *(env, config["env_steps"], config.get("algorithm"), imitation_of(config))
+    )
+    check_same_demonstrations(folder, training)
     pipe = Pipeline(trained, PipelineConfig(training=training))
     seeds = tuple(int(s) for s in config["seeds"])
     keys = seed_keys(list(seeds))

@@ -54,7 +54,7 @@ class Config(
 
 def run(config: Config) -> None:
     """Compiles, runs and reports."""
-    from train._robots import check_seeds, training_config
+    from train._robots import check_seeds, imitation_of, training_config
 
     check_seeds(config.seeds)
     from easi_jax.io.runs.folder import RunFolder
@@ -65,7 +65,10 @@ def run(config: Config) -> None:
     given = read_given(config)
     env = open_env(config.robot, config.env, config.option)
     training = training_config(
-        robots(env, given)[0], config.env_steps, config.algorithm
+        robots(env, given)[0],
+        config.env_steps,
+        config.algorithm,
+        imitation_of(config),
     )
     setup = ready(config, env, given, training, config.seeds, config.option)
     with RunFolder.open(

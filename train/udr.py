@@ -63,6 +63,7 @@ def run(config: Config) -> None:
     from train._robots import (
         check_chunk,
         check_seeds,
+        imitation_of,
         load_networks,
         save_policies,
         training_config,
@@ -88,7 +89,9 @@ def run(config: Config) -> None:
 
     given = read_given(config)
     env, real = robots(open_env(config.robot, config.env, config.option), given)
-    training = training_config(env, config.env_steps, config.algorithm)
+    training = training_config(
+        *(env, config.env_steps, config.algorithm, imitation_of(config))
+    )
     theta = target_parameters((real or env).space, config.target)
     method = "Fixed" if config.fixed else "UDR"
     settings = PipelineConfig(training=training, eval_episodes=config.eval_episodes)
@@ -163,7 +166,10 @@ def _trained(
 def _settings(config: Config, method: str, robot: str, training: Any) -> dict[str, Any]:
     """What ``results.json`` says of how a policy was made."""
     from easi_jax.rl.presets import algorithm_of
+    from train._robots import digest_of
 
+    given = getattr(training, "demonstrations", None)
+    imitated = {} if given is None else {"demonstrations_sha256": digest_of(given)}
     return {
         "robot": robot,
         "env": None if config.env is None else str(config.env),
@@ -172,6 +178,7 @@ def _settings(config: Config, method: str, robot: str, training: Any) -> dict[st
         "env_steps": training.env_steps,
         "algorithm": algorithm_of(training),
         "methods": [method],
+        **imitated,
     }
 
 

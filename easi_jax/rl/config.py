@@ -1,9 +1,10 @@
-"""Settings of SAC (defaults: EASI's reference on Cartpole) and of PPO."""
+"""Settings of SAC (defaults: EASI's reference on Cartpole), PPO and Ess-InfoGAIL."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from easi_jax.errors import UserError
+from easi_jax.rl.demonstrations import Demonstrations
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,14 @@ class PpoConfig:
     entropy_cost: float = 1e-3
     """Weight of the entropy."""
 
+    value_cost: float = 0.5
+    """Weight of the value's squared error, halved, beside the policy's loss."""
+
+    target_kl: float = 0.0
+    """Divergence of an update that the learning rate is steered to: 1.5 times slower
+    beyond twice as much, 1.5 times faster below half, within 1e-5 and 1e-2; 0: the
+    learning rate is as above."""
+
     reward_scaling: float = 1.0
     """Factor on rewards inside the losses; reported returns are unscaled."""
 
@@ -163,7 +172,7 @@ class PpoConfig:
                 *("env_steps", "num_envs", "unroll", "minibatches"),
                 *("epochs", "eval_envs"),
             ),
-            none_or_more=("evaluate_every", "entropy_cost"),
+            none_or_more=("evaluate_every", "entropy_cost", "value_cost", "target_kl"),
             positive=("learning_rate", "learning_rate_decay", "max_gradient"),
             shares=("discount", "gae_lambda", "clipping"),
         )
@@ -180,6 +189,202 @@ class PpoConfig:
     def steps_per_iteration(self) -> int:
         """Environment steps of one of them."""
         return self.num_envs * self.unroll
+
+
+@dataclass(frozen=True)
+class EssInfoGailConfig(PpoConfig):
+    """Ess-InfoGAIL on PPO. Raises UserError for values that cannot work.
+
+    The authors' later form (conditional entropy alone, prior as a running mean of the
+    posterior), its defects mended; `PaperEssInfoGailConfig` is as published. Each
+    defect has its own switch.
+    """
+
+    demonstrations: Demonstrations | None = field(default=None, repr=False)
+    """What is imitated."""
+
+    skills: int = 1
+    """Categories that the policy is given one of for an episode."""
+
+    skill: int = 0
+    """The one that a finished policy plays."""
+
+    continuous: bool = False
+    """A continuous code, uniform in -1 and 1, is given to the policy, too."""
+
+    frames: int = 2
+    """What the discriminator sees: 2: how the robot holds itself and moves before and
+    after a step; 1: before it, and the command that was sent."""
+
+    judge_hidden: tuple[int, ...] = (100, 100)
+    """Hidden layer sizes of the discriminator and its other heads, tanh."""
+
+    judge_updates: int = 10
+    """Gradient updates of it after each unroll."""
+
+    judge_batch: int = 1024
+    """Demonstrated, and as many simulated, windows of such an update."""
+
+    judge_learning_rate: float = 3e-4
+    """Of Adam, for discriminator and posterior."""
+
+    judge_decay: float = 1e-3
+    """Decoupled weight decay beside it."""
+
+    real_cost: float = 10.0
+    """Weight of the two cross entropies of the discriminator."""
+
+    code_cost: float = 1.0
+    """Weight of the continuous code's error."""
+
+    code_error: str = "squared"
+    """Its form: squared or absolute."""
+
+    gradient_penalty: float = 0.1
+    """Weight of the discriminator's squared slope at demonstrations."""
+
+    logit_cost: float = 0.25
+    """Weight of the squared weights of its last layer."""
+
+    weight_cost: float = 5e-4
+    """Weight of all squared weights."""
+
+    label_cost: float = 4.0
+    """Weight of the cross entropy of labelled demonstrations."""
+
+    conditional_cost: float = 2.0
+    """Weight of the skills' entropy given a window, of those without a label: every
+    window is of one skill."""
+
+    marginal_cost: float = 0.0
+    """Weight of the entropy of their mean, which is driven up."""
+
+    prior_cost: float = 0.0
+    """Weight of the cross entropy between their mean and the prior."""
+
+    ramp_start: int = 20
+    """Unrolls before the last three act; they then grow linearly to their weights at
+    the training's end."""
+
+    prior: str = "mean"
+    """How the prior over skills is found: mean (running, of the posterior on
+    demonstrations), gradient (of PPO's loss through the skill that was given) or fixed
+    (all alike)."""
+
+    prior_rate: float = 1e-3
+    """Share of the running mean that is new at an update, or Adam's learning rate."""
+
+    temperature: float = 0.1
+    """Of the relaxed skill (Gumbel-softmax) that the policy is given."""
+
+    style_reward: float = 1.0
+    """Weight of the discriminator's reward."""
+
+    code_reward: float = 0.2
+    """Weight of the continuous code that can be read off, by the error's negative."""
+
+    skill_reward: float = 0.2
+    """Weight of the skill that can be read off, by its log probability."""
+
+    task_reward: float = 0.01
+    """Weight of the environment's own reward."""
+
+    style_form: str = "score"
+    """Of the discriminator's reward at its logit d: score: d itself, cut to -5 and 5, a
+    task that ends being worth the least of it for good; positive: -log(1 - sigma(d)),
+    which pays a robot for living on."""
+
+    double_softmax: bool = False
+    """A defect: the labels' cross entropy takes probabilities for logits."""
+
+    one_rate: bool = False
+    """A defect: the discriminator takes the policy's learning rate."""
+
+    shared_trunk_twice: bool = False
+    """A defect: the layers that discriminator and posterior share are in the
+    optimizers of both, which take turns; else one optimizer descends both losses."""
+
+    def __post_init__(self) -> None:
+        """Raises UserError for values that cannot work."""
+        super().__post_init__()
+        costs = ("real", "code", "logit", "weight", "label", "conditional", "prior")
+        _check(
+            self,
+            "Ess-InfoGAIL",
+            counts=("skills", "judge_batch"),
+            none_or_more=(
+                "skill",
+                *(f"{name}_cost" for name in costs),
+                *("marginal_cost", "gradient_penalty", "judge_updates", "judge_decay"),
+                *("ramp_start", "prior_rate"),
+                *("style_reward", "code_reward", "skill_reward", "task_reward"),
+            ),
+            positive=("judge_learning_rate", "temperature"),
+            shares=(),
+        )
+        if self.skill >= self.skills:
+            need = f"counts from 0, and there are skills={self.skills}"
+            _refuse(self, "Ess-InfoGAIL", "skill", need)
+        for name, known in _CHOICES.items():
+            if getattr(self, name) not in known:
+                _refuse(
+                    self,
+                    "Ess-InfoGAIL",
+                    name,
+                    f"is one of {', '.join(map(str, known))}",
+                )
+
+    @property
+    def codes(self) -> int:
+        """Numbers that the policy is given beside the observation."""
+        return int(self.continuous) + (self.skills if self.skills > 1 else 0)
+
+    def acting(self) -> PpoConfig:
+        """PPO whose policies have the same form: a skill is built into these."""
+        return PpoConfig(env_steps=self.env_steps, hidden=self.hidden)
+
+
+@dataclass(frozen=True)
+class PaperEssInfoGailConfig(EssInfoGailConfig):
+    """Ess-InfoGAIL as published, its code's defects included.
+
+    Facts of the authors' public code. What still differs: the policy's network is
+    brax's (ReLU, a spread that depends on the observation), and many environments
+    unroll in place of one.
+    """
+
+    frames: int = 1
+    continuous: bool = True
+    epochs: int = 20
+    minibatches: int = 1
+    learning_rate: float = 3e-3
+    target_kl: float = 0.01
+    entropy_cost: float = 0.0
+    value_cost: float = 2.5  # 5, halved, beside a policy's loss that counts 4 times
+    judge_updates: int = 50
+    judge_batch: int = 1000
+    judge_learning_rate: float = 5e-3
+    code_error: str = "absolute"
+    conditional_cost: float = 3.0
+    marginal_cost: float = 0.05
+    prior_cost: float = 0.5
+    prior: str = "gradient"
+    prior_rate: float = 3e-3
+    style_form: str = "positive"
+    code_reward: float = 0.1
+    skill_reward: float = 0.1
+    task_reward: float = 0.005
+    double_softmax: bool = True
+    one_rate: bool = True
+    shared_trunk_twice: bool = True
+
+
+_CHOICES: dict[str, tuple[Any, ...]] = {
+    "frames": (1, 2),
+    "code_error": ("squared", "absolute"),
+    "prior": ("mean", "gradient", "fixed"),
+    "style_form": ("score", "positive"),
+}
 
 
 def _check(

@@ -35,12 +35,14 @@ def make_networks(
     action_size: int,
     hidden: tuple[int, ...],
     critic_layer_norm: bool = False,
+    scaled: Any = standardize,
 ) -> sac_networks.SACNetworks:
-    """Tanh-normal policy and twin critics, ReLU, observations standardized."""
+    """Tanh-normal policy and twin critics, ReLU; they take what ``scaled`` makes of
+    observations and their statistics, as `standardize` does."""
     return sac_networks.make_sac_networks(
         obs_size,
         action_size,
-        preprocess_observations_fn=standardize,
+        preprocess_observations_fn=scaled,
         hidden_layer_sizes=hidden,
         q_network_layer_norm=critic_layer_norm,
         # brax hands its keyword dict over as the first argument.

@@ -10,7 +10,7 @@ in the losses.
 import copy
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
@@ -74,22 +74,25 @@ class Ppo:
         self._episodes = Episodes(
             env, bind, draw, config.num_envs, config.eval_envs, tested=tested
         )
-        actor = make_networks(env.obs_size, env.action_size, config.hidden)
+        actor = make_networks(
+            env.obs_size, env.action_size, config.hidden, scaled=self._scaled
+        )
         build: Any = PPONetworks
         self._networks = build(
             policy_network=actor.policy_network,
             value_network=networks.make_value_network(
                 env.obs_size,
-                preprocess_observations_fn=standardize,
+                preprocess_observations_fn=self._scaled,
                 hidden_layer_sizes=config.hidden,
                 activation=linen.relu,
             ),
             parametric_action_distribution=actor.parametric_action_distribution,
         )
-        self._optimizer = optax.chain(
-            optax.clip_by_global_norm(config.max_gradient),
-            optax.flatten(optax.adam(_learning_rate(config))),
-        )
+        self._optimizer = _optimizer(config)
+
+    def _scaled(self, observation: Any, preprocessor_params: Any) -> Any:
+        """Inputs as the networks take them."""
+        return standardize(observation, preprocessor_params)
 
     def over(self, mesh: Mesh) -> "Ppo":
         """The same training with its environments split over the devices of a mesh."""
@@ -147,12 +150,9 @@ class Ppo:
         key, k_unroll, k_learn, k_eval = jax.random.split(
             jax.random.wrap_key_data(state.key), 4
         )
-        (envs, theta, returns), (rows, told) = jax.lax.scan(
-            lambda carry, k: self._move(state, dist, carry, k),
-            (state.envs, state.theta, state.returns),
-            jax.random.split(k_unroll, config.unroll),
-        )
-        state = replace(state, envs=envs, theta=theta, returns=returns)
+        state, rows, told = self._unroll(state, dist, k_unroll)
+        k_judge = jax.random.fold_in(k_learn, 0)
+        state, rows, more = self._judged(state, rows, k_judge)
         ended, usable = told["ended"], told["usable"]
         beyond = self.values(state, rows.next_observation)
         bonus = config.discount / config.reward_scaling * beyond
@@ -167,7 +167,7 @@ class Ppo:
         state = replace(
             state, key=jax.random.key_data(key), iteration=state.iteration + 1
         )
-        info |= {
+        info |= more | {
             "episodes": ended.sum(),
             "return": mean_where(ended, told["returns"]),
             "nonfinite": (~usable).sum(),
@@ -201,6 +201,32 @@ class Ppo:
         """The state with other counters."""
         return replace(state, iteration=clock[0])
 
+    def _unroll(
+        self, state: PpoState, dist: Any, key: jax.Array
+    ) -> tuple[PpoState, types.Transition, Info]:
+        """``config.unroll`` control steps; rows ``(unroll, num_envs, ...)``."""
+        (envs, theta, returns), (rows, told) = jax.lax.scan(
+            lambda carry, k: self._move(state, dist, carry, k),
+            (state.envs, state.theta, state.returns),
+            jax.random.split(key, self.config.unroll),
+        )
+        state = replace(state, envs=envs, theta=theta, returns=returns)
+        return state, rows, told
+
+    def _judged(
+        self, state: PpoState, rows: types.Transition, key: jax.Array
+    ) -> tuple[PpoState, types.Transition, Info]:
+        """Rows with the rewards that are learned from, and scalars to tell."""
+        del key
+        return state, rows, {}
+
+    def _noted(
+        self, envs: EnvState, new: EnvState, theta: Any, action: jax.Array
+    ) -> Any:
+        """What `_judged` needs of a step of all environments; leaves ``(n, ...)``."""
+        del envs, new, theta, action
+        return ()
+
     def _move(self, state: PpoState, dist: Any, carry: Any, key: jax.Array) -> Any:
         k_reset, k_act = jax.random.split(key)
         envs, theta, returns = carry
@@ -225,6 +251,7 @@ class Ppo:
                 "log_prob": actions.log_prob(logits, raw),
                 "distribution_params": logits,
             },
+            "noted": self._noted(envs, new, theta, actions.postprocess(raw)),
         }
         row = types.Transition(
             observation=obs,
@@ -258,13 +285,16 @@ class Ppo:
                 reward_scaling=c.reward_scaling,
                 gae_lambda=c.gae_lambda,
                 clipping_epsilon=c.clipping,
+                vf_coefficient=c.value_cost,
             )
 
         def update(carry: Any, item: Any) -> tuple[Any, Info]:
             params, optimizer = carry
             batch, k = item
             grads, told = jax.grad(loss, has_aux=True)(params, batch, k)
-            change, optimizer = self._optimizer.update(grads, optimizer)
+            change, optimizer = self._optimizer.update(
+                grads, optimizer, params, kl=told["kl_mean"]
+            )
             new = optax.apply_updates(params, change)
             info = {
                 "policy_loss": told["policy_loss"],
@@ -288,6 +318,44 @@ class Ppo:
         )
         state = replace(state, params=params, optimizer=optimizer)
         return state, jax.tree.map(jnp.mean, info)
+
+
+def _optimizer(config: PpoConfig) -> optax.GradientTransformationExtraArgs:
+    cut = optax.clip_by_global_norm(config.max_gradient)
+    if config.target_kl:
+        adam = optax.flatten(optax.scale_by_adam())
+        return optax.chain(cut, adam, _steered(config.learning_rate, config.target_kl))
+    adam = optax.flatten(optax.adam(_learning_rate(config)))
+    return optax.with_extra_args_support(optax.chain(cut, adam))
+
+
+# Slowest and fastest learning rate that is steered to, and the factor of one step.
+_SLOWEST, _FASTEST, _STEER = 1e-5, 1e-2, 1.5
+
+
+class Steered(NamedTuple):
+    """State of a learning rate that follows a divergence."""
+
+    rate: jax.Array
+
+
+def _steered(rate: float, target: float) -> optax.GradientTransformationExtraArgs:
+    """Steps at a rate that keeps the divergence of an update near ``target``."""
+
+    def init(params: Any) -> Steered:
+        del params
+        return Steered(jnp.asarray(rate))
+
+    def update(updates: Any, state: Any, params: Any = None, **more: Any) -> Any:
+        del params
+        kl, now = more["kl"], state.rate
+        slower = jnp.maximum(now / _STEER, _SLOWEST)
+        faster = jnp.minimum(now * _STEER, _FASTEST)
+        now = jnp.where(kl > 2 * target, slower, now)
+        now = jnp.where((kl < target / 2) & (kl > 0), faster, now)
+        return jax.tree.map(lambda g: -now * g, updates), Steered(now)
+
+    return optax.GradientTransformationExtraArgs(init, update)
 
 
 def _learning_rate(config: PpoConfig) -> optax.ScalarOrSchedule:

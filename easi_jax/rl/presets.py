@@ -7,7 +7,12 @@ from dataclasses import replace
 from typing import Any
 
 from easi_jax.errors import UserError, nearest
-from easi_jax.rl.config import PpoConfig, SacConfig
+from easi_jax.rl.config import (
+    EssInfoGailConfig,
+    PaperEssInfoGailConfig,
+    PpoConfig,
+    SacConfig,
+)
 from easi_jax.rl.trainer import TrainingConfig
 
 _SAC = SacConfig(
@@ -37,6 +42,18 @@ _PPO = PpoConfig(
     evaluate_every=20,
 )
 
+_IMITATION: dict[str, TrainingConfig] = {
+    "ess_infogail": EssInfoGailConfig(
+        env_steps=4_000_000,
+        learning_rate_decay=0.1,
+        evaluate_every=20,
+        style_reward=0.3,
+        task_reward=1.0,
+    ),
+    "ess_infogail_paper": PaperEssInfoGailConfig(
+        env_steps=4_000_000, evaluate_every=20
+    ),
+}
 _GENERAL: dict[str, TrainingConfig] = {"sac": _SAC, "ppo": _PPO}
 PRESETS: dict[str, dict[str, TrainingConfig]] = {
     "cartpole": _GENERAL,
@@ -71,7 +88,8 @@ def training_preset(env: Any, algorithm: str | None = None) -> TrainingConfig:
     Raises:
         UserError: no algorithm of that name.
     """
-    mine = getattr(env, "training", None) or PRESETS.get(env.name, _GENERAL)
+    own = getattr(env, "training", None) or PRESETS.get(env.name, _GENERAL)
+    mine = {**own, **{k: v for k, v in _IMITATION.items() if k not in own}}
     if algorithm is None:
         return next(iter(mine.values()))
     if algorithm not in mine:
@@ -84,4 +102,12 @@ def training_preset(env: Any, algorithm: str | None = None) -> TrainingConfig:
 
 def algorithm_of(config: TrainingConfig) -> str:
     """The name under which presets know an algorithm."""
-    return "ppo" if isinstance(config, PpoConfig) else "sac"
+    return _NAMES[type(config)]
+
+
+_NAMES: dict[type[TrainingConfig], str] = {
+    SacConfig: "sac",
+    PpoConfig: "ppo",
+    EssInfoGailConfig: "ess_infogail",
+    PaperEssInfoGailConfig: "ess_infogail_paper",
+}

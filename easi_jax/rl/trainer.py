@@ -1,4 +1,4 @@
-"""What a training algorithm offers: the same door for SAC and PPO."""
+"""What a training algorithm offers: the same door for SAC, PPO and Ess-InfoGAIL."""
 
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -6,8 +6,9 @@ from typing import Any, Protocol
 import jax
 from jax.sharding import Mesh
 
-from easi_jax.rl.config import PpoConfig, SacConfig
+from easi_jax.rl.config import EssInfoGailConfig, PpoConfig, SacConfig
 from easi_jax.rl.episodes import Tested
+from easi_jax.rl.ess_infogail import EssInfoGail
 from easi_jax.rl.learner import Info
 from easi_jax.rl.networks import PolicyParams
 from easi_jax.rl.ppo import Ppo
@@ -55,7 +56,13 @@ def make_trainer(
     draw: Callable[[Any, jax.Array], Any],
     tested: Tested | None = None,
 ) -> Trainer:
-    """The algorithm that ``config`` is of; arguments as for `Sac`."""
+    """The algorithm that ``config`` is of; arguments as for `Sac`.
+
+    Raises:
+        UserError: imitation without demonstrations, or of other skills than it has.
+    """
+    if isinstance(config, EssInfoGailConfig):
+        return EssInfoGail(env, config, bind, draw, tested)
     if isinstance(config, PpoConfig):
         return Ppo(env, config, bind, draw, tested)
     return Sac(env, config, bind, draw, tested)

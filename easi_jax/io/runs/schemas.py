@@ -15,6 +15,10 @@ TRAINED = {
     "env_steps?": int,
     "seeds": [int],
     "algorithm?": str,
+    "demonstrations?": str,
+    "labelled?": float,
+    "skills?": int,
+    "skill?": str,
     "effects?": {},
     "target_effects?": {},
 }
