@@ -35,6 +35,9 @@ LEFT_OUT = ("nothing", "labels", "learned prior", "information terms")
 ENV_STEPS = 1_000_000
 
 
+Episode = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
 class Point(NamedTuple):
     """Position [m] and last displacement [m], ``(2,)`` each."""
 
@@ -88,11 +91,16 @@ class Circles:
         return jnp.concatenate([qpos, qvel / _STEP])
 
 
-def circle(radius: float, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+def circle(radius: float, rng: np.random.Generator | None) -> Episode:
     """Positions, displacements and actions of a demonstration, ``(STEPS, 2)`` each: a
-    circle through the origin, to the left, with noise that is steered against."""
+    circle through the origin, to the left, with noise that is steered against; without
+    any where ``rng`` is None."""
+
+    def noise() -> np.ndarray:
+        return np.zeros(2) if rng is None else rng.standard_normal(2)
+
     center = np.array([0.0, radius])
-    at, last = 0.01 * rng.standard_normal(2), np.zeros(2)
+    at, last = 0.01 * noise(), np.zeros(2)
     rows = []
     for _ in range(STEPS):
         out = (at - center) / max(float(np.linalg.norm(at - center)), 1e-6)
@@ -100,14 +108,17 @@ def circle(radius: float, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
         # Chords lie inside: what a step of this length along the tangent adds.
         off = np.linalg.norm(at - center + _PACE * _STEP * along) - radius
         action = _PACE * along - off / _STEP * out
-        action = np.clip(action + _NOISE * rng.standard_normal(2), -1.0, 1.0)
+        action = np.clip(action + _NOISE * noise(), -1.0, 1.0)
         rows.append((at, last, action))
         last = _STEP * action
         at = at + last
-    return tuple(np.array(x) for x in zip(*rows, strict=True))
+    qpos, qvel, ctrl = (np.array(x) for x in zip(*rows, strict=True))
+    return qpos, qvel, ctrl
 
 
-def demonstrations(seed: int, shares: tuple[float, ...] = SHARES, frames: int = 1):
+def demonstrations(
+    seed: int, shares: tuple[float, ...] = SHARES, frames: int = 1
+) -> Any:
     """`Demonstrations` of all radii, ``shares`` of `EPISODES` each."""
     from easi_jax.rl.demonstrations import demonstrations_of
 
@@ -216,21 +227,28 @@ def solve(cell: Cell, env_steps: int = ENV_STEPS) -> dict[str, Any]:
     confusion = measures.confusion_of(classifier, episodes, skills, len(RADII))
     prior = np.asarray(trainer.prior(state), float)
     true = np.array(SHARES) / sum(SHARES)
-    off = [
-        abs(np.linalg.norm(e[len(e) // 4 :, :2] - [0.0, RADII[k]], axis=1) - RADII[k])
-        for e, k in zip(episodes, skills, strict=True)
-    ]
     return {
         "nmi": measures.mutual_information(confusion),
         "ent": measures.skill_entropy(confusion),
         "confusion": confusion.tolist(),
         "prior": measures.prior_distance(prior, true, cell.left_out != "labels"),
         "found_prior": prior.tolist(),
-        "off_circle": float(np.mean(np.concatenate(off))),
+        "off_path": off_path(episodes, [RADII[k] for k in skills]),
         "classifier_right": right,
         "judge_right": float(np.asarray(info["judge_right"])[-20:].mean()),
         "seconds": time.monotonic() - begun,
     }
+
+
+def off_path(episodes: list[np.ndarray], radii: list[float]) -> float:
+    """Mean distance [m] of episodes, windows ``(T, features)``, from the place that a
+    demonstration without noise of their radius has at the same time."""
+    paths = {r: circle(r, None)[0] for r in set(radii)}
+    off = [
+        np.linalg.norm(e[:, :2] - paths[r][: len(e)], axis=1)
+        for e, r in zip(episodes, radii, strict=True)
+    ]
+    return float(np.mean(np.concatenate(off)))
 
 
 def judge_of_circles(seed: int) -> tuple[Any, float]:
@@ -267,8 +285,9 @@ def played(
             row = env.style(*state.physics), action
             return env.step(None, state, action), row
 
-        rows = jax.lax.scan(step, env.reset(None, key), length=STEPS)[1]
-        return windows_of(*rows, 1)
+        first = env.reset(None, key)
+        motion, actions = jax.lax.scan(step, first, length=STEPS)[1]
+        return windows_of(motion, actions, 1)
 
     episodes, given = [], []
     for skill in range(skills):

@@ -147,9 +147,7 @@ def commanded(env: Any, forward: Any) -> Callable[[jax.Array], EnvState]:
 
     def one(key: jax.Array, command: jax.Array) -> EnvState:
         state = env.reset(env.model(), key)
-        memory = state.memory._replace(command=jnp.array([1.0, 0, 0]) * command)
-        obs = env.observe(state.physics, memory)
-        return replace(state, memory=memory, obs=obs)
+        return env.begun(state, jnp.array([1.0, 0.0, 0.0]) * command)
 
     return lambda keys: jax.vmap(one)(keys, jnp.asarray(forward, jnp.float32))
 

@@ -6,8 +6,8 @@ robot figures are the maker's. Reward terms are the usual ones of legged locomot
 """
 
 import itertools
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -219,6 +219,12 @@ class Go2(Robot):
         )
         return start(physics, self.observe(physics, memory), memory)
 
+    def begun(self, state: EnvState, command: jax.Array) -> EnvState:
+        """The first state of an episode with another command ``(3,)``."""
+        memory = state.memory._replace(command=command)
+        obs = self.observe(state.physics, memory)
+        return replace(state, memory=memory, obs=obs)
+
     def draw_command(self, key: jax.Array) -> jax.Array:
         """A command ``(3,)``."""
         c = self.commands
@@ -376,3 +382,19 @@ def feet_in_base(joints: jax.Array) -> jax.Array:
 def feet_in_world(qpos: jax.Array) -> jax.Array:
     """Centers of the feet in the world ``(4, 3)`` [m]."""
     return qpos[:3] + feet_in_base(qpos[7:]) @ matrix(qpos[3:7]).T
+
+
+class Commanded:
+    """A Go2 whose episodes all begin with one command to walk forward."""
+
+    def __init__(self, env: Go2, speed: Any) -> None:
+        """``speed``: forward [m/s], ``()``."""
+        self._env, self._speed = env, speed
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._env, name)
+
+    def reset(self, model: Model, key: jax.Array) -> EnvState:
+        """As the robot's own, with the command."""
+        command = jnp.array([1.0, 0.0, 0.0]) * self._speed
+        return self._env.begun(self._env.reset(model, key), command)

@@ -100,12 +100,8 @@ class Go2Expert(Go2):
         """As `Go2.reset`, at any phase of the stride."""
         k_go2, k_phase = jax.random.split(key)
         state = super().reset(model, k_go2)
-        memory = Clocked(*state.memory[:4], phase=jax.random.uniform(k_phase))
-        return self._seen(state, memory)
-
-    def begun(self, state: EnvState, command: jax.Array) -> EnvState:
-        """The first state of an episode with another command."""
-        return self._seen(state, state.memory._replace(command=command))
+        memory = Clocked(*state.memory, phase=jax.random.uniform(k_phase))
+        return self.begun(replace(state, memory=memory), memory.command)
 
     def step(self, model: Model, state: EnvState, action: jax.Array) -> EnvState:
         """As `Go2.step`; the clock goes on."""
@@ -150,6 +146,3 @@ class Go2Expert(Go2):
         track = self.tracking(physics, memory.command)
         total = track + gait - cost - 0.05 * slip - 1.0 * hips
         return jnp.maximum(0.0, total / 3.2)
-
-    def _seen(self, state: EnvState, memory: Any) -> EnvState:
-        return replace(state, memory=memory, obs=self.observe(state.physics, memory))

@@ -406,6 +406,7 @@ def load_udr(folder: Path, env_file: Path | None = None) -> dict[str, Any]:
         "env": env,
         "seeds": seeds,
         "training": training,
+        "trainer": pipe.trainer,
         "states": found.state,
         "policies": pipe.policies(found.state),
         "given": given,

@@ -38,6 +38,9 @@ class Config(RunOptions, EngineOptions):
     """Speeds forward [m/s]."""
     episodes: int = 100
     """Episodes of 4 s for each gait and speed; of a policy, in all."""
+    shares: tuple[float, ...] = ()
+    """Share of these episodes that each gait has (as real recordings have more of one
+    than of another); all of them where not given."""
     noise: float = 0.1
     """Standard deviation of the noise on actions (of a range from -1 to 1)."""
     env_steps: int = 5_000_000
@@ -108,6 +111,11 @@ def _check(config: Config) -> None:
         raise UserError(f"--speeds {config.speeds}: give speeds above 0, at most 3 m/s")
     if config.episodes < 2:
         raise UserError(f"--episodes is {config.episodes}: give at least 2")
+    if config.shares and (
+        len(config.shares) != len(config.gaits)
+        or not all(0 < x <= 1 for x in config.shares)
+    ):
+        raise UserError("--shares: give one of each gait, above 0 and at most 1")
     if not 0 <= config.noise <= 1:
         raise UserError(f"--noise is {config.noise}: give a number from 0 to 1")
     if config.env_steps < 1:
@@ -141,7 +149,10 @@ def _gait(folder: "RunFolder", config: Config, gait: str) -> "list[Run]":
     high = max(config.speeds) + _TRAINED_BEYOND
     env = Go2Expert(gait, forward_only(f"{low}:{high}"))
     policy = jax.tree.map(lambda x: x[0], _trained(folder, config, gait, env))
-    runs = _recorded(config, env, policy, config.speeds, config.episodes, gait)
+    shares = config.shares or (1.0,) * len(config.gaits)
+    share = shares[config.gaits.index(gait)]
+    episodes = max(1, round(share * config.episodes))
+    runs = _recorded(config, env, policy, config.speeds, episodes, gait)
     if not runs:
         raise UserError(
             f"the expert's {gait} falls at every speed: train it for longer "
@@ -179,22 +190,6 @@ def _trained(folder: "RunFolder", config: Config, gait: str, env: Any) -> Any:
     return pipe.policies(states)
 
 
-class _Commanded:
-    """A Go2 whose episodes begin with one command."""
-
-    def __init__(self, env: Any, speed: Any) -> None:
-        self._env, self._speed = env, speed
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._env, name)
-
-    def reset(self, model: Any, key: Any) -> Any:
-        import jax.numpy as jnp
-
-        command = jnp.array([1.0, 0.0, 0.0]) * self._speed
-        return self._env.begun(self._env.reset(model, key), command)
-
-
 def _recorded(
     config: Config, env: Any, policy: Any, speeds: Any, episodes: int, label: str
 ) -> "list[Run]":
@@ -213,6 +208,7 @@ def _recorded(
     from easi_jax.rl.demonstrations import LABELLED
     from easi_jax.rl.networks import act
     from easi_jax.simulation.rollout import policy_rollout
+    from envs.go2 import Commanded
 
     def noisy(obs: Any, key: Any) -> Any:
         mode = act(policy, obs, deterministic=True)
@@ -221,7 +217,7 @@ def _recorded(
         )
 
     def episode(key: Any, speed: Any) -> Any:
-        own = env if speed is None else _Commanded(env, speed)
+        own = env if speed is None else Commanded(env, speed)
         return policy_rollout(own, model, noisy, key, env.episode_length)
 
     model, found = env.model(), []

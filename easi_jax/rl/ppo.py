@@ -324,7 +324,7 @@ def _optimizer(config: PpoConfig) -> optax.GradientTransformationExtraArgs:
     cut = optax.clip_by_global_norm(config.max_gradient)
     if config.target_kl:
         adam = optax.flatten(optax.scale_by_adam())
-        return optax.chain(cut, adam, _steered(config.learning_rate, config.target_kl))
+        return optax.chain(cut, adam, steered(config.learning_rate, config.target_kl))
     adam = optax.flatten(optax.adam(_learning_rate(config)))
     return optax.with_extra_args_support(optax.chain(cut, adam))
 
@@ -339,7 +339,7 @@ class Steered(NamedTuple):
     rate: jax.Array
 
 
-def _steered(rate: float, target: float) -> optax.GradientTransformationExtraArgs:
+def steered(rate: float, target: float) -> optax.GradientTransformationExtraArgs:
     """Steps at a rate that keeps the divergence of an update near ``target``."""
 
     def init(params: Any) -> Steered:

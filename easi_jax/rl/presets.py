@@ -42,17 +42,23 @@ _PPO = PpoConfig(
     evaluate_every=20,
 )
 
+# Imitation of a machine with a task: style and task count alike, and the discriminator
+# is so smooth that it does not win before the policy has learned to stand (Go2: with a
+# gradient penalty of 0.1, the authors', it tells 99 % right after 300,000 steps and the
+# policy is paid nothing).
+_ESS = EssInfoGailConfig(
+    env_steps=4_000_000,
+    learning_rate_decay=0.1,
+    evaluate_every=20,
+    gradient_penalty=20.0,
+    style_reward=0.5,
+    task_reward=1.0,
+    reward_scaling=0.3,
+)
+_PAPER_ESS = PaperEssInfoGailConfig(env_steps=4_000_000, evaluate_every=20)
 _IMITATION: dict[str, TrainingConfig] = {
-    "ess_infogail": EssInfoGailConfig(
-        env_steps=4_000_000,
-        learning_rate_decay=0.1,
-        evaluate_every=20,
-        style_reward=0.3,
-        task_reward=1.0,
-    ),
-    "ess_infogail_paper": PaperEssInfoGailConfig(
-        env_steps=4_000_000, evaluate_every=20
-    ),
+    "ess_infogail": _ESS,
+    "ess_infogail_paper": _PAPER_ESS,
 }
 _GENERAL: dict[str, TrainingConfig] = {"sac": _SAC, "ppo": _PPO}
 PRESETS: dict[str, dict[str, TrainingConfig]] = {
@@ -75,6 +81,14 @@ PRESETS: dict[str, dict[str, TrainingConfig]] = {
             entropy_cost=5e-3,
         ),
         "sac": replace(_SAC, hidden=(128, 128), env_steps=500_000),
+        "ess_infogail": replace(
+            _ESS,
+            hidden=(128, 128),
+            env_steps=5_000_000,
+            minibatches=8,
+            discount=0.97,
+            entropy_cost=5e-3,
+        ),
     },
 }
 

@@ -1,6 +1,7 @@
 """Go2's clocked expert, its rewards, and the gait that is read off its positions."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -123,7 +124,7 @@ def test_a_reward_for_the_command_alone() -> None:
         ({"forward": "0:nan"}, 'forward is "0:nan"'),
     ],
 )
-def test_options_that_do_not_exist(options: dict[str, str], said: str) -> None:
+def test_options_that_do_not_exist(options: dict[str, Any], said: str) -> None:
     with pytest.raises(UserError, match=said):
         Go2(**options)
     with pytest.raises(UserError, match="unknown gait"):

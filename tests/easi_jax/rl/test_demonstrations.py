@@ -145,9 +145,9 @@ def test_demonstrations_that_cannot_be_imitated(cartpole: Any, tmp_path: Path) -
     with pytest.raises(UserError, match="qpos"):
         read_demonstrations(path, make("ballbalance"))
     (run,) = runs_of(cartpole, ["a"], 30)
-    cycle = [np.tile(x, (20, 1)) for x in (run.qpos, run.qvel, run.ctrl)]
+    q, v, u = (np.tile(x, (20, 1)) for x in (run.qpos, run.qvel, run.ctrl))
     with pytest.raises(UserError, match="repeats a single cycle: 30 different"):
-        demonstrations_of(cartpole, [tuple(cycle)], [-1])
+        demonstrations_of(cartpole, [(q, v, u)], [-1])
     given = demonstrations_of(
         cartpole,
         [(r.qpos, r.qvel, r.ctrl) for r in runs_of(cartpole, ["a"], 300)],
