@@ -281,8 +281,11 @@ def _flat(x: Any) -> Any:
 # -- training ----------------------------------------------------------------
 
 
-def trained(cell: Cell, place: Path, env: Any, found: dict[str, Any]) -> Any:
-    """The policy of a whole training under what was found, in chunks."""
+def trained(
+    cell: Cell, place: Path, env: Any, found: dict[str, Any], training: Any = None
+) -> Any:
+    """The policy of a whole training under what was found, in chunks; ``training`` are
+    its settings, the robot's own where not given."""
     import jax
     import jax.numpy as jnp
 
@@ -293,7 +296,7 @@ def trained(cell: Cell, place: Path, env: Any, found: dict[str, Any]) -> Any:
     from train._robots import search_config, training_chunk, training_config
     from train._stages import jit_chunks, run_stage
 
-    training = quiet(training_config(env, cell.env_steps))
+    training = quiet(training or training_config(env, cell.env_steps))
     search = search_config(_PRESETS[cell.method], cell.settings, cell.robot)
     pipe = Pipeline(env, PipelineConfig(search=search, training=training))
     mean, cov = whole(pipe.space, found)

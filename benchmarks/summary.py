@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import (
+    circles,
     commands,
     compile_times,
     coverage_summary,
@@ -23,6 +24,7 @@ from benchmarks import (
     fresh_clone,
     gap_summary,
     go2_in_air,
+    imitation,
     lines,
     paper_tables,
     parity,
@@ -408,6 +410,8 @@ SECTIONS = (
         go2_in_air.paragraphs,
     ),
     *walking.SECTIONS,
+    *imitation.SECTIONS,
+    *circles.SECTIONS,
     Section(*("## MuJoCo's features", "parity.json", "parity", parity.paragraphs)),
     *commands.SECTIONS,
     Section(

@@ -198,6 +198,7 @@ TINY = {
     "train.easi": _SEARCH,
     "train.pipeline": {**_SEARCH, "--env-steps": "2500"},
     "train.evaluate": {"--episodes": "2"},
+    "train.demonstrate": {"--env-steps": "10240", "--episodes": "20"},
 }
 # Run at a size of their own by the tests of notebooks, sweeps and experiments.
 SIZED_ELSEWHERE = ("benchmarks.", "scripts.")
@@ -206,7 +207,10 @@ HIDDEN = """
 effects:
 - {effect: coulomb_friction, at: cart, kind: joint, columns: {coulomb: 0.5}}
 """
-ORDER = ("index", "your_own_robot", "export", "gap", "importers", "batch", "engines")
+ORDER = (
+    *("index", "your_own_robot", "export", "gap", "importers", "batch", "engines"),
+    "imitation",
+)
 NOT_RUN = ("method", "reference", "user_files")  # pages of reading, not of doing
 
 

@@ -15,8 +15,6 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
-from brax.training import types
-from brax.training.agents.ppo import losses
 
 from easi_jax.errors import UserError
 from easi_jax.rl.config import EssInfoGailConfig
@@ -205,8 +203,8 @@ class EssInfoGail(Ppo):
         return Noted(windows, theta[1], new.terminated > 0)
 
     def _judged(
-        self, state: EssState, rows: types.Transition, key: jax.Array
-    ) -> tuple[EssState, types.Transition, Info]:
+        self, state: EssState, rows: Any, key: jax.Array
+    ) -> tuple[EssState, Any, Info]:
         c, judge = self._ess, self._judge
         extras: Any = rows.extras
         noted: Noted = extras["noted"]
@@ -241,7 +239,7 @@ class EssInfoGail(Ppo):
         return state, rows._replace(reward=reward, extras=extras), told
 
     def _prior_slope(
-        self, state: EssState, rows: types.Transition, codes: Codes, prior: jax.Array
+        self, state: EssState, rows: Any, codes: Codes, prior: jax.Array
     ) -> jax.Array:
         """Slope ``(K,)`` of PPO's loss by what the prior is kept as, through the skills
         that were drawn."""
@@ -253,19 +251,9 @@ class EssInfoGail(Ppo):
             skill = relaxed(self._judge, prior, codes.gumbel, c.temperature)
             seen = jax.vmap(jax.vmap(self._coded.tail))(codes.code, skill)
             obs = jnp.concatenate([rows.observation[..., :n], seen], -1)
-            return losses.compute_ppo_loss(
-                state.params,
-                state.normalizer,
-                data._replace(observation=order(obs)),
-                jax.random.key(0),
-                self._networks,
-                entropy_cost=0.0,
-                discounting=c.discount,
-                reward_scaling=c.reward_scaling,
-                gae_lambda=c.gae_lambda,
-                clipping_epsilon=c.clipping,
-                vf_coefficient=0.0,
-            )[0]
+            batch = data._replace(observation=order(obs))
+            given = state.normalizer, state.params, batch, jax.random.key(0)
+            return self._loss(*given, of_policy=True)[0]
 
         return jax.grad(loss)(prior)
 

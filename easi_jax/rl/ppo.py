@@ -10,6 +10,7 @@ in the losses.
 import copy
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -266,27 +267,40 @@ class Ppo:
         told = {"ended": ended, "usable": ok, "returns": returns, "cut": cut}
         return (new, theta, returns), (row, told)
 
+    def _loss(
+        self,
+        statistics: Any,
+        params: Any,
+        batch: Any,
+        key: jax.Array,
+        of_policy: bool = False,
+    ) -> tuple[jax.Array, Any]:
+        """brax's loss of rows ``(envs, unroll, ...)``, and what it tells.
+
+        ``of_policy``: without the value's and the entropy's parts.
+        """
+        c = self.config
+        return losses.compute_ppo_loss(
+            params,
+            statistics,
+            batch,
+            key,
+            self._networks,
+            entropy_cost=0.0 if of_policy else c.entropy_cost,
+            discounting=c.discount,
+            reward_scaling=c.reward_scaling,
+            gae_lambda=c.gae_lambda,
+            clipping_epsilon=c.clipping,
+            vf_coefficient=0.0 if of_policy else c.value_cost,
+        )
+
     def _learn(
         self, state: PpoState, rows: Any, key: jax.Array
     ) -> tuple[PpoState, Info]:
         """All epochs over the rows ``(unroll, num_envs, ...)``."""
         c = self.config
         data = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), rows)
-
-        def loss(params: Any, batch: Any, key: jax.Array) -> tuple[jax.Array, Any]:
-            return losses.compute_ppo_loss(
-                params,
-                state.normalizer,
-                batch,
-                key,
-                self._networks,
-                entropy_cost=c.entropy_cost,
-                discounting=c.discount,
-                reward_scaling=c.reward_scaling,
-                gae_lambda=c.gae_lambda,
-                clipping_epsilon=c.clipping,
-                vf_coefficient=c.value_cost,
-            )
+        loss = partial(self._loss, state.normalizer)
 
         def update(carry: Any, item: Any) -> tuple[Any, Info]:
             params, optimizer = carry

@@ -54,7 +54,7 @@ def test_an_imitator_is_a_run_like_any(runs: Path, tmp_path: Path) -> None:
     again = "--run", runs / "like", "--env", ENV, "--episodes", 2
     command(evaluate, *again, "--out", out)
     assert read(out)["method"] == "UDR"
-    command(export, "--run", runs / "like", "--env", ENV, "--out", tmp_path / "made")
+    command(export, runs / "like", "--env", ENV, "--out", tmp_path / "made")
     assert (tmp_path / "made" / "policy.onnx").is_file()
 
 
