@@ -176,6 +176,12 @@ def told(row: dict[str, Any]) -> str:
     )
 
 
+def shown(cell: Cell) -> Any:
+    """Demonstrations of a cell, with the labels that it has."""
+    share = 0.0 if cell.left_out == "labels" else LABELLED
+    return demonstrations(cell.seed).labelled(share, cell.seed)
+
+
 def settings(
     form: str, left_out: str, demonstrations: Any, env_steps: int = ENV_STEPS
 ) -> Any:
@@ -214,8 +220,7 @@ def solve(cell: Cell, env_steps: int = ENV_STEPS) -> dict[str, Any]:
 
     begun = time.monotonic()
     env = Circles()
-    share = 0.0 if cell.left_out == "labels" else LABELLED
-    given = demonstrations(cell.seed).labelled(share, cell.seed)
+    given = shown(cell)
     trainer = EssInfoGail(
         *(env, settings(cell.form, cell.left_out, given, env_steps)),
         *(lambda theta: theta, lambda dist, key: dist),

@@ -45,8 +45,9 @@ from easi_jax.model.parameter_proposal import own_space
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.results import Flag, GapResult, HeldOutErrors
 from easi_jax.pipeline.stages import seed_keys
+from easi_jax.rl.config import EssInfoGailConfig
 from easi_jax.rl.networks import PolicyParams, act
-from easi_jax.rl.presets import training_preset
+from easi_jax.rl.presets import imitating, training_preset
 from easi_jax.rl.seeds import train_seeds
 from easi_jax.rl.trainer import make_trainer
 from easi_jax.search.config import preset
@@ -431,6 +432,7 @@ def train_policy(
     algorithm: str | None = None,
     env_steps: int | None = None,
     seed: int = 0,
+    demonstrations: PathLike | None = None,
 ) -> Policy:
     """Trains a policy under randomized physics, as one compiled program.
 
@@ -440,17 +442,24 @@ def train_policy(
         estimated: its distribution is drawn from, a sample an episode; parameters that
             it lacks keep their nominal values. None: uniform over the environment's
             own ranges.
-        algorithm: ``sac`` or ``ppo``; the environment's own where None.
+        algorithm: ``sac``, ``ppo``, or ``ess_infogail``, which imitates; the
+            environment's own where None.
         env_steps: control steps of training; those of the preset where None.
         seed: of the random numbers.
+        demonstrations: log of motion to imitate (docs/imitation.md).
 
     Raises:
-        UserError: no such algorithm; ``estimated`` has parameters that ``env`` lacks;
-            the training did not stay finite.
+        UserError: no such algorithm, or one that does not go with ``demonstrations``; a
+            log that cannot be imitated; ``estimated`` has parameters that ``env``
+            lacks; the training did not stay finite.
     """
     config = training_preset(env, algorithm)
     if env_steps is not None:
         config = replace(config, env_steps=env_steps)
+    if isinstance(config, EssInfoGailConfig) != (demonstrations is not None):
+        raise UserError("demonstrations and algorithm ess_infogail go together")
+    if isinstance(config, EssInfoGailConfig) and demonstrations is not None:
+        config = imitating(config, env, Path(demonstrations))
     if estimated is None:
         space, dist = env.space, distribution.uniform(env.space, *env.space.initial)
     else:

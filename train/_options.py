@@ -67,11 +67,11 @@ class TrainingOptions:
     demonstrations: Path | None = None
     """Log of motion to imitate, made by train.demonstrate or recorded: a run is an
     episode, and SKILL:NAME as its name labels it."""
-    labelled: float = 1.0
-    """Share of the labelled steps whose label is used."""
+    labelled: float | None = None
+    """Share of the labelled steps whose label is used; all where not given."""
     skills: int | None = None
     """Skills that the policy has; not given: as many as there are labels, or one."""
-    skill: str = ""
+    skill: str | None = None
     """The label of the skill that the finished policy plays, or its number from 0; the
     first where not given."""
 

@@ -32,16 +32,17 @@ def training_config(
 
     from easi_jax.errors import UserError
     from easi_jax.rl.config import EssInfoGailConfig
-    from easi_jax.rl.presets import training_preset
+    from easi_jax.rl.presets import imitating, training_preset
+    from train._command import say
 
     config = training_preset(env, algorithm)
     if env_steps is not None:
         config = replace(config, env_steps=env_steps)
     path = imitated.get("demonstrations")
     if not isinstance(config, EssInfoGailConfig):
-        if path is not None:
+        if imitated:
             raise UserError(
-                "--demonstrations goes with --algorithm ess_infogail: add it"
+                f"--{next(iter(imitated))} goes with --algorithm ess_infogail: add it"
             )
         return config
     if path is None:
@@ -49,38 +50,32 @@ def training_config(
             "--algorithm ess_infogail imitates: give --demonstrations FILE (python -m "
             "train.demonstrate makes them)"
         )
-    return _imitating(config, env, Path(path), imitated)
-
-
-def _imitating(config: Any, env: Any, path: Path, imitated: Mapping[str, Any]) -> Any:
-    """Settings with demonstrations, their labels and skills."""
-    from dataclasses import replace
-
-    from easi_jax.errors import UserError
-    from easi_jax.rl.demonstrations import read_demonstrations
-
-    given = read_demonstrations(path, env, config.frames).some(_MOST_WINDOWS)
-    skills = imitated.get("skills") or max(1, len(given.skills))
-    share = float(imitated.get("labelled", 1.0))
-    if skills > 1:
-        given = given.labelled(share)
-    name = str(imitated.get("skill") or "0")
-    number = int(name) if name.isdecimal() else given.skill(name)
-    if number >= skills:
-        raise UserError(f"--skill {name}: there are {skills} skills, counted from 0")
-    return replace(config, demonstrations=given, skills=skills, skill=number)
-
-
-# Windows of demonstrations that are kept: 36 MB for a Go2, part of each program.
-_MOST_WINDOWS = 100_000
+    options = {k: v for k, v in imitated.items() if k != "demonstrations"}
+    config = imitating(config, env, Path(path), **options)
+    assert config.demonstrations is not None
+    for note in config.demonstrations.notes:
+        say(f"note: {note}")
+    return config
 
 
 def imitation_of(config: Any) -> dict[str, Any]:
-    """Options of imitation of a command or of a run folder, and none where there are no
-    demonstrations."""
+    """Options of imitation that a command or a run folder was given."""
     get = config.get if isinstance(config, dict) else partial(getattr, config)
-    found = {name: get(name) for name in _IMITATES if get(name) is not None}
-    return found if "demonstrations" in found else {}
+    return {name: get(name) for name in _IMITATES if get(name) is not None}
+
+
+def recorded(given: Given, config: Any, training: Any) -> dict[str, Any]:
+    """What a run folder keeps of a command's options: of imitation what was given, and
+    what the demonstrations were."""
+    found = given.recorded(config)
+    for name in _IMITATES:
+        if found[name] is None:
+            del found[name]
+    shown = getattr(training, "demonstrations", None)
+    return found if shown is None else {**found, _DIGEST: shown.digest}
+
+
+_DIGEST = "demonstrations_sha256"
 
 
 # Gradient steps of the discriminator in a generation, where the reference's recipe has
@@ -306,35 +301,20 @@ def acting_config(env: Any, result: Mapping[str, Any]) -> Any:
     return config.acting() if isinstance(config, EssInfoGailConfig) else config
 
 
-def check_same_demonstrations(folder: Path, training: Any) -> None:
+def check_same_demonstrations(folder: Path, config: Any, training: Any) -> None:
     """Refuses demonstrations that are not those that a run of ``folder`` imitated.
 
     Raises:
         UserError: they are others.
     """
     from easi_jax.errors import UserError
-    from easi_jax.io.files import read_json
 
     given = getattr(training, "demonstrations", None)
-    if given is None:
-        return
-    theirs = read_json(folder / "results.json").get("demonstrations_sha256")
-    if theirs != digest_of(given):
+    if given is not None and config.get(_DIGEST, given.digest) != given.digest:
         raise UserError(
             f"{given.source} is not what {folder} imitated: put the file back, or run "
             "train.udr again"
         )
-
-
-def digest_of(given: Any) -> str:
-    """SHA-256 of what is imitated."""
-    import hashlib
-
-    import numpy as np
-
-    found = hashlib.sha256(np.ascontiguousarray(given.windows).tobytes())
-    found.update(np.ascontiguousarray(given.labels).tobytes())
-    return found.hexdigest()
 
 
 def read_policies(path: Path) -> dict[str, Any]:
@@ -349,9 +329,7 @@ def read_policies(path: Path) -> dict[str, Any]:
 
     told = read_json(path)
     if isinstance(told, dict) and "methods" not in told:
-        raise UserError(
-            f"{path.parent} holds no policies: it identified a machine from logs"
-        )
+        raise UserError(f"{path.parent} holds no policies: no policy was trained there")
     told = checked(told, POLICIES, f"{path} is not the result of a training")
     if not told["methods"]:
         raise UserError(f"{path}: no method")
@@ -391,7 +369,7 @@ def load_udr(folder: Path, env_file: Path | None = None) -> dict[str, Any]:
     training = training_config(
         *(env, config["env_steps"], config.get("algorithm"), imitation_of(config))
     )
-    check_same_demonstrations(folder, training)
+    check_same_demonstrations(folder, config, training)
     pipe = Pipeline(trained, PipelineConfig(training=training))
     seeds = tuple(int(s) for s in config["seeds"])
     keys = seed_keys(list(seeds))
@@ -432,6 +410,7 @@ def load_networks(
     import numpy as np
 
     from easi_jax.errors import UserError
+    from easi_jax.rl.config import EssInfoGailConfig
     from easi_jax.rl.presets import algorithm_of
 
     old = load_udr(folder, env_file)
@@ -443,6 +422,13 @@ def load_networks(
         ("algorithm", algorithm_of(theirs), algorithm_of(training)),
         ("hidden layers", tuple(theirs.hidden), tuple(training.hidden)),
     )
+    if isinstance(theirs, EssInfoGailConfig):
+        pairs += tuple(
+            (name.replace("_", " "), getattr(theirs, name), getattr(training, name))
+            for name in ("skills", "continuous", "frames", "judge_hidden")
+        )
+        labels = (getattr(c.demonstrations, "skills", ()) for c in (theirs, training))
+        pairs += (("list of labels", *labels),)
     for what, one, other in pairs:
         if one != other:
             raise UserError(

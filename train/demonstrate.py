@@ -60,6 +60,7 @@ class Config(RunOptions, EngineOptions):
 
 def run(config: Config) -> None:
     """Trains experts where none is given, records, writes."""
+    from easi_jax.errors import UserError
     from easi_jax.io.logs.reader import write_log
     from easi_jax.io.runs.folder import RunFolder
     from train._robots import check_chunk, check_seeds
@@ -78,6 +79,11 @@ def run(config: Config) -> None:
         if played is not None:
             env, policy = played
             runs = _recorded(config, env, policy, [None], config.episodes, "")
+            if not runs:
+                raise UserError(
+                    f"{config.policy}: every episode ended before its time; give a "
+                    "policy that was trained for longer"
+                )
             table = _summary(runs)
         else:
             from envs import make
@@ -109,6 +115,8 @@ def _check(config: Config) -> None:
         raise UserError("--gaits: give at least one, each once")
     if not config.speeds or not all(0 < v <= 3 for v in config.speeds):
         raise UserError(f"--speeds {config.speeds}: give speeds above 0, at most 3 m/s")
+    if len({f"{v:g}" for v in config.speeds}) < len(config.speeds):
+        raise UserError("--speeds: give each once")
     if config.episodes < 2:
         raise UserError(f"--episodes is {config.episodes}: give at least 2")
     if config.shares and (
@@ -120,10 +128,16 @@ def _check(config: Config) -> None:
         raise UserError(f"--noise is {config.noise}: give a number from 0 to 1")
     if config.env_steps < 1:
         raise UserError(f"--env-steps is {config.env_steps}: give at least 1")
-    if config.policy is None:
-        for name in ("method", "env"):
-            if getattr(config, name) is not None:
-                raise UserError(f"--{name} goes with --policy: give the run, too")
+    fresh = Config()
+    alone = ("gaits", "speeds", "shares", "env_steps")
+    for name in ("method", "env") if config.policy is None else alone:
+        if getattr(config, name) != getattr(fresh, name):
+            flag = "--" + name.replace("_", "-")
+            raise UserError(
+                f"{flag} goes with --policy: give the run, too"
+                if config.policy is None
+                else f"{flag} is of experts, and --policy trains none: leave it out"
+            )
 
 
 def _loaded(config: Config) -> tuple[Any, Any]:

@@ -54,7 +54,12 @@ class Config(
 
 def run(config: Config) -> None:
     """Compiles, runs and reports."""
-    from train._robots import check_seeds, imitation_of, training_config
+    from train._robots import (
+        check_seeds,
+        imitation_of,
+        recorded,
+        training_config,
+    )
 
     check_seeds(config.seeds)
     from easi_jax.io.runs.folder import RunFolder
@@ -73,7 +78,7 @@ def run(config: Config) -> None:
     setup = ready(config, env, given, training, config.seeds, config.option)
     with RunFolder.open(
         config.out,
-        given.recorded(config),
+        recorded(given, config, training),
         command="train.pipeline",
         resume=config.resume,
         overwrite=config.overwrite,

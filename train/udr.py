@@ -65,6 +65,7 @@ def run(config: Config) -> None:
         check_seeds,
         imitation_of,
         load_networks,
+        recorded,
         save_policies,
         training_config,
     )
@@ -105,7 +106,7 @@ def run(config: Config) -> None:
         old = load_networks(config.start_from, config.env, env, training, config.seeds)
     with RunFolder.open(
         config.out,
-        given.recorded(config),
+        recorded(given, config, training),
         command="train.udr",
         resume=config.resume,
         overwrite=config.overwrite,
@@ -166,10 +167,7 @@ def _trained(
 def _settings(config: Config, method: str, robot: str, training: Any) -> dict[str, Any]:
     """What ``results.json`` says of how a policy was made."""
     from easi_jax.rl.presets import algorithm_of
-    from train._robots import digest_of
 
-    given = getattr(training, "demonstrations", None)
-    imitated = {} if given is None else {"demonstrations_sha256": digest_of(given)}
     return {
         "robot": robot,
         "env": None if config.env is None else str(config.env),
@@ -178,7 +176,6 @@ def _settings(config: Config, method: str, robot: str, training: Any) -> dict[st
         "env_steps": training.env_steps,
         "algorithm": algorithm_of(training),
         "methods": [method],
-        **imitated,
     }
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import enum
 import errno
+import hashlib
 import json
 import math
 import os
@@ -161,3 +162,16 @@ def read_json(path: Path) -> Any:
         raise UserError(f"{path} is not valid JSON: {error}") from error
     except RecursionError as error:
         raise UserError(f"{path} is not valid JSON: nested too deeply") from error
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file, hex.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {os_reason(error)}") from error

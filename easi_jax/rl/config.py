@@ -228,6 +228,9 @@ class EssInfoGailConfig(PpoConfig):
     judge_learning_rate: float = 3e-4
     """Of Adam, for discriminator and posterior."""
 
+    skill_learning_rate: float = 1e-2
+    """Of the posterior, where `shared_trunk_twice` gives it an optimizer of its own."""
+
     judge_decay: float = 1e-3
     """Decoupled weight decay beside it."""
 
@@ -319,12 +322,15 @@ class EssInfoGailConfig(PpoConfig):
                 *("ramp_start", "prior_rate"),
                 *("style_reward", "code_reward", "skill_reward", "task_reward"),
             ),
-            positive=("judge_learning_rate", "temperature"),
+            positive=("judge_learning_rate", "skill_learning_rate", "temperature"),
             shares=(),
         )
         if self.skill >= self.skills:
             need = f"counts from 0, and there are skills={self.skills}"
             _refuse(self, "Ess-InfoGAIL", "skill", need)
+        if self.style_form == "score" and self.discount >= 1:
+            need = "is below 1 where style_form is score"
+            _refuse(self, "Ess-InfoGAIL", "discount", need)
         for name, known in _CHOICES.items():
             if getattr(self, name) not in known:
                 _refuse(
@@ -349,8 +355,10 @@ class PaperEssInfoGailConfig(EssInfoGailConfig):
     """Ess-InfoGAIL as published, its code's defects included.
 
     Facts of the authors' public code. What still differs: the policy's network is
-    brax's (ReLU, a spread that depends on the observation), and many environments
-    unroll in place of one.
+    brax's (ReLU, a spread that depends on the observation), many environments unroll in
+    place of one, the discriminator sees what is imitated (`easi_jax.rl.demonstrations`)
+    and not the observation, always in standard deviations of the demonstrations, and
+    its weight decay is apart from Adam's moments.
     """
 
     frames: int = 1

@@ -1,7 +1,7 @@
 """What a policy is to imitate: windows of recorded motion, a few of them labelled."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from easi_jax.errors import UserError, nearest
 LABELLED = ":"  # between the skill and the rest of a run's name
 _FEWEST = 200  # windows; fewer hold next to no motion
 _SAME_STEP = 0.01  # share that control steps may differ by
-_LIVELY = 1e-4  # share of the largest spread, below which an input does not vary
+_LIVELY = 1e-5  # of an input's own size; what varies by less is rounding
 
 Style = Callable[[jax.Array, jax.Array], jax.Array]
 
@@ -32,6 +32,8 @@ class Demonstrations:
         episodes: which recording each is of, ``(N,)``.
         skills: names of the skills that are labelled; may be empty.
         source: the file, for messages and records.
+        digest: SHA-256 of the file, and what was made of it; empty without one.
+        notes: what a user should know of the reading, one line each.
     """
 
     windows: np.ndarray
@@ -39,13 +41,15 @@ class Demonstrations:
     episodes: np.ndarray
     skills: tuple[str, ...] = ()
     source: str = ""
+    digest: str = ""
+    notes: tuple[str, ...] = ()
     mean: np.ndarray = field(init=False)
     std: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
         """Mean and standard deviation of each feature; 1 where it never varies."""
         std = self.windows.std(0)
-        lively = std > _LIVELY * std.max(initial=0.0)
+        lively = std > _LIVELY * np.abs(self.windows).max(0, initial=0.0)
         object.__setattr__(self, "mean", self.windows.mean(0))
         object.__setattr__(self, "std", np.where(lively, std, 1.0))
 
@@ -68,7 +72,7 @@ class Demonstrations:
             own = np.flatnonzero(self.labels == skill)
             count = max(1, round(share * len(own)))
             labels[rng.choice(own, min(count, len(own)), replace=False)] = skill
-        return self._with(labels=labels)
+        return replace(self, labels=labels)
 
     def some(self, count: int, seed: int = 0) -> "Demonstrations":
         """At most ``count`` of the windows, drawn at random."""
@@ -76,7 +80,8 @@ class Demonstrations:
             return self
         rng = np.random.default_rng(seed)
         kept = np.sort(rng.choice(len(self.windows), count, replace=False))
-        return self._with(
+        return replace(
+            self,
             windows=self.windows[kept],
             labels=self.labels[kept],
             episodes=self.episodes[kept],
@@ -96,13 +101,6 @@ class Demonstrations:
             )
         return self.skills.index(name)
 
-    def _with(self, **changes: Any) -> "Demonstrations":
-        kept = {
-            name: getattr(self, name)
-            for name in ("windows", "labels", "episodes", "skills", "source")
-        }
-        return Demonstrations(**(kept | changes))
-
 
 def style_of(env: Any) -> Style:
     """What of an environment's motion is imitated: its own ``style(qpos, qvel)``, or
@@ -115,7 +113,8 @@ def read_demonstrations(path: Path, env: Any, frames: int = 2) -> Demonstrations
     """Demonstrations in a log (docs/your_own_robot.md) of the robot of ``env``.
 
     A run is an episode. Its label is what stands before the colon in its name, as in
-    ``trot:12``; a run without a colon has none.
+    ``trot:12``. A run without a colon has none, nor has one whose name begins with a
+    number, such as a time of day.
 
     Args:
         path: ``.csv``, ``.npz`` or ``.parquet``.
@@ -125,26 +124,39 @@ def read_demonstrations(path: Path, env: Any, frames: int = 2) -> Demonstrations
     Raises:
         UserError: not a log of this robot or control step, or too little motion.
     """
+    from easi_jax.io.files import digest_of
+    from easi_jax.io.logs.columns import log_columns
     from easi_jax.io.logs.reader import read_logs
+    from easi_jax.io.logs.tables import read_table
 
-    runs = read_logs(path, env.mj_model).runs
-    for run in runs:
+    there = read_table(path).columns
+    lacks = [c for c in ("time", *log_columns(env.mj_model).qpos) if c not in there]
+    if lacks:
+        more = f" (and {len(lacks) - 1} more)" * (len(lacks) > 1)
+        raise UserError(
+            f"{path} has no column {lacks[0]}{more}: {env.name} is imitated where the "
+            "position of every joint was measured, a base included (python -m "
+            "train.import_logs makes logs of other tables)"
+        )
+    log = read_logs(path, env.mj_model)
+    for run in log.runs:
         if abs(run.dt / env.dt - 1) > _SAME_STEP:
             raise UserError(
                 f"{path}: {run.name} has a control step of {1e3 * run.dt:.4g} ms, "
                 f"{env.name} one of {1e3 * env.dt:.4g} ms: record demonstrations at "
                 f"{1 / env.dt:.4g} Hz"
             )
-    named = [_label(run.name) for run in runs]
+    named = [_label(run.name) for run in log.runs]
     skills = tuple(sorted({name for name in named if name}))
-    return demonstrations_of(
+    found = demonstrations_of(
         env,
-        [(r.qpos, r.qvel, r.ctrl) for r in runs],
+        [(r.qpos, r.qvel, r.ctrl) for r in log.runs],
         [skills.index(name) if name else -1 for name in named],
         skills,
         frames,
         str(path),
     )
+    return replace(found, digest=digest_of(path), notes=log.notes)
 
 
 def demonstrations_of(
@@ -221,8 +233,8 @@ def _check_variety(windows: np.ndarray, source: str) -> None:
 
 def _label(name: str) -> str:
     """The skill in a run's name; empty where it has none."""
-    own = name.rsplit("/", 1)[-1]
-    return own.split(LABELLED, 1)[0] if LABELLED in own else ""
+    label, colon, _ = name.partition("/")[2].partition(LABELLED)
+    return label if colon and not label[:1].isdigit() else ""
 
 
 # -- motion without place and heading --------------------------------------------------

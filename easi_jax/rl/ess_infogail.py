@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import flax.struct
 import jax
 import jax.numpy as jnp
-import optax
 
 from easi_jax.errors import UserError
 from easi_jax.rl.config import EssInfoGailConfig
@@ -23,7 +22,7 @@ from easi_jax.rl.episodes import Tested, raw_key
 from easi_jax.rl.judge import Batch, Judge, JudgeState
 from easi_jax.rl.learner import Info
 from easi_jax.rl.networks import PolicyParams, standardize
-from easi_jax.rl.ppo import Ppo, PpoState
+from easi_jax.rl.ppo import Ppo, PpoState, learning_rate_of
 from easi_jax.simulation.env import Env, EnvState, Model
 
 
@@ -203,8 +202,8 @@ class EssInfoGail(Ppo):
         return Noted(windows, theta[1], new.terminated > 0)
 
     def _judged(
-        self, state: EssState, rows: Any, key: jax.Array
-    ) -> tuple[EssState, Any, Info]:
+        self, state: Any, rows: Any, bonus: jax.Array, key: jax.Array
+    ) -> tuple[Any, Any, Info]:
         c, judge = self._ess, self._judge
         extras: Any = rows.extras
         noted: Noted = extras["noted"]
@@ -219,14 +218,13 @@ class EssInfoGail(Ppo):
         ramp = jnp.clip(after / max(c.iterations - c.ramp_start, 1), 0.0, 1.0)
         rate = jnp.asarray(c.judge_learning_rate)
         if c.one_rate:
-            steered = optax.tree_utils.tree_get(state.optimizer, "rate")
-            rate = jnp.asarray(c.learning_rate) if steered is None else steered
+            rate = learning_rate_of(c, state)
         judged, told = judge.updates(state.judge, flat, key, ramp, rate)
         style = judge.rewards(
             *(judged.params, windows, noted.codes.skill, noted.codes.code),
             *(noted.failed & fine, c.discount),
         )
-        reward = jnp.where(fine, style + c.task_reward * rows.reward, 0.0)
+        reward = jnp.where(fine, style + c.task_reward * rows.reward, 0.0) + bonus
         extras = {k: v for k, v in extras.items() if k != "noted"}
         if c.prior == "gradient" and c.skills > 1:
             paid = rows._replace(reward=reward, extras=extras)
@@ -241,14 +239,15 @@ class EssInfoGail(Ppo):
     def _prior_slope(
         self, state: EssState, rows: Any, codes: Codes, prior: jax.Array
     ) -> jax.Array:
-        """Slope ``(K,)`` of PPO's loss by what the prior is kept as, through the skills
-        that were drawn."""
+        """Slope ``(K,)`` of the policy's loss by what the prior is kept as, through the
+        skills that were drawn (which may be of an older prior: their values stay)."""
         c, n = self._ess, self._plain.obs_size
         order = lambda x: jnp.swapaxes(x, 0, 1)  # noqa: E731
         data = jax.tree.map(order, rows)
 
         def loss(prior: jax.Array) -> jax.Array:
-            skill = relaxed(self._judge, prior, codes.gumbel, c.temperature)
+            now = relaxed(self._judge, prior, codes.gumbel, c.temperature)
+            skill = codes.skill + now - jax.lax.stop_gradient(now)
             seen = jax.vmap(jax.vmap(self._coded.tail))(codes.code, skill)
             obs = jnp.concatenate([rows.observation[..., :n], seen], -1)
             batch = data._replace(observation=order(obs))

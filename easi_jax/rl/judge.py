@@ -93,6 +93,8 @@ class Judge:
         self.real = jnp.asarray(given.scaled(given.windows), jnp.float32)
         at = given.labels >= 0
         self.labelled = self.real[at] if at.any() else self.real[:0]
+        # All where each has a label: then what has one stands for what has none.
+        self.unlabelled = self.real if at.all() else self.real[~at]
         self.labels = jnp.asarray(given.labels[at])
         # A rate of one: updates are scaled by the rate that holds.
         self._optimizer = optax.adamw(1.0, weight_decay=config.judge_decay)
@@ -195,7 +197,7 @@ class Judge:
         self, state: JudgeState, fake: Batch, key: jax.Array, ramp: Any, rate: Any
     ) -> tuple[JudgeState, Info]:
         c = self.config
-        k_real, k_fake, k_label = jax.random.split(key, 3)
+        k_real, k_fake, k_label, k_free = jax.random.split(key, 4)
         real = self.real[_drawn(k_real, c.judge_batch, len(self.real))]
         at = _drawn(k_fake, c.judge_batch, len(fake.windows))
         fake = Batch(*(x[at] for x in fake))
@@ -208,15 +210,19 @@ class Judge:
         def judged(params: Any) -> tuple[jax.Array, Info]:
             return self._real_loss(params, real, fake)
 
+        at = _drawn(k_free, c.judge_batch, len(self.unlabelled))
+        free = self.unlabelled[at]
+
         def skilled(params: Any) -> tuple[jax.Array, jax.Array]:
-            return self._skill_loss(params, real, labelled, labels, prior, ramp)
+            return self._skill_loss(params, free, labelled, labels, prior, ramp)
 
         params = state.params
         if c.shared_trunk_twice:
             slope, told = jax.grad(judged, has_aux=True)(params)
             params, opt = self._descend(slope, state.optimizer, params, rate)
             slope, mean = jax.grad(skilled, has_aux=True)(params)
-            params, second = self._descend(slope, state.skill_optimizer, params, rate)
+            own = state.skill_optimizer, params, c.skill_learning_rate
+            params, second = self._descend(slope, *own)
         else:
 
             def both(params: Any) -> Any:
@@ -269,17 +275,17 @@ class Judge:
     def _skill_loss(
         self,
         params: Any,
-        real: jax.Array,
+        free: jax.Array,
         labelled: jax.Array,
         labels: jax.Array,
         prior: jax.Array,
         ramp: jax.Array,
     ) -> tuple[jax.Array, jax.Array]:
-        """The posterior's loss, and its mean over demonstrations ``(K,)``."""
+        """The posterior's loss, and its mean over windows without a label ``(K,)``."""
         c = self.config
         if c.skills == 1:
             return jnp.zeros(()), jnp.ones(1)
-        log_q = jax.nn.log_softmax(self.read(params, real).skill)
+        log_q = jax.nn.log_softmax(self.read(params, free).skill)
         q = jnp.exp(log_q)
         mean = q.mean(0)
         log_mean = jnp.log(jnp.maximum(mean, 1e-8))

@@ -152,12 +152,12 @@ class Ppo:
             jax.random.wrap_key_data(state.key), 4
         )
         state, rows, told = self._unroll(state, dist, k_unroll)
-        k_judge = jax.random.fold_in(k_learn, 0)
-        state, rows, more = self._judged(state, rows, k_judge)
         ended, usable = told["ended"], told["usable"]
         beyond = self.values(state, rows.next_observation)
         bonus = config.discount / config.reward_scaling * beyond
-        rows = rows._replace(reward=rows.reward + jnp.where(told["cut"], bonus, 0.0))
+        bonus = jnp.where(told["cut"], bonus, 0.0)
+        k_judge = jax.random.fold_in(k_learn, _NO_EPOCH)
+        state, rows, more = self._judged(state, rows, bonus, k_judge)
         state, info = self._learn(state, rows, k_learn)
         if config.normalize_observations:
             # After the updates: the policy that acted saw the old statistics.
@@ -215,11 +215,12 @@ class Ppo:
         return state, rows, told
 
     def _judged(
-        self, state: PpoState, rows: types.Transition, key: jax.Array
-    ) -> tuple[PpoState, types.Transition, Info]:
-        """Rows with the rewards that are learned from, and scalars to tell."""
+        self, state: Any, rows: Any, bonus: jax.Array, key: jax.Array
+    ) -> tuple[Any, Any, Info]:
+        """Rows with the rewards that are learned from, ``bonus`` for what comes after
+        a time limit among them, and scalars to tell."""
         del key
-        return state, rows, {}
+        return state, rows._replace(reward=rows.reward + bonus), {}
 
     def _noted(
         self, envs: EnvState, new: EnvState, theta: Any, action: jax.Array
@@ -334,6 +335,11 @@ class Ppo:
         return state, jax.tree.map(jnp.mean, info)
 
 
+# Folded into the key of an unroll's epochs, which `jax.random.split` counts from 0, so
+# that what it gives is none of theirs.
+_NO_EPOCH = 2**31 - 1
+
+
 def _optimizer(config: PpoConfig) -> optax.GradientTransformationExtraArgs:
     cut = optax.clip_by_global_norm(config.max_gradient)
     if config.target_kl:
@@ -370,6 +376,16 @@ def steered(rate: float, target: float) -> optax.GradientTransformationExtraArgs
         return jax.tree.map(lambda g: -now * g, updates), Steered(now)
 
     return optax.GradientTransformationExtraArgs(init, update)
+
+
+def learning_rate_of(config: PpoConfig, state: PpoState) -> jax.Array:
+    """The rate that the next update of a training has, ``()``."""
+    steered = optax.tree_utils.tree_get(state.optimizer, "rate")
+    if steered is not None:
+        return steered
+    rate = _learning_rate(config)
+    done = state.iteration * config.epochs * config.minibatches
+    return jnp.asarray(rate(done) if callable(rate) else rate)
 
 
 def _learning_rate(config: PpoConfig) -> optax.ScalarOrSchedule:

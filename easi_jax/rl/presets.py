@@ -4,7 +4,10 @@ The first algorithm of a robot is its default.
 """
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
+
+import jax
 
 from easi_jax.errors import UserError, nearest
 from easi_jax.rl.config import (
@@ -13,6 +16,7 @@ from easi_jax.rl.config import (
     PpoConfig,
     SacConfig,
 )
+from easi_jax.rl.demonstrations import read_demonstrations
 from easi_jax.rl.trainer import TrainingConfig
 
 _SAC = SacConfig(
@@ -116,7 +120,56 @@ def training_preset(env: Any, algorithm: str | None = None) -> TrainingConfig:
 
 def algorithm_of(config: TrainingConfig) -> str:
     """The name under which presets know an algorithm."""
-    return _NAMES[type(config)]
+    return next(_NAMES[kind] for kind in type(config).__mro__ if kind in _NAMES)
+
+
+def imitating(
+    config: EssInfoGailConfig,
+    env: Any,
+    path: Path,
+    labelled: float = 1.0,
+    skills: int | None = None,
+    skill: str = "",
+) -> EssInfoGailConfig:
+    """Settings with what is imitated.
+
+    Args:
+        config: settings without.
+        env: the robot.
+        path: log of demonstrations.
+        labelled: share of the labelled steps whose label is used.
+        skills: of the policy; None: as many as there are labels, or one.
+        skill: label, or number from 0, of the one that a finished policy plays; the
+            first where empty.
+
+    Raises:
+        UserError: a file that cannot be imitated, or options that do not go with it.
+    """
+    if skills is not None and skills < 1:
+        raise UserError(f"skills is {skills}: give at least 1")
+    state = jax.eval_shape(lambda k: env.reset(env.model(), k), jax.random.key(0))
+    if not hasattr(state.physics, "qpos"):
+        raise UserError(
+            f"{env.name}: imitation needs an environment whose state has physics with "
+            "qpos and qvel, as those of easi_jax.simulation have"
+        )
+    given = read_demonstrations(path, env, config.frames).some(_MOST_WINDOWS)
+    given = given.labelled(labelled)
+    count = max(1, len(given.skills)) if skills is None else skills
+    number = given.skills.index(skill) if skill in given.skills else -1
+    if number < 0:
+        name = skill or "0"
+        number = int(name) if name.isdecimal() else given.skill(name)
+    if number >= count:
+        plural = "s" * (count > 1)
+        raise UserError(
+            f"skill {skill}: the policy has {count} skill{plural}, counted from 0"
+        )
+    return replace(config, demonstrations=given, skills=count, skill=number)
+
+
+# Windows of demonstrations that are kept: 36 MB for a Go2, part of each program.
+_MOST_WINDOWS = 100_000
 
 
 _NAMES: dict[type[TrainingConfig], str] = {

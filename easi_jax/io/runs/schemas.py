@@ -19,6 +19,7 @@ TRAINED = {
     "labelled?": float,
     "skills?": int,
     "skill?": str,
+    "demonstrations_sha256?": str,
     "effects?": {},
     "target_effects?": {},
 }

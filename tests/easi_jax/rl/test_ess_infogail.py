@@ -1,6 +1,5 @@
 """Ess-InfoGAIL: its parts against what is known, and a toy that it must learn."""
 
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -12,7 +11,7 @@ from benchmarks.circles import RADII, STEPS, Circles, circle, off_path, played
 from easi_jax.errors import UserError
 from easi_jax.rl.config import EssInfoGailConfig, PaperEssInfoGailConfig, PpoConfig
 from easi_jax.rl.demonstrations import Demonstrations, demonstrations_of
-from easi_jax.rl.ess_infogail import Coded, Codes, EssInfoGail
+from easi_jax.rl.ess_infogail import Coded, Codes, EssInfoGail, relaxed
 from easi_jax.rl.judge import Batch, Judge
 from easi_jax.rl.networks import act
 from easi_jax.rl.ppo import Ppo, steered
@@ -255,21 +254,52 @@ def test_the_prior_becomes_the_share_of_each_skill() -> None:
 
 
 def test_the_prior_follows_the_slope_of_the_policys_loss() -> None:
-    t = trainer(PaperEssInfoGailConfig, skills=2)
-    state = jax.jit(t.train)(jax.random.key(0), NOWHERE)[0]
-    dist = NOWHERE, state.judge.prior
-    _, rows, _ = jax.jit(lambda s: t._unroll(s, dist, jax.random.key(1)))(state)
-    noted = rows.extras["noted"]
-    extras = {k: v for k, v in rows.extras.items() if k != "noted"}
-    rows = rows._replace(extras=extras, reward=jnp.sin(jnp.arange(80.0)).reshape(10, 8))
-    prior = jnp.array([0.4, 0.6])
-    # At a temperature of 1 the loss is smooth enough for differences.
-    t._ess = replace(t._ess, temperature=1.0)
-    slope = t._prior_slope(state, rows, noted.codes, prior)
-    assert slope.shape == (2,) and float(jnp.abs(slope).max()) > 0
-    # Of a softmax over all: what is added to both exponentials alike changes nothing.
-    direction = jnp.exp(-prior)
-    assert float(jnp.abs(slope @ direction)) < 1e-4 * float(jnp.abs(slope).max()) + 1e-6
+    """Against central differences, episodes that a time limit cuts among them."""
+    t = trainer(PaperEssInfoGailConfig, skills=2, temperature=1.0, unroll=STEPS)
+    state = jax.jit(t.init)(jax.random.key(0), NOWHERE)
+    prior = state.judge.prior
+    _, rows, told = jax.jit(
+        lambda s: t._unroll(s, (NOWHERE, prior), jax.random.key(1))
+    )(state)
+    assert int(told["cut"].sum()) == 8
+    codes = rows.extras["noted"].codes
+    # Paid for its second skill, and for what comes after the limit.
+    rows = rows._replace(
+        extras={k: v for k, v in rows.extras.items() if k != "noted"},
+        reward=codes.skill[..., 1] * jnp.cos(rows.observation[..., 0])
+        + 3.0 * told["cut"],
+    )
+
+    def loss(prior: jax.Array) -> jax.Array:
+        skill = relaxed(t._judge, prior, codes.gumbel, 1.0)
+        tails = jnp.concatenate([codes.code[..., None], skill], -1)
+        seen = jnp.concatenate([rows.observation[..., :4], tails], -1)
+        batch = jax.tree.map(
+            lambda x: jnp.swapaxes(x, 0, 1), rows._replace(observation=seen)
+        )
+        key = jax.random.key(0)
+        return t._loss(state.normalizer, state.params, batch, key, of_policy=True)[0]
+
+    slope = np.asarray(jax.jit(lambda: t._prior_slope(state, rows, codes, prior))())
+    step = 0.02
+    differences = [
+        float(loss(prior + step * e) - loss(prior - step * e)) / (2 * step)
+        for e in np.eye(2, dtype=np.float32)
+    ]
+    np.testing.assert_allclose(slope, differences, rtol=0.05)
+    assert np.abs(slope).max() > 1e-4
+    # Skills of an older prior keep their values: the slope alone is of today's.
+    old = codes._replace(skill=codes.skill[..., ::-1])
+    assert np.isfinite(t._prior_slope(state, rows, old, prior)).all()
+
+
+def test_a_skill_that_pays_more_becomes_likelier() -> None:
+    judge = judge_of(PaperEssInfoGailConfig, skills=2)
+    state = judge.init(jax.random.key(0))
+    for _ in range(20):
+        state = judge.prior_step(state, jnp.array([0.3, -0.3]))
+    low, high = judge.probabilities(state.prior)
+    assert float(high) > 0.5 > float(low)
 
 
 def test_one_rate_is_that_of_the_policy() -> None:
@@ -314,6 +344,7 @@ def test_settings_that_cannot_work_are_refused() -> None:
         ({"prior": "guess"}, "prior=guess"),
         ({"label_cost": -1.0}, "label_cost=-1"),
         ({"temperature": 0.0}, "temperature=0"),
+        ({"discount": 1.0}, "discount=1"),
     ):
         wrong: dict[str, Any] = settings
         with pytest.raises(UserError, match=name):
