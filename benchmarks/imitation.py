@@ -340,7 +340,8 @@ def _walks(rows: list[dict[str, Any]]) -> list[str]:
         f"`python -m benchmarks.imitation` (commits {commits_of(rows)}): a trot at "
         f"{speeds} m/s, {EPISODES} episodes each, those that fell aside. Rates and "
         "duties are ratios to the demonstrations'; a fresh classifier tells pairs of "
-        "frames from demonstrated ones, both with the demonstrations' noise, split by episode (50 % is best).",
+        "frames from demonstrated ones, both with the demonstrations' noise, split by "
+        "episode (50 % is best).",
         markdown_table(
             (
                 *("method", "seed", "speed error [m/s]", "stride rate", "duty"),
