@@ -66,6 +66,7 @@ def test_easi_retrains_by_imitation(runs: Path, tmp_path: Path) -> None:
     assert np.isfinite(read(out / "results.json")["returns"]["EASI"]["0"])
 
 
+@pytest.mark.slow
 def test_one_program_imitates(runs: Path, tmp_path: Path) -> None:
     shown = runs / "shown" / "demonstrations.npz"
     command(
