@@ -128,6 +128,8 @@ def _check(config: Config) -> None:
         raise UserError(f"--noise is {config.noise}: give a number from 0 to 1")
     if config.env_steps < 1:
         raise UserError(f"--env-steps is {config.env_steps}: give at least 1")
+    if config.distributed:
+        raise UserError("--distributed: an expert is one training; leave it out")
     fresh = Config()
     alone = ("gaits", "speeds", "shares", "env_steps")
     for name in ("method", "env") if config.policy is None else alone:

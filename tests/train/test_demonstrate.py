@@ -140,6 +140,7 @@ def test_options_of_imitation_that_do_not_go_together(
         (("--episodes", 1), "at least 2"),
         (("--noise", -1), "from 0 to 1"),
         (("--env-steps", 0), "at least 1"),
+        (("--policy", "nowhere", "--env-steps", 9), "--env-steps is of experts"),
         (("--method", "UDR"), "--method goes with --policy"),
         (("--policy", "nowhere"), "nowhere"),
     ],
