@@ -21,10 +21,11 @@ def walked(
 ) -> np.ndarray:
     """Positions of a Go2 whose feet stand and swing by a clock, 10 s, ``(500, 19)``."""
     stand = Go2().mj_model.key_qpos[0].copy()
+    stand[7:] = np.tile([0.0, 0.9, -1.8], 4)  # rad, all feet at one height
     rows = np.tile(stand, (500, 1))
     t = DT * np.arange(500)
     rows[:, 0] = speed * t
-    # Calves bend in swing; the base stands so high that straight legs touch.
+    # Calves bend in swing; the base is so high that the others touch.
     foot = np.asarray(feet_in_world(jnp.asarray(stand)))[:, 2].min()
     rows[:, 2] += FOOT - foot
     for leg, offset in enumerate(offsets):
