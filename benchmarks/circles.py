@@ -201,7 +201,9 @@ def settings(
         shared.pop("continuous")
         base = PaperEssInfoGailConfig(**shared)
     else:
-        base = EssInfoGailConfig(**shared, task_reward=0.0)
+        # At a constant rate where the training ends is a matter of luck: the policy
+        # and the discriminator run after each other.
+        base = EssInfoGailConfig(**shared, task_reward=0.0, learning_rate_decay=0.05)
     if left_out == "learned prior":
         return dataclasses.replace(base, prior="fixed", prior_cost=0.0)
     if left_out == "information terms":
