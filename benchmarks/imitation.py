@@ -152,18 +152,15 @@ def played(env: Any, policy: Any, noise: float, seed: int) -> Any:
     import jax
     import jax.numpy as jnp
 
-    from easi_jax.rl.networks import act
+    from easi_jax.rl.networks import noisy
     from easi_jax.simulation.rollout import policy_rollout
     from envs.go2 import Commanded
 
-    def noisy(obs: Any, key: Any) -> Any:
-        mode = act(policy, obs, deterministic=True)
-        return jnp.clip(mode + noise * jax.random.normal(key, mode.shape), -1.0, 1.0)
-
     def one(key: Any, speed: Any) -> Any:
         at = Commanded(env, speed)
-        return policy_rollout(at, env.model(), noisy, key, env.episode_length)
+        return policy_rollout(at, model, acts, key, env.episode_length)
 
+    model, acts = env.model(), noisy(policy, noise)
     keys = jax.random.split(jax.random.key(seed), EPISODES)
     every = jax.vmap(jax.vmap(one, (0, None)), (None, 0))
     return jax.device_get(jax.jit(every)(keys, jnp.array(SPEEDS)))

@@ -287,8 +287,8 @@ class Go2(Robot):
         moving = jnp.linalg.norm(memory.command) > 0.1
         landed = touching & (before.air > 0)
         airtime = jnp.sum((before.air - 0.1) * landed) * moving
-        shift = jnp.linalg.norm(memory.feet[:, :2] - before.feet[:, :2], axis=1)
-        swing = jnp.abs(memory.feet[:, 2] - FOOT - SWING) * jnp.sqrt(shift / self.dt)
+        speed = self.foot_speed(memory, before)
+        swing = jnp.abs(memory.feet[:, 2] - FOOT - SWING) * jnp.sqrt(speed)
         cost = (
             self.unsteadiness(model, physics, memory, before, touching)
             + 0.5 * jnp.sum(swing * ~touching)
@@ -328,7 +328,6 @@ class Go2(Robot):
         target = self.action_map(None, memory.last)
         torque = gain[0] * (target - q[7:]) + gain[1] * v[6:]
         torque = jnp.clip(torque, -self._limit, self._limit)
-        shift = jnp.linalg.norm(memory.feet[:, :2] - before.feet[:, :2], axis=1)
         return (
             0.5 * (rotation.T @ v[:3])[2] ** 2
             + 0.05 * jnp.sum(v[3:5] ** 2)
@@ -336,8 +335,13 @@ class Go2(Robot):
             + 1e-4 * jnp.sum(torque**2)
             + 0.01 * jnp.sum((memory.last - before.last) ** 2)
             + 2e-4 * jnp.sum(jnp.abs(torque * v[6:]))
-            + 0.1 * jnp.sum((shift / self.dt) ** 2 * touching)
+            + 0.1 * jnp.sum(self.foot_speed(memory, before) ** 2 * touching)
         )
+
+    def foot_speed(self, memory: Memory, before: Memory) -> jax.Array:
+        """How fast each foot went over ground in a step, ``(4,)`` [m/s]."""
+        shift = jnp.linalg.norm(memory.feet[:, :2] - before.feet[:, :2], axis=1)
+        return shift / self.dt
 
     def style(self, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
         """What imitation compares, ``(42,)``: how the robot holds itself and moves, not

@@ -137,8 +137,8 @@ class Go2Expert(Go2):
         lift = jnp.sin(jnp.pi * jnp.clip((phase - duty) / (1.0 - duty), 0.0, 1.0))
         height = FOOT + SWING * lift
         above = jnp.exp(-(((memory.feet[:, 2] - height) / 0.03) ** 2))
-        shift = jnp.linalg.norm(memory.feet[:, :2] - before.feet[:, :2], axis=1)
-        slip = jnp.sum((shift / self.dt) ** 2 * standing * touching)
+        speed = self.foot_speed(memory, before)
+        slip = jnp.sum(speed**2 * standing * touching)
         base = jnp.exp(-(((physics.qpos[2] - _HEIGHT) / 0.04) ** 2))
         hips = jnp.sum((physics.qpos[7::3] - self._pose[::3]) ** 2)
         cost = self.unsteadiness(model, physics, memory, before, touching)

@@ -10,6 +10,7 @@ from train._command import progress
 
 if TYPE_CHECKING:
     from easi_jax.io.runs.folder import RunFolder
+    from easi_jax.pipeline.stages import Pipeline
 
 T = TypeVar("T")
 Rows = list[tuple[int, dict[str, float]]]
@@ -85,6 +86,51 @@ def run_stage(
             shown = {k: v for k, v in last.items() if "/" not in k}
             meter.advance(n, **shown)
     return distributed.local(state)
+
+
+def train_stage(
+    run: "RunFolder",
+    name: str,
+    pipe: "Pipeline",
+    keys: Any,
+    physics: Any,
+    target: Any,
+    seeds: Sequence[int],
+    chunk: int | None,
+    old: Any = None,
+    notes: list[str] | None = None,
+) -> Any:
+    """Policies ``(S, ...)`` of a whole training, in chunks.
+
+    Args:
+        name, notes: as for `run_stage`.
+        keys: one for each of ``seeds``.
+        physics: distribution that all seeds train under.
+        target: parameters that evaluations are made with.
+        chunk: iterations between checkpoints, as a command was given it.
+        old: networks to go on from; None for new ones.
+    """
+    from easi_jax.simulation.compile_time import expected
+    from train._robots import training_chunk
+
+    training = pipe.config.training
+    wide = pipe.spread(physics, len(seeds))
+    step = jit_chunks(
+        lambda states, dist, target, n: pipe.train_chunk(states, dist, target, n)
+    )
+    states = run_stage(
+        run,
+        name,
+        training.iterations,
+        training_chunk(chunk, training),
+        lambda: pipe.train_init(keys, wide, old),
+        lambda s, n: step(s, wide, target, n),
+        training_rows(seeds, training.steps_per_iteration),
+        notes,
+        per_step=training.steps_per_iteration,
+        seconds=expected(pipe.simulator),
+    )
+    return pipe.policies(states)
 
 
 def as_read_back(tree: Any) -> Any:

@@ -182,28 +182,15 @@ def _trained(folder: "RunFolder", config: Config, gait: str, env: Any) -> Any:
     import jax.numpy as jnp
 
     from easi_jax.pipeline.stages import Pipeline, PipelineConfig, seed_keys
-    from easi_jax.rl.presets import PRESETS
-    from easi_jax.simulation.compile_time import expected
-    from train._robots import training_chunk
-    from train._stages import jit_chunks, run_stage, training_rows
+    from train._robots import training_config
+    from train._stages import train_stage
 
-    training = dataclasses.replace(PRESETS["go2"]["ppo"], env_steps=config.env_steps)
+    training = training_config(env, config.env_steps, "ppo")
     pipe = Pipeline(env, PipelineConfig(training=training))
     nominal = jnp.asarray(env.space.nominal, jnp.float32)
-    one = pipe.spread(pipe.point(nominal), 1)
-    step = jit_chunks(lambda s, dist, theta, n: pipe.train_chunk(s, dist, theta, n))
-    states = run_stage(
-        folder,
-        gait,
-        training.iterations,
-        training_chunk(config.chunk, training),
-        lambda: pipe.train_init(seed_keys([config.seed]), one),
-        lambda s, n: step(s, one, nominal, n),
-        training_rows([config.seed], training.steps_per_iteration),
-        per_step=training.steps_per_iteration,
-        seconds=expected(pipe.simulator),
-    )
-    return pipe.policies(states)
+    keys, seeds = seed_keys([config.seed]), (config.seed,)
+    at = pipe.point(nominal)
+    return train_stage(folder, gait, pipe, keys, at, nominal, seeds, config.chunk)
 
 
 def _recorded(
@@ -216,27 +203,20 @@ def _recorded(
         label: of the runs; none where empty.
     """
     import jax
-    import jax.numpy as jnp
     import numpy as np
 
     from easi_jax.data.recording import Run
     from easi_jax.model.joint_space import Configuration
     from easi_jax.rl.demonstrations import LABELLED
-    from easi_jax.rl.networks import act
+    from easi_jax.rl.networks import noisy
     from easi_jax.simulation.rollout import policy_rollout
     from envs.go2 import Commanded
 
-    def noisy(obs: Any, key: Any) -> Any:
-        mode = act(policy, obs, deterministic=True)
-        return jnp.clip(
-            mode + config.noise * jax.random.normal(key, mode.shape), -1.0, 1.0
-        )
-
     def episode(key: Any, speed: Any) -> Any:
         own = env if speed is None else Commanded(env, speed)
-        return policy_rollout(own, model, noisy, key, env.episode_length)
+        return policy_rollout(own, model, acts, key, env.episode_length)
 
-    model, found = env.model(), []
+    model, acts, found = env.model(), noisy(policy, config.noise), []
     play = jax.jit(jax.vmap(episode, (0, None)))
     for k, speed in enumerate(speeds):
         key = jax.random.fold_in(jax.random.key(config.seed), k)

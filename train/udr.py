@@ -139,29 +139,13 @@ def _trained(
     notes: list[str],
 ) -> Any:
     """Policies of all seeds; ``old`` networks to go on from, None for new ones."""
-    from easi_jax.simulation.compile_time import expected
-    from train._robots import training_chunk
-    from train._stages import jit_chunks, run_stage, training_rows
+    from train._stages import train_stage
 
-    training = pipe.config.training
     physics = pipe.point(target) if config.fixed else pipe.udr()
-    wide = pipe.spread(physics, len(config.seeds))
-    step = jit_chunks(
-        lambda states, dist, target, n: pipe.train_chunk(states, dist, target, n)
+    return train_stage(
+        *(folder, "train", pipe, key, physics, target, config.seeds, config.chunk),
+        *(old, notes),
     )
-    states = run_stage(
-        folder,
-        "train",
-        training.iterations,
-        training_chunk(config.chunk, training),
-        lambda: pipe.train_init(key, wide, old),
-        lambda s, n: step(s, wide, target, n),
-        training_rows(config.seeds, training.steps_per_iteration),
-        notes,
-        per_step=training.steps_per_iteration,
-        seconds=expected(pipe.simulator),
-    )
-    return pipe.policies(states)
 
 
 def _settings(config: Config, method: str, robot: str, training: Any) -> dict[str, Any]:

@@ -168,10 +168,7 @@ def digest_of(path: Path) -> str:
     """SHA-256 of a file, hex.
 
     Raises:
-        UserError: it cannot be read.
+        OSError: it cannot be read.
     """
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {os_reason(error)}") from error
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from brax import math
 
 from easi_jax.errors import UserError, nearest
 
@@ -32,7 +33,7 @@ class Demonstrations:
         episodes: which recording each is of, ``(N,)``.
         skills: names of the skills that are labelled; may be empty.
         source: the file, for messages and records.
-        digest: SHA-256 of the file, and what was made of it; empty without one.
+        digest: SHA-256 of the file; empty without one.
         notes: what a user should know of the reading, one line each.
     """
 
@@ -258,11 +259,9 @@ def _plain_style(layout: Any, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     q, v, free = layout
     parts = [qpos[q], qvel[v]]
     for at, dof in zip(free[::2], free[1::2], strict=True):
-        w, x, y, z = qpos[at + 3 : at + 7]
-        up = jnp.stack(
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
-        )
-        forward = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)])
+        quaternion = qpos[at + 3 : at + 7]
+        up = math.inv_rotate(jnp.array([0.0, 0.0, 1.0]), quaternion)
+        forward = math.rotate(jnp.array([1.0, 0.0, 0.0]), quaternion)[:2]
         forward = forward / jnp.maximum(jnp.linalg.norm(forward), 1e-6)
         speed = qvel[dof : dof + 3]
         level = jnp.stack(

@@ -1,5 +1,6 @@
 """Networks of the policy and the critics: brax's, with saveable policy parameters."""
 
+from collections.abc import Callable
 from typing import Any
 
 import flax.struct
@@ -48,6 +49,19 @@ def make_networks(
         # brax hands its keyword dict over as the first argument.
         policy_network_kernel_init_fn=lambda _: jax.nn.initializers.lecun_uniform(),
     )
+
+
+def noisy(
+    policy: PolicyParams, noise: float
+) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    """``act(obs, key)``: the policy's mode with Gaussian noise of this standard
+    deviation, cut to [-1, 1]."""
+
+    def acts(obs: jax.Array, key: jax.Array) -> jax.Array:
+        mode = act(policy, obs, deterministic=True)
+        return jnp.clip(mode + noise * jax.random.normal(key, mode.shape), -1.0, 1.0)
+
+    return acts
 
 
 def act(

@@ -380,9 +380,9 @@ def steered(rate: float, target: float) -> optax.GradientTransformationExtraArgs
 
 def learning_rate_of(config: PpoConfig, state: PpoState) -> jax.Array:
     """The rate that the next update of a training has, ``()``."""
-    steered = optax.tree_utils.tree_get(state.optimizer, "rate")
-    if steered is not None:
-        return steered
+    now = optax.tree_utils.tree_get(state.optimizer, "rate")
+    if now is not None:
+        return now
     rate = _learning_rate(config)
     done = state.iteration * config.epochs * config.minibatches
     return jnp.asarray(rate(done) if callable(rate) else rate)

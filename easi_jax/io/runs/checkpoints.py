@@ -12,7 +12,6 @@ has begun, and cannot hold digests of files in the commit that writes them.
 """
 
 import contextlib
-import hashlib
 import logging
 import os
 import re
@@ -27,7 +26,7 @@ import numpy as np
 
 from easi_jax.devices import distributed
 from easi_jax.errors import UserError, engine_calls
-from easi_jax.io.files import os_reason, read_json, to_json
+from easi_jax.io.files import digest_of, os_reason, read_json, to_json
 
 FORMAT = 1
 KEEP = 2
@@ -286,9 +285,7 @@ def _digests(folder: Path) -> dict[str, str]:
     for path in sorted(p for p in folder.rglob("*") if not p.is_dir()):
         if path.is_symlink() or not path.is_file():
             raise _UnusableError(f"{path.name} is no file")
-        with path.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-        digests[path.relative_to(folder).as_posix()] = digest
+        digests[path.relative_to(folder).as_posix()] = digest_of(path)
     return digests
 
 
