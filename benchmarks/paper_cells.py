@@ -260,8 +260,11 @@ class _Bench:
 
         task = self._task(train)
         method = identifiers()[cell.method](cell)
+        demos = self.demos
+        if isinstance(method, Easi) and method.search.source == "policy":
+            demos = self._recorded_as(method.search)
         found = jax.block_until_ready(
-            method.fit(task, self.demos, Budget(), self.keys["search"])
+            method.fit(task, demos, Budget(), self.keys["search"])
         )
         truth = np.asarray(self.target, float)
         off = self._off(found.space.to_si(found.distribution.mean))
@@ -287,6 +290,21 @@ class _Bench:
         if cell.curves:
             row["curve"] = self._curve(curve[-1])
         return learned, row
+
+    def _recorded_as(self, search: Any) -> Any:
+        """The demonstrations as a search whose simulations run the controller has
+        them."""
+        import jax
+
+        from easi_jax.pipeline.stages import Pipeline
+
+        config = dataclasses.replace(self.pipe.config, search=search)
+        pipe = Pipeline(self.env, config, start=self.cell.start)
+        policy, key = jax.tree.map(
+            lambda x: x[None], (self.policy, self.keys["demonstrate"])
+        )
+        demos = jax.jit(pipe.demonstrate)(policy, self.target, key)
+        return jax.tree.map(lambda x: x[0], demos)
 
     def learned(self) -> tuple[Any, dict[str, Any]]:
         """The policy of a method that ends with one."""

@@ -264,7 +264,9 @@ def by_controller(
         policy=policy,
     )
     key = stage_keys(seed_keys([cell.seed]))["search"][0]
-    config = search_config("paper", cell.settings, cell.robot)
+    # A log holds positions and speeds, and not what the controller saw.
+    unseen = {"observation_inputs": False, "mask_resets": True}
+    config = search_config("paper", cell.settings, cell.robot, **unseen)
     found = Easi(config).fit(task, demos, Budget(), key)
     dist = found.distribution
     return {

@@ -137,22 +137,24 @@ def _solver(
     from easi_jax.simulation.simulator import Simulator
 
     simulator, noisy = Simulator(env.mj_model, space, env.dt), any(noise)
-    changes = {} if preset == "paper" else {"horizon": 8 if noisy else 1}
-    search = Search(
-        simulator,
-        make_preset(preset, generations=config.generations, **changes),
-        env=env,
-        act=lambda _, obs, key: controller(obs, key),
-    )
+    # Noise is of positions and velocities.
+    unlike = {"observation_inputs": not noisy}
+    changes = unlike if preset == "paper" else {"horizon": 8 if noisy else 1}
+    settings = make_preset(preset, generations=config.generations, **changes)
+    acts = lambda _, obs, key: controller(obs, key)  # noqa: E731
+    search = Search(simulator, settings, env=env, act=acts)
     deviation, nominal = jnp.asarray(noise), env.model()
 
-    def trajectories(key: jax.Array, count: int) -> Any:
-        return collect(env, nominal, controller, key, count, env.episode_length)
+    def trajectories(key: jax.Array, count: int, as_searched: bool = False) -> Any:
+        given = env, nominal, controller, key, count, env.episode_length
+        crosses = as_searched and search.config.crosses_resets
+        sees = as_searched and search.config.observation_inputs
+        return collect(*given, auto_reset=crosses, sees=sees)
 
     @jax.jit
     def demonstrate(key: jax.Array) -> Any:
         k_run, k_noise = jax.random.split(key)
-        runs = trajectories(k_run, config.trajectories)
+        runs = trajectories(k_run, config.trajectories, as_searched=True)
         return measured(runs, deviation, k_noise, simulator.configuration)
 
     @functools.partial(jax.jit, compiler_options=fast_loops())

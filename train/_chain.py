@@ -78,7 +78,7 @@ def ready(
         training=training,
         trajectories=config.trajectories,
         noise=config.noise,
-        refine=config.refine,
+        refine=config.finishes,
         restarts=config.restarts,
         warm_start=config.warm_start,
         eval_episodes=config.eval_episodes,

@@ -34,7 +34,7 @@ def run(config: Any) -> None:
 
         finish = started(
             lambda: ready_finish(
-                problem, search, config.refine, config.restarts or 0, say
+                problem, search, config.finishes, config.restarts or 0, say
             )
         )
         data = search_data(problem)
@@ -57,7 +57,10 @@ def _settings(config: Any, problem: "Problem") -> Any:
     from easi_jax.estimation.from_runs import replayed
     from train._robots import chosen_search
 
-    chosen = chosen_search(config, source="replay", horizon=problem.piece)
+    # Nobody knows what a controller saw where these logs were recorded.
+    chosen = chosen_search(
+        config, source="replay", horizon=problem.piece, observation_inputs=False
+    )
     if chosen.source != "replay" or chosen.policy_updates_per_generation:
         raise UserError(
             "logs come without their controller: leave source and "

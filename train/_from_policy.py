@@ -61,7 +61,7 @@ def _check_options(config: Any) -> None:
                 f"{flag} goes without --policy: where a robot is simulated under its "
                 "controller, no piece starts at a row of the log"
             )
-    if config.stand and not config.refine:
+    if config.stand and not config.finishes:
         raise UserError("--stand goes without --no-refine: the fit has use for it")
 
 
@@ -94,8 +94,10 @@ def read_problem(config: Any) -> "tuple[UnpairedProblem, Any, dict[str, Any]]":
         env, policy, robot = _controlled(config)
     given = dataclasses.replace(config, unmeasured=_unmeasured(config, env.mj_model))
     runs = _true(read_runs(given, env.mj_model, HORIZON), env.mj_model, config)
+    # Compared is what sensors read.
+    unseen = {"observation_inputs": False, "stale_first_observation": False}
     source = {"source": "policy", "innovation_inputs": False}
-    settings = chosen_search(config, env.name, **source)
+    settings = chosen_search(config, env.name, **source, **unseen)
     if settings.policy_updates_per_generation or settings.source != "policy":
         raise UserError(
             "no policy is trained from logs: leave source and "
@@ -284,7 +286,7 @@ def _finished(
     found = {}
     for k, seed in enumerate(seeds):
         end = states.result_mean[k], states.result_cov[k]
-        given = simulated, pieces, *end, keys[k], config.refine, say
+        given = simulated, pieces, *end, keys[k], config.finishes, say
         found[seed] = found_of(*given, known[k])
     good = {s: f for s, f in found.items() if np.isfinite(f.mean).all()}
     lost = {s: "too few simulations stay on their feet" for s in seeds if s not in good}

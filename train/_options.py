@@ -94,12 +94,18 @@ class SearchOptions:
     start: tuple[float, float] | None = None
     """Where the search starts, as factors on the nominal values; not given: where UDR
     trained."""
-    refine: bool = True
-    """Finish with least squares on the paired data."""
+    refine: bool | None = None
+    """Finish with least squares on the paired data; where not given, yes, but not for
+    the preset paper, which has no such finish."""
     restarts: int | None = None
     """More starts of the least-squares finish, drawn from the search's spread; the best
     fit counts. Not given: 2 for noisy data, none for clean ones, larger robots and
     logs."""
+
+    @property
+    def finishes(self) -> bool:
+        """Whether least squares follow the search."""
+        return self.preset != "paper" if self.refine is None else self.refine
 
 
 @dataclasses.dataclass(frozen=True)

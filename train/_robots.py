@@ -78,9 +78,11 @@ def recorded(given: Given, config: Any, training: Any) -> dict[str, Any]:
 _DIGEST = "demonstrations_sha256"
 
 
-# Gradient steps of the discriminator in a generation, where the reference's recipe has
-# other than the preset, which is Cartpole's.
-_PAPER_UPDATES = {"ant": 20, "ballbalance": 20}
+# Where the reference's recipe is another than the preset, which is Cartpole's.
+_PAPER = {
+    robot: {"discriminator_updates": 20, "stale_first_observation": True}
+    for robot in ("ant", "ballbalance")
+}
 
 
 def search_config(
@@ -97,9 +99,8 @@ def search_config(
 
     base = make(preset)
     known = asdict(base)
-    chosen = {k: v for k, v in changes.items() if v is not None}
-    if preset == "paper" and robot in _PAPER_UPDATES:
-        chosen["discriminator_updates"] = _PAPER_UPDATES[robot]
+    chosen = _PAPER.get(robot, {}) if preset == "paper" else {}
+    chosen |= {k: v for k, v in changes.items() if v is not None}
     for setting in settings:
         name, sign, text = setting.partition("=")
         if not sign or name not in known:

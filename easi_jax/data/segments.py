@@ -30,6 +30,8 @@ class Segments:
             simulation has use for it.
         hidden: what laws remember there (`easi_jax.data.law_states`), ``(M, S)``;
             likewise.
+        seen: what the controller saw and did, ``[s, a, s']`` of one step,
+            ``(M, obs_size + action_size + obs_size)``; () where nobody asks for it.
     """
 
     qpos: Any
@@ -43,6 +45,7 @@ class Segments:
     sensed: Any = ()
     time: Any = ()
     hidden: Any = ()
+    seen: Any = ()
 
     @property
     def count(self) -> int:
@@ -155,6 +158,7 @@ def windows(
         act=jax.tree.map(lambda x: flat(x[:, starts]), t.act),
         time=jax.tree.map(lambda x: flat(x[:, starts]), t.time),
         hidden=jax.tree.map(lambda x: flat(x[:, starts]), t.hidden),
+        seen=jax.tree.map(lambda x: flat(x[:, starts]), t.seen),
     )
 
 

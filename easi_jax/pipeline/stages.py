@@ -30,7 +30,7 @@ from easi_jax.rl.seeds import init_seeds, run_seeds
 from easi_jax.rl.trainer import TrainingConfig, make_trainer
 from easi_jax.search.config import SearchConfig
 from easi_jax.search.easi import Search, SearchData, SearchInfo, SearchState
-from easi_jax.simulation.rollout import collect, measured
+from easi_jax.simulation.rollout import collect, last_seen, measured
 
 
 @dataclass(frozen=True)
@@ -182,6 +182,12 @@ class Pipeline:
                 f"noise has {len(config.noise)} numbers: {env.name} needs {2 * nv}, "
                 f"for {', '.join(env.simulator.state_names)}"
             )
+        if config.search.observation_inputs and any(x > 0 for x in config.noise):
+            raise UserError(
+                "noise is of positions and velocities, and the search compares what "
+                "the controller observes: set observation_inputs=false (and "
+                "stale_first_observation=false) to compare positions and velocities"
+            )
         self.env, self.config, self.mesh = env, config, mesh or make_mesh()
         self.real = env if real is None else real
         space = env.space if start is None else env.space.scaled(*start)
@@ -261,24 +267,32 @@ class Pipeline:
     ) -> Segments:
         """What sensors record of the policies in the target, ``(S, B, T, 1, ...)``.
 
-        The controller acts stochastically, as in the paper.
+        The controller acts stochastically, as in the paper. Resets, and what the
+        controller sees first, are as in the search's simulations.
         """
-        c, env = self.config, self.real
+        c, env, search = self.config, self.real, self.config.search
 
         def one(item: Any) -> Segments:
             policy, key = item
             k_run, k_noise = jax.random.split(key)
-            trajectories = collect(
-                env,
-                env.model(target),
-                lambda obs, k: act(policy, obs, k),
-                k_run,
-                c.trajectories,
-                env.episode_length,
-                self.simulator.past_steps,
-            )
+
+            def trajectories(key: jax.Array, stale: Any = None) -> Segments:
+                return collect(
+                    *(env, env.model(target), lambda obs, k: act(policy, obs, k)),
+                    *(key, c.trajectories, env.episode_length),
+                    past=self.simulator.past_steps,
+                    auto_reset=search.crosses_resets,
+                    sees=search.observation_inputs,
+                    stale=stale,
+                )
+
+            stale = None
+            if search.stale_first_observation:
+                before = trajectories(jax.random.fold_in(k_run, 1))
+                stale = last_seen(before, env.obs_size)
             return measured(
-                trajectories, self.noise, k_noise, self.simulator.configuration
+                *(trajectories(k_run, stale), self.noise, k_noise),
+                self.simulator.configuration,
             )
 
         return jax.lax.map(one, (policies, keys))

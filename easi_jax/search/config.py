@@ -47,6 +47,10 @@ class SearchConfig:
     spread of what is measured and simulated, instead of s'."""
     delta_inputs: bool = True
     """Show s' - s instead of s' (where innovation_inputs is off)."""
+    observation_inputs: bool = False
+    """Show what the controller sees and does (observation, action, next observation)
+    in place of state and commands; for source policy, without innovation_inputs and
+    delta_inputs."""
     standardize_inputs: bool = True
     """Standardize the discriminator's inputs by the measured data."""
     steady_learning: bool = True
@@ -54,6 +58,13 @@ class SearchConfig:
     generation moves the discriminator as far as with 20."""
     clip_after_update: bool = True
     """Clip discriminator weights after each step (Algorithm 1), not before."""
+    epsilon_in_root: bool = True
+    """RMSprop divides by sqrt(v + 1e-8), not by sqrt(v) + 1e-8."""
+    half_loss: bool = False
+    """Half of Eq. 4; RMSprop's step hardly changes by it."""
+    positive_weights: bool = True
+    """With an elite_ratio above a half, individuals of the worse half weigh nothing
+    in the recombination (their weights are negative otherwise)."""
     uniform_first_generation: bool = True
     """Evaluate a truly uniform first generation, not a moment-matched Gaussian."""
     last_evaluation: bool = True
@@ -61,7 +72,11 @@ class SearchConfig:
     respect_bounds: bool = True
     """Keep individuals and samples of the result inside the physical bounds."""
     mask_resets: bool = True
-    """No transition crosses a reset."""
+    """No transition crosses a reset; otherwise trajectories that run the controller go
+    on after one, and the discriminator sees the transition across."""
+    stale_first_observation: bool = False
+    """At a trajectory's first step the controller sees the end of the trajectory
+    before (nothing, zeros, before the first); goes with observation_inputs."""
     common_random_numbers: bool = True
     """Same starts and noise for all individuals of a generation."""
     spread_about: str = "old_mean"
@@ -99,12 +114,27 @@ class SearchConfig:
                 raise UserError(
                     f"search {field} is {getattr(self, field)}: give at least 1"
                 )
+        others = self.innovation_inputs or self.delta_inputs or self.source != "policy"
+        if self.observation_inputs and others:
+            raise UserError(
+                "search observation_inputs shows what a controller sees: it goes with "
+                "source=policy, innovation_inputs=false and delta_inputs=false"
+            )
+        if self.stale_first_observation and not self.observation_inputs:
+            raise UserError(
+                "search stale_first_observation goes with observation_inputs=true"
+            )
         if self.population < 4:
             raise UserError(f"search population is {self.population}: give at least 4")
         if not 0 < self.elite_ratio <= 1:
             raise UserError(
                 f"search elite_ratio is {self.elite_ratio}: give a share in (0, 1]"
             )
+
+    @property
+    def crosses_resets(self) -> bool:
+        """Whether trajectories go on after a reset."""
+        return self.source == "policy" and not self.mask_resets
 
 
 DEFAULT = SearchConfig()
@@ -116,9 +146,13 @@ PAPER = SearchConfig(
     discriminator_updates=10,
     innovation_inputs=False,
     delta_inputs=False,
+    observation_inputs=True,
     standardize_inputs=False,
     steady_learning=False,
     clip_after_update=False,
+    epsilon_in_root=False,
+    half_loss=True,
+    positive_weights=False,
     uniform_first_generation=False,
     last_evaluation=False,
     respect_bounds=True,

@@ -40,6 +40,8 @@ class CriticConfig:
     clip_after_update: bool = flax.struct.field(pytree_node=False, default=True)
     penalty: float = flax.struct.field(pytree_node=False, default=10.0)
     learning_rate: float = flax.struct.field(pytree_node=False, default=3e-4)
+    epsilon_in_root: bool = flax.struct.field(pytree_node=False, default=True)
+    loss_scale: float = flax.struct.field(pytree_node=False, default=1.0)
 
 
 @flax.struct.dataclass
@@ -51,7 +53,9 @@ class CriticState:
 
 
 def _optimizer(config: CriticConfig) -> optax.GradientTransformation:
-    return optax.rmsprop(config.learning_rate, decay=0.99)
+    return optax.rmsprop(
+        config.learning_rate, decay=0.99, eps_in_sqrt=config.epsilon_in_root
+    )
 
 
 def init(config: CriticConfig, key: jax.Array, features: int) -> CriticState:
@@ -114,6 +118,7 @@ def update(
             loss -= jnp.sum(weight * jax.nn.log_sigmoid(-on_fake))
         else:
             loss = jnp.sum(weight * on_fake) - jnp.mean(on_real)
+        loss *= config.loss_scale
         if config.regularizer == "gradient_penalty":
             n = min(real.shape[0], fake.shape[0])
             mix = jax.random.uniform(key, (n, 1))

@@ -5,6 +5,7 @@ discriminator on measured against simulated transitions, let its mean score be t
 fitness, update the distribution.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -24,7 +25,7 @@ from easi_jax.search import discriminator as critic
 from easi_jax.search.config import SearchConfig
 from easi_jax.search.evolution import make_strategy
 from easi_jax.simulation import open_loop
-from easi_jax.simulation.rollout import policy_rollout
+from easi_jax.simulation.rollout import last_seen, policy_rollout
 from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.slopes import shift_start
 
@@ -61,6 +62,8 @@ class SearchState:
     Attributes:
         mean, cov: the distribution in unit coordinates, ``(n,)``, ``(n, n)``.
         result_mean, result_cov: what `last_evaluation` says is the result.
+        observed: by `stale_first_observation`, where each individual's trajectory of
+            the generation before ended, ``(N, obs_size)``; () without it.
     """
 
     strategy: Any
@@ -72,6 +75,7 @@ class SearchState:
     generation: jax.Array
     key: jax.Array
     training: Any
+    observed: Any = ()
 
 
 @flax.struct.dataclass
@@ -141,6 +145,7 @@ class Search:
             self.space.size,
             config.elite_ratio,
             config.spread_about,
+            config.positive_weights,
         )
         self.critic_config = critic.CriticConfig(
             hidden=config.hidden,
@@ -148,6 +153,8 @@ class Search:
             regularizer=config.regularizer,
             clip_after_update=config.clip_after_update,
             learning_rate=config.learning_rate * _pace(config),
+            epsilon_in_root=config.epsilon_in_root,
+            loss_scale=0.5 if config.half_loss else 1.0,
         )
 
     # -- state ---------------------------------------------------------------
@@ -160,6 +167,8 @@ class Search:
         n = self.space.size
         k_es, k_critic, k_run = jax.random.split(key, 3)
         mean, std = jnp.full(n, 0.5), jnp.full(n, 12.0**-0.5)
+        stale = self.config.stale_first_observation
+        size = (self.config.population, self.env.obs_size) if stale else ()
         cov = jnp.diag(std**2)
         return SearchState(
             strategy=self.strategy.init(k_es, mean, std),
@@ -171,10 +180,13 @@ class Search:
             generation=jnp.zeros((), jnp.int32),
             key=k_run,
             training=training if self.trainer else (),
+            observed=jnp.zeros(size) if stale else (),
         )
 
     def _width(self, data: SearchData) -> int:
         """How many numbers the discriminator sees."""
+        if self.config.observation_inputs:
+            return int(data.segments.seen.shape[1])
 
         def inputs(s: Segments) -> tuple[jax.Array, jax.Array]:
             outcome = self._outcome(s, (s.next_qpos, s.next_qvel))
@@ -205,7 +217,8 @@ class Search:
         low, high = self.space.unit_bounds
         population = jnp.clip(raw, low, high) if c.respect_bounds else raw
 
-        real, fake, weight, finite = self._simulate(state, data, population, k_sim)
+        simulated = self._simulate(state, data, population, k_sim)
+        real, fake, weight, finite, observed = simulated
         trained, loss = self._train_critic(state.critic, k_critic, real, fake, weight)
         fitness = critic.fitness(self.critic_config, trained, fake, weight)
         told, cost = _only_finite(population, -fitness, finite)
@@ -242,6 +255,7 @@ class Search:
             generation=state.generation + 1,
             key=key,
             training=training,
+            observed=observed,
         )
         info = SearchInfo(
             mean=mean,
@@ -306,13 +320,18 @@ class Search:
 
     def _simulate(
         self, state: SearchState, data: SearchData, population: jax.Array, key: Any
-    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, Any]:
         """Discriminator inputs: real ``(K, F)``, simulated ``(N, K', F)``, weights
-        ``(N, K')`` and which individuals stayed finite ``(N,)``."""
+        ``(N, K')``, which individuals stayed finite ``(N,)``, and what the next state
+        has as ``observed``."""
         theta = self.space.to_si(population)
         center = self.space.to_si(state.mean)
-        simulate = self._replay if self.config.source == "replay" else self._roll
-        simulated = simulate(data, theta, center, key)
+        if self.config.source == "replay":
+            simulated = self._replay(data, theta, center, key)
+        else:
+            simulated = self._roll(state, data, theta, center, key)
+        if self.config.observation_inputs:
+            return self._observed(data, simulated[0], simulated[2])
         real_seg, real_ref, fake_seg, fake_ref = simulated
         real_out = self._outcome(real_seg, real_ref)
         fake_out = jax.vmap(self._outcome)(fake_seg, fake_ref)
@@ -326,7 +345,22 @@ class Search:
         real = jnp.concatenate([base(real_seg), real_out], -1)
         fake = jnp.concatenate([jax.vmap(base)(fake_seg), fake_out], -1)
         fake = jnp.where(ok[..., None], fake, 0.0)
-        return real, fake, weight, ok.all(1)
+        return real, fake, weight, ok.all(1), ()
+
+    def _observed(
+        self, data: SearchData, real: Segments, fake: Segments
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, Any]:
+        """As `_simulate`: what the controller saw and did."""
+        c, seen = self.config, fake.seen
+        ok = jnp.isfinite(seen).all(-1)
+        seen = jnp.where(ok[..., None], seen, 0.0)
+        stale = c.stale_first_observation
+        last = last_seen(dataclasses.replace(fake, seen=seen), self.env.obs_size)
+        told, weight = real.seen, fake.weight * ok
+        if c.standardize_inputs:
+            mid, std = moments(data.segments.seen, data.segments.weight)
+            told, seen = (told - mid) / std, (seen - mid) / std
+        return told, seen, weight, ok.all(1), last if stale else ()
 
     def _replay(
         self, data: SearchData, theta: jax.Array, center: jax.Array, key: Any
@@ -385,7 +419,12 @@ class Search:
         return seg, reference, fake, jax.tree.map(tile, reference)
 
     def _roll(
-        self, data: SearchData, theta: jax.Array, center: jax.Array, key: Any
+        self,
+        state: SearchState,
+        data: SearchData,
+        theta: jax.Array,
+        center: jax.Array,
+        key: Any,
     ) -> tuple[Segments, Any, Segments, Any]:
         """Every individual runs the controller from a reset."""
         c, n = self.config, theta.shape[0]
@@ -397,25 +436,38 @@ class Search:
 
         def trajectories(chunk: Any, policy: Any, model: Any) -> Any:
             def one(item: Any) -> Any:
-                t, k = item
+                t, k, *stale = item
                 seg = policy_rollout(
                     self.env,
                     self.simulator.model(t),
                     lambda obs, kk: self.act(policy, obs, kk),  # type: ignore[misc]
                     k,
                     c.rollout_steps,
-                    auto_reset=not c.mask_resets,
+                    auto_reset=c.crosses_resets,
                     past=self.simulator.past_steps,
+                    sees=c.observation_inputs,
+                    stale=stale[0] if stale else None,
                 )
                 return seg, self._reference(model, seg)
 
             return jax.lax.map(one, chunk, batch_size=self.simulator.batch)
 
+        items = (theta, keys)
+        if c.stale_first_observation:
+            items += (state.observed,)
         fake, reference = sharded_map(
-            trajectories, self.mesh, (theta, keys), data.policy, model
+            trajectories, self.mesh, items, data.policy, model
         )
-        count = min(c.real_batch, data.segments.count)
-        real = data.segments.take(pick(k_pick, data.segments.weight, count))
+        # Each step of the discriminator draws its batch from all that was measured,
+        # but where a prediction is needed of each row.
+        known = data.segments
+        count = known.count
+        if c.innovation_inputs:
+            count = min(c.real_batch, count)
+        if c.crosses_resets:
+            fake = dataclasses.replace(fake, weight=jnp.ones_like(fake.weight))
+            known = dataclasses.replace(known, weight=jnp.ones_like(known.weight))
+        real = known.take(pick(k_pick, known.weight, count))
         return real, self._reference(model, real), fake, reference
 
     # -- discriminator inputs ------------------------------------------------

@@ -36,14 +36,15 @@ class _MuLambda(SimpleES):
 
     def _tell(self, key, population, fitness, state, params):  # type: ignore[no-untyped-def]
         new = super()._tell(key, population, fitness, state, params)
+        about = new.mean if self.about_new_mean else state.mean
+        # Negative weights may leave a variance below zero, which has no root.
+        var = jnp.maximum(jnp.dot(fitness, (population - about) ** 2), 0.0)
+        std = (1 - params.c_std) * state.std + params.c_std * jnp.sqrt(var)
         if not self.about_new_mean:
             # A discriminator that lags behind a moving mean feeds a spread that
             # grows without end; twice the start is enough to get anywhere.
-            return new.replace(std=jnp.minimum(new.std, 2.0 * params.std_init))
-        var = jnp.dot(fitness, (population - new.mean) ** 2)
-        return new.replace(
-            std=(1 - params.c_std) * state.std + params.c_std * jnp.sqrt(var)
-        )
+            std = jnp.minimum(std, 2.0 * params.std_init)
+        return new.replace(std=std)
 
 
 class Strategy(NamedTuple):
@@ -66,20 +67,28 @@ def names() -> tuple[str, ...]:
     return (MU_LAMBDA, *(n for n in algorithms if n not in _LEFT_OUT))
 
 
-def recombination_weights(population_size: int, elites: int) -> jax.Array:
+def recombination_weights(
+    population_size: int, elites: int, positive: bool = True
+) -> jax.Array:
     """w_i ~ ln(0.5 (lambda + 1)) - ln i over the best ``elites``, summing to one.
 
     (mu/mu_I, lambda)-ES as in EASI's reference: w_1 = 0.0341 and mu_eff = 78.0 for
-    lambda = 300, mu = 150.
+    lambda = 300, mu = 150. Those of the worse half of all, which are negative, are zero
+    where ``positive``.
     """
     rank = jnp.arange(1, population_size + 1)
     w = jnp.log(0.5 * (population_size + 1)) - jnp.log(rank)
-    w = jnp.where(rank <= elites, jnp.maximum(w, 0.0), 0.0)
+    w = jnp.where(rank <= elites, jnp.maximum(w, 0.0) if positive else w, 0.0)
     return w / w.sum()
 
 
 def _algorithm(
-    name: str, population_size: int, size: int, elite_ratio: float, spread_about: str
+    name: str,
+    population_size: int,
+    size: int,
+    elite_ratio: float,
+    spread_about: str,
+    positive: bool,
 ) -> tuple[Any, Any]:
     """evosax's object and its parameters; arguments as in `make_strategy`."""
     blank = jnp.zeros(size)
@@ -88,7 +97,7 @@ def _algorithm(
         es = _MuLambda(population_size, blank)
         es.about_new_mean = spread_about == "new_mean"
         es.elite_ratio = elite_ratio
-        weights = recombination_weights(population_size, es.num_elites)
+        weights = recombination_weights(population_size, es.num_elites, positive)
         base = es.default_params.replace(weights=weights, c_std=1.0)
     elif name == "RandomSearch":
         es = algorithms[name](
@@ -109,6 +118,7 @@ def make_strategy(
     size: int,
     elite_ratio: float = 0.5,
     spread_about: str = "old_mean",
+    positive: bool = True,
 ) -> Strategy:
     """The strategy ``name`` for ``size`` parameters.
 
@@ -117,6 +127,7 @@ def make_strategy(
             ``Sep_CMA_ES``, ``SNES``, ...).
         elite_ratio: mu / lambda, for ``mu_lambda``.
         spread_about: ``old_mean`` or ``new_mean``, for ``mu_lambda``.
+        positive: no weight is negative, for ``mu_lambda``.
 
     Raises:
         UserError: unknown name, or one that cannot search here, with the reason.
@@ -127,7 +138,9 @@ def make_strategy(
         raise UserError(f'unknown strategy "{name}"{nearest(name, names())}')
     if spread_about not in ("old_mean", "new_mean"):
         raise UserError(f'spread_about is "{spread_about}": old_mean or new_mean')
-    es, base = _algorithm(name, population_size, size, elite_ratio, spread_about)
+    es, base = _algorithm(
+        name, population_size, size, elite_ratio, spread_about, positive
+    )
     population_based = not isinstance(es, DistributionBasedAlgorithm)
 
     def params_of(std: jax.Array) -> Any:

@@ -245,7 +245,7 @@ class UnpairedSearch(Search):
 
     def _simulate(  # type: ignore[override]
         self, state: SearchState, data: UnpairedData, population: jax.Array, key: Any
-    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, Any]:
         c = self.config
         k_pick, k_roll = jax.random.split(key)
         theta = self.space.to_si(population)
@@ -273,7 +273,7 @@ class UnpairedSearch(Search):
             return jnp.concatenate([*parts], -1)
 
         fakes = jnp.where(weigh > 0, inputs(fake), 0.0)
-        return inputs(real), fakes, weight, sound
+        return inputs(real), fakes, weight, sound, ()
 
 
 class Simulations:

@@ -1,5 +1,6 @@
 """Trajectories of a controller in an environment, as segments of one step."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -21,19 +22,25 @@ def policy_rollout(
     steps: int,
     auto_reset: bool = False,
     past: int = 0,
+    sees: bool = False,
+    stale: jax.Array | None = None,
 ) -> Segments:
     """One trajectory of ``act(obs, key) -> action`` from a reset.
 
-    ``past``: how many commands before each step the segments hold; those before an
-    episode's first are that one.
+    Args:
+        past: how many commands before each step the segments hold; those before an
+            episode's first are that one.
+        sees: the segments hold what the controller saw and did, too.
+        stale: what the controller sees at the first step in place of the state there,
+            ``(obs_size,)``.
 
     Returns:
         Segments with horizon 1, ``(steps, 1, ...)``, weight 1 where the transition
         counts, with what sensors read where each step begins, where the simulator
         reads some (`easi_jax.simulation.reading`). Without ``auto_reset`` the
         trajectory ends at termination and later weights are 0. With it, as in EASI's
-        reference, the state after a termination is that of the next episode, and the
-        transition across is kept.
+        reference, the state after a termination or the time limit is that of the next
+        episode; the transition across has weight 0.
     """
     k_reset, k_run = jax.random.split(key)
 
@@ -44,9 +51,10 @@ def policy_rollout(
         ctrl = env.control(state, action)
         sent = jnp.where(begun, sent, ctrl)
         new = env.step(model, state, action)
-        done = new.terminated > 0
-        after = new
+        done, weight, after = new.terminated > 0, alive, new
         if auto_reset:
+            done |= new.truncated > 0
+            weight = 1.0 - done
             fresh = env.reset(model, k_again)
             after = jax.tree.map(lambda a, b: jnp.where(done, a, b), fresh, new)
         seg = Segments(
@@ -55,12 +63,13 @@ def policy_rollout(
             ctrl=ctrl[None],
             next_qpos=after.physics.qpos[None],
             next_qvel=after.physics.qvel[None],
-            weight=alive,
+            weight=weight,
             past=sent if past else (),
             act=state.physics.act if state.physics.act.size else (),
             sensed=_read(new.physics),
             time=state.physics.time,
             hidden=state.physics.hidden,
+            seen=jnp.concatenate([state.obs, action, after.obs]) if sees else (),
         )
         sent = jnp.concatenate([sent, ctrl[None]])[1:]
         if auto_reset:
@@ -70,6 +79,8 @@ def policy_rollout(
         return (held, alive * (1.0 - done), (sent, jnp.ones((), bool))), seg
 
     first = env.reset(model, k_reset)
+    if stale is not None:
+        first = dataclasses.replace(first, obs=stale)
     ctrl = jax.eval_shape(lambda s: env.control(s, act(s.obs, k_run)), first)
     sent = jnp.zeros((past, *ctrl.shape))
     init = (first, jnp.ones(()), (sent, jnp.zeros((), bool)))
@@ -91,13 +102,25 @@ def collect(
     trajectories: int,
     steps: int,
     past: int = 0,
+    auto_reset: bool = False,
+    sees: bool = False,
+    stale: jax.Array | None = None,
 ) -> Segments:
-    """``trajectories`` rollouts of one model: leaves ``(B, steps, ...)``; ``past`` as
-    for `policy_rollout`."""
-    keys = jax.random.split(key, trajectories)
-    return jax.vmap(lambda k: policy_rollout(env, model, act, k, steps, past=past))(
-        keys
-    )
+    """``trajectories`` rollouts of one model: leaves ``(B, steps, ...)``; other
+    arguments as for `policy_rollout`, ``stale`` ``(B, obs_size)``."""
+
+    def one(key: jax.Array, stale: jax.Array | None) -> Segments:
+        return policy_rollout(
+            env, model, act, key, steps, auto_reset, past, sees, stale
+        )
+
+    return jax.vmap(one)(jax.random.split(key, trajectories), stale)
+
+
+def last_seen(trajectories: Segments, obs_size: int) -> jax.Array:
+    """The last observation of trajectories ``(B, T, ...)`` that hold what was seen,
+    ``(B, obs_size)``."""
+    return trajectories.seen[:, -1, -obs_size:]
 
 
 def measured(
@@ -130,4 +153,5 @@ def measured(
         act=t.act,
         time=t.time,
         hidden=t.hidden,
+        seen=t.seen,
     )

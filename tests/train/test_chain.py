@@ -1,5 +1,6 @@
 """train.udr, train.easi, train.evaluate and train.pipeline, end to end and small."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -25,7 +26,7 @@ from easi_jax.simulation.rollout import policy_rollout
 from tests.commands import command, refused
 from tests.tiny_robot.env import XML, Tiny
 from train import easi, evaluate, export, pipeline, udr
-from train._robots import load_policies, training_config
+from train._robots import load_policies, search_config, training_config
 
 # The whole chain is compiled here; on a busy machine that takes its time.
 pytestmark = pytest.mark.timeout(1500)
@@ -224,6 +225,49 @@ def _moved(run: Path, fresh: bool = False) -> float:
     return sum(jax.tree.leaves(apart)) ** 0.5
 
 
+def test_demonstrations_of_the_preset_paper() -> None:
+    """They cross resets, hold what is seen, and begin with a stale observation."""
+    search = search_config("paper", ("rollout_steps=40",), "ant")
+    assert search.discriminator_updates == 20 and search.stale_first_observation
+    assert not search_config("paper", (), "cartpole").stale_first_observation
+    env = Tiny()
+    config = PipelineConfig(training_config(env, 2400), trajectories=6)
+    config = dataclasses.replace(config, search=search)
+    pipe = Pipeline(env, config)
+    wide = pipe.spread(pipe.udr(), 1)
+    policies = pipe.policies(pipe.train_init(seed_keys([0]), wide))
+    target = jnp.asarray(env.space.nominal)
+    demos = jax.jit(pipe.demonstrate)(policies, target, seed_keys([1]))
+    seen, last = np.asarray(demos.seen), env.episode_length - 1
+    assert seen.shape == (1, 6, last + 1, 2 * env.obs_size + env.action_size)
+    size = env.obs_size
+    np.testing.assert_array_equal(seen[..., 1:, :size], seen[..., :-1, -size:])
+    # The time limit ends an episode, and the last transition crosses to the next.
+    assert (np.asarray(demos.weight)[..., last] == 0).all()
+    states = np.concatenate([demos.qpos, demos.qvel], -1)
+    np.testing.assert_allclose(states[..., 1:, :], seen[..., 1:, :size], atol=1e-5)
+    assert not np.isclose(states[..., 0, :], seen[..., 0, :size]).all(-1).any()
+
+
+def test_the_preset_paper_has_no_finish_unless_asked_for() -> None:
+    options = easi.Config(preset="paper")
+    assert not options.finishes and dataclasses.replace(options, refine=True).finishes
+    assert easi.Config().finishes
+
+
+@pytest.mark.slow
+def test_the_preset_paper_goes_through(chain: Path, tmp_path: Path) -> None:
+    given = ("--env", ENV, "--udr", chain / "udr", *TARGET, "--chunk", 24)
+    small = ("--set", "rollout_steps=20", "real_batch=64", "discriminator_updates=2")
+    out = tmp_path / "run"
+    command(
+        easi, *given, *SEARCH, *small, "--eval-episodes", 4, "--preset", "paper",
+        "--warm-start", "--out", out,
+    )  # fmt: skip
+    found = json.loads((out / "distribution.json").read_text())["seeds"]["0"]
+    assert np.isfinite(found["mean"]).all()
+
+
 @pytest.mark.slow
 def test_warm_start_goes_on_from_the_first_networks_alone(chain: Path) -> None:
     assert _moved(chain / "easi") < 0.3 * _moved(chain / "easi", fresh=True)
@@ -255,6 +299,12 @@ def test_warm_start_goes_on_from_the_first_networks_alone(chain: Path) -> None:
         (pipeline, ("--set", "segmnts=3"), 'did you mean "segments"?'),
         (pipeline, ("--set", "loss=hinge"), "loss"),
         (pipeline, ("--noise", "0.1"), "noise"),
+        (
+            pipeline,
+            ("--preset", "paper", "--noise", *("0.01",) * 4),
+            "observation_inputs=false",
+        ),
+        (pipeline, ("--set", "observation_inputs=true"), "source=policy"),
     ],
 )
 @pytest.mark.fault("wrong options and files")

@@ -63,6 +63,8 @@ class Servo(Simulator):
 class ServoEnv:
     """Fails beyond 0.22 m."""
 
+    obs_size = 2
+
     def __init__(self, simulator: Simulator) -> None:
         self.simulator = simulator
 
@@ -114,6 +116,7 @@ def measured() -> Segments:
         next_qpos=after.qpos[:, None],
         next_qvel=after.qvel[:, None],
         weight=jnp.ones(60),
+        seen=jnp.concatenate([s, u, after.qpos, after.qvel], 1),
     )
 
 
@@ -152,12 +155,21 @@ def reference(config: SearchConfig) -> Any:
 
 PLAIN = dataclasses.replace(BASE, innovation_inputs=False)
 ROLL = dataclasses.replace(BASE, source="policy")
+SEEN = dataclasses.replace(
+    ROLL, innovation_inputs=False, delta_inputs=False, observation_inputs=True
+)
 SWITCHES: tuple[tuple[SearchConfig, dict[str, Any]], ...] = (
     (BASE, {"innovation_inputs": False}),
     (PLAIN, {"delta_inputs": False}),
     (PLAIN, {"standardize_inputs": False}),
     (BASE, {"steady_learning": False}),
     (BASE, {"clip_after_update": False}),
+    (BASE, {"epsilon_in_root": False}),
+    (BASE, {"half_loss": True}),
+    (dataclasses.replace(BASE, elite_ratio=0.8), {"positive_weights": False}),
+    (SEEN, {"observation_inputs": False}),
+    (SEEN, {"stale_first_observation": True}),
+    (SEEN, {"standardize_inputs": False}),
     (BASE, {"uniform_first_generation": False}),
     (BASE, {"last_evaluation": False}),
     (ROLL, {"mask_resets": False}),
@@ -237,6 +249,20 @@ def test_bounds_are_respected_or_not() -> None:
         state, info = one_generation(config, servo(space=tight))
         assert (np.asarray(info.at_bound[0]) > 0).all() == respect
         assert (state.mean >= low).all() and (state.mean <= high).all()
+
+
+def test_a_trajectory_begins_with_the_end_of_the_one_before() -> None:
+    search = make(dataclasses.replace(SEEN, stale_first_observation=True))
+    state = search.init(jax.random.key(0), data())
+    assert state.observed.shape == (24, 2) and not state.observed.any()
+    step = jax.jit(search.step)
+    first, _ = step(state, data())
+    second, _ = step(first, data())
+    assert first.observed.any(1).all()
+    assert not np.isclose(first.observed, second.observed).all(1).any()
+    # What comes first is what the policy acts on: another end, another trajectory.
+    other, _ = step(dataclasses.replace(first, observed=-first.observed), data())
+    assert not np.isclose(other.observed, second.observed).all(1).any()
 
 
 @pytest.fixture(scope="module")
@@ -427,6 +453,11 @@ def test_policy_training_goes_along() -> None:
 @pytest.mark.parametrize(
     ("change", "told"),
     [
+        ({"observation_inputs": True}, "observation_inputs shows what a controller"),
+        (
+            {"stale_first_observation": True},
+            "stale_first_observation goes with observation_inputs",
+        ),
         ({"source": "relpay"}, 'source is "relpay".*did you mean "replay"'),
         ({"loss": "wgan"}, "wasserstein, gan"),
         ({"regularizer": "l2"}, "gradient_penalty"),

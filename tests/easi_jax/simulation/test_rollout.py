@@ -76,12 +76,36 @@ def test_auto_reset_keeps_the_transition_across() -> None:
     seg = rollout.policy_rollout(
         Walker(), jnp.asarray(0.2), forward, jax.random.key(0), STEPS, auto_reset=True
     )
-    assert (seg.weight == 1).all()
     jump = np.asarray(seg.next_qpos[:, 0, 0] - seg.qpos[:, 0])
     crossing = jump < -0.5
     assert crossing.sum() >= 2
+    np.testing.assert_array_equal(seg.weight, ~crossing)
     np.testing.assert_array_equal(seg.qpos[1:, 0], seg.next_qpos[:-1, 0, 0])
     assert (seg.next_qpos[crossing, 0, 0] <= 0.2).all()
+
+
+def test_what_is_seen_and_done_is_kept() -> None:
+    env: Any = Walker()
+
+    def act(obs: jax.Array, key: jax.Array) -> jax.Array:
+        return 1.0 + obs
+
+    def run(stale: jax.Array | None) -> np.ndarray:
+        given = env, jnp.asarray(0.1), act, jax.random.key(1), 3, 6
+        return np.asarray(rollout.collect(*given, sees=True, stale=stale).seen)
+
+    seen = run(None)
+    assert seen.shape == (3, 6, 3)
+    before, action, after = seen[..., 0], seen[..., 1], seen[..., 2]
+    np.testing.assert_array_equal(before[:, 1:], after[:, :-1])
+    np.testing.assert_allclose(action, 1 + before, rtol=1e-6)
+    stale = run(jnp.full((3, 1), 0.7))
+    np.testing.assert_allclose(stale[:, 0, :2], [[0.7, 1.7]] * 3, rtol=1e-6)
+    # It moves from where it is, by what it does about what it sees.
+    np.testing.assert_allclose(stale[:, 0, 2], before[:, 0] + 0.17, rtol=1e-5)
+    np.testing.assert_allclose(
+        rollout.last_seen(Segments(*(0,) * 6, seen=stale), 1), stale[:, -1, 2:]
+    )
 
 
 def test_trajectories_are_independent(ended: Segments) -> None:
