@@ -115,7 +115,7 @@ def check_out(path: Path) -> None:
 
 
 def read_rows(path: Path, names: Sequence[str] = ()) -> list[dict[str, Any]]:
-    """One a cell; none where the file is missing.
+    """One a cell, its last one; none where the file is missing.
 
     What a killed process left of its last line is no row; `add_row` takes it away.
 
@@ -147,7 +147,9 @@ def read_rows(path: Path, names: Sequence[str] = ()) -> list[dict[str, Any]]:
                 "or name another --out"
             )
         rows.append(row)
-    return rows
+    # A cell that was run again has its last line.
+    last = {row["key"]: k for k, row in enumerate(rows) if "key" in row}
+    return [row for k, row in enumerate(rows) if last.get(row.get("key"), k) == k]
 
 
 def add_row(path: Path, row: dict[str, Any]) -> None:

@@ -3,7 +3,7 @@
 import dataclasses
 import fcntl
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +106,39 @@ def learners() -> dict[str, Callable[[Cell], Any]]:
         "FineTune, no random actions": lambda _: FineTune(random_steps=0),
         "GARAT": lambda _: Garat(),
     }
+
+
+# What changed figures of a method since its first rows. A row says how many of these
+# its method had (``recipe``); one that lacks some is stale.
+_FINISH = (
+    "the least-squares finish fits unknown starts, and the initial range counts in its "
+    "mean",
+)
+_CHANGES = {
+    "EASI paper": (
+        "the discriminator sees the robot's observations and a fresh measured batch at "
+        "each step, RMSprop's epsilon is outside the root, and demonstrations cross "
+        "resets as simulations do",
+    ),
+    "EASI default": _FINISH,
+    WARM[1]: _FINISH,
+    AFTER_GAP: _FINISH,
+}
+
+
+def changes(method: str) -> tuple[str, ...]:
+    """What changed figures of a method, in order."""
+    return _CHANGES.get(method, ())
+
+
+def recipe(method: str) -> int:
+    """How many changes of its figures a method has behind it."""
+    return len(changes(method))
+
+
+def is_stale(row: Mapping[str, Any]) -> bool:
+    """Whether a row was made before its method changed."""
+    return row.get("recipe", 0) < recipe(row["method"])
 
 
 METHODS = (

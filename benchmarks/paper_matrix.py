@@ -4,12 +4,18 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from benchmarks._common import commits_of, markdown_table
-from benchmarks.paper import CHANGED, EXPERIMENTS, MUST, SEARCHES, Config, cells
-from benchmarks.paper_cells import METHODS
+from benchmarks.paper_cells import METHODS, changes, is_stale
+from benchmarks.paper_experiments import (
+    CHANGED,
+    EXPERIMENTS,
+    MUST,
+    OF_ONE,
+    SEARCHES,
+    Config,
+    cells,
+)
 from benchmarks.rival_cells import AFTER_GAP
 
-# Of one robot, whatever --robot says.
-_OF_ONE = {"table2": "cartpole", "fig7": "go2", "appendix_a": "go2"}
 _OF_OTHERS = (SEARCHES[1], AFTER_GAP)
 
 Row = Mapping[str, Any]
@@ -20,7 +26,7 @@ def paragraphs(rows: Iterable[Row]) -> list[str]:
     have = {r["key"]: r for r in rows}
     lines, none = [], []
     for name in EXPERIMENTS:
-        for robot in (_OF_ONE[name],) if name in _OF_ONE else CHANGED:
+        for robot in (OF_ONE[name],) if name in OF_ONE else CHANGED:
             every = cells(Config(name, robot=robot))
             mine = [have[c.key] for c in every if c.key in have]
             if not mine:
@@ -34,18 +40,23 @@ def paragraphs(rows: Iterable[Row]) -> list[str]:
             lines.append(
                 (
                     *(name, robot, f"{len(mine)} of {len(every)}"),
+                    str(sum(map(is_stale, mine)) or ""),
                     ", ".join(map(str, whole)) or "none",
                     *(devices(mine), commits_of(mine)),
                 )
             )
     tried = {r["method"] for r in have.values()}
     idle = [m for m in METHODS if m not in (*MUST, *tried, *_OF_OTHERS)]
-    head = ("experiment", "robot", "cells run", "seeds complete", "on", "commits")
+    head = ("experiment", "robot", "cells run", "of these stale")
+    head = (*head, "seeds complete", "on", "commits")
     out = [
-        "`python -m benchmarks.paper NAME --robot ROBOT`; a commit with + had changes "
-        "that were not committed.",
+        "`python -m benchmarks.paper NAME --robot ROBOT`; `status` in place of NAME "
+        "says what the rest takes, `all` runs it. A commit with + had changes that "
+        "were not committed.",
         markdown_table(head, lines),
     ]
+    for m in sorted({r["method"] for r in have.values() if is_stale(r)}):
+        out.append(f"Stale rows of {m} are from before this: {'; '.join(changes(m))}.")
     if none:
         out.append(f"Not run: {', '.join(none)}.")
     if idle:

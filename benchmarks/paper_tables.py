@@ -16,8 +16,8 @@ from benchmarks import paper_matrix
 from benchmarks._cells import read_rows
 from benchmarks._common import markdown_table
 from benchmarks._page import Named, Section, each_of, met, table, those
-from benchmarks.paper import CHANGED, MUST, ON_HARDWARE, SEARCHES, STARTS
 from benchmarks.paper_cells import METHODS, WARM
+from benchmarks.paper_experiments import CHANGED, MUST, ON_HARDWARE, SEARCHES, STARTS
 from benchmarks.paper_runtime import WAYS
 from benchmarks.paper_twin import TWIN
 from benchmarks.twin_measures import COMMANDS, EPISODES, TRACKED

@@ -6,17 +6,17 @@ from typing import Any
 
 import pytest
 
-from benchmarks import paper, paper_tables
+from benchmarks import paper, paper_experiments, paper_tables
 from benchmarks._page import shown
-from benchmarks.paper import Config, cells
-from benchmarks.paper_cells import WARM, Cell
+from benchmarks.paper_cells import WARM, Cell, recipe
+from benchmarks.paper_experiments import Config, cells
 from envs import make
 from train._command import main
 
 VERSIONS = {"commit": "0123456789"}
 
 
-@pytest.mark.parametrize("name", paper.EXPERIMENTS)
+@pytest.mark.parametrize("name", paper_experiments.EXPERIMENTS)
 def test_each_cell_has_a_name_of_its_own(name: str) -> None:
     every = cells(Config(name, seeds=(0, 1)))
     assert len({c.key for c in every}) == len(every) >= 4
@@ -24,7 +24,10 @@ def test_each_cell_has_a_name_of_its_own(name: str) -> None:
 
 def test_tables_share_cells() -> None:
     """What table 1 has run, table 3 and figure 6 need not run again."""
-    keys = {n: {c.key for c in cells(Config(n, seeds=(0,)))} for n in paper.EXPERIMENTS}
+    keys = {
+        n: {c.key for c in cells(Config(n, seeds=(0,)))}
+        for n in paper_experiments.EXPERIMENTS
+    }
     assert len(keys["table1"] & keys["fig6"]) == 6
     assert len(keys["table1"] & keys["table3"]) == 2
 
@@ -71,6 +74,7 @@ def row(method: str, target: str, seed: int, **values: Any) -> dict[str, Any]:
     return {
         **given,
         "key": Cell(**named).key,
+        "recipe": recipe(method),
         **values,
         "versions": VERSIONS,
     }
@@ -152,7 +156,7 @@ def test_what_was_run_is_a_table(tmp_path: Path) -> None:
     rows = [
         row(m, f"cart_kp*{x:g}", 0, **{"return": 100.0})
         for x in (0.25, 0.5)
-        for m in paper.MUST
+        for m in paper_experiments.MUST
     ]
     rows.append(row("UDR", "cart_kp*0.5", 1, **{"return": 90.0}))
     rows[-1]["versions"] = {
@@ -162,7 +166,7 @@ def test_what_was_run_is_a_table(tmp_path: Path) -> None:
     lines = page(tmp_path, *rows).splitlines()
     (line,) = (x for x in lines if x.startswith("| table1 | cartpole"))
     assert [x.strip() for x in line.strip("|").split("|")[2:]] == [
-        *("15 of 70", "0", "? (14), NVIDIA (1)", "0123456, abcdef0+"),
+        *("15 of 70", "", "0", "? (14), NVIDIA (1)", "0123456, abcdef0+"),
     ]
     none = next(x for x in lines if x.startswith("Not run: ") and "appendix_a" in x)
     for name in ("appendix_a of go2", "fig5 of cartpole", "table5 of ant"):
@@ -176,7 +180,7 @@ def test_figure_4_has_its_errors_beside_those_of_the_start(tmp_path: Path) -> No
     trace = [[[1.5, 1.0]], [[1.2, 0.9]], [[1.9, 1.1]]]
     rows = [
         row(
-            *(paper.SEARCHES[1], "cart_kp*0.5", s),
+            *(paper_experiments.SEARCHES[1], "cart_kp*0.5", s),
             start=(1.0, 2.0),
             policy=False,
             curves=True,
@@ -190,7 +194,7 @@ def test_figure_4_has_its_errors_beside_those_of_the_start(tmp_path: Path) -> No
     line = next(
         x
         for x in page(tmp_path, *rows).splitlines()
-        if x.startswith(f"| cartpole | {paper.SEARCHES[1]}")
+        if x.startswith(f"| cartpole | {paper_experiments.SEARCHES[1]}")
     )
     assert line.endswith("| not run | 0.300 (0.100, 0.300, 0.500); 0.400 |")
 
@@ -218,8 +222,8 @@ def test_pictures_come_from_the_rows_alone(tmp_path: Path) -> None:
     rows = [
         row(m, "", 0, start=s, policy=False, curves=True, trace=trace, parameters=names)
         | {"error": 0.1}
-        for m in paper.SEARCHES
-        for s in paper.STARTS
+        for m in paper_experiments.SEARCHES
+        for s in paper_experiments.STARTS
     ]
     rows += [
         row(m, "", s, curves=True, curve=[[1000, 2000], [50.0, 90.0 + s]])
@@ -288,7 +292,7 @@ def test_one_program_and_separate_ones_are_shown_side_by_side(tmp_path: Path) ->
     assert sum("| 9 (1.0 MB) | 190.0 |" in x for x in lines) == 2
 
 
-@pytest.mark.parametrize("robot", paper.CHANGED)
+@pytest.mark.parametrize("robot", paper_experiments.CHANGED)
 def test_what_is_changed_and_shown_exists(robot: str) -> None:
     names = make(robot).space.names
-    assert {paper.CHANGED[robot], *paper_tables.SHOWN[robot]} <= set(names)
+    assert {paper_experiments.CHANGED[robot], *paper_tables.SHOWN[robot]} <= set(names)

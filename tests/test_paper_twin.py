@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks import paper, paper_twin, twin_measures
+from benchmarks import paper, paper_experiments, paper_twin, twin_measures
 from benchmarks.paper_cells import Cell
 from benchmarks.rival_cells import AFTER_GAP
 from benchmarks.twin import CARTPOLE, GAPS, GO2, Gap, Motor, Twin
@@ -324,7 +324,7 @@ def test_what_the_gap_workflow_named_is_in_search_and_training(tmp_path: Path) -
 def test_cells_are_of_the_twins_and_named_so() -> None:
     for experiment, robot in (("table2", "cartpole"), ("fig7", "go2")):
         cells = paper.cells(paper.Config(experiment, seeds=(0, 1)))
-        assert [c.method for c in cells[:4]] == list(paper.ON_HARDWARE)
+        assert [c.method for c in cells[:4]] == list(paper_experiments.ON_HARDWARE)
         assert all("twin" in c.key and c.robot == robot for c in cells)
     with pytest.raises(UserError, match="of table2 and fig7"):
         paper.cells(paper.Config("table1", methods=(AFTER_GAP,)))
@@ -344,7 +344,7 @@ def test_cells_at_their_smallest(
     monkeypatch.setattr(paper_twin, "LOGGED", 120)
     small = ("population=16", "generations=2", "rollout_steps=20")
     cell = Cell("UDR", robot, "twin", 0, 4, 10_240, settings=small)
-    for method in paper.ON_HARDWARE[: 4 if robot == "cartpole" else 3]:
+    for method in paper_experiments.ON_HARDWARE[: 4 if robot == "cartpole" else 3]:
         row = paper_twin.solve(replace(cell, method=method), tmp_path)
         assert "not" in row["stands_for"] and np.isfinite(row["return"])
         if method != "UDR":

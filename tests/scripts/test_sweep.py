@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from benchmarks import paper
+from benchmarks.paper_cells import recipe
 from scripts import sweep
 from tests.commands import refused
 from tests.documented import ROOT
@@ -62,7 +63,10 @@ def call(folder: Path, *words: object, **env: str) -> subprocess.CompletedProces
 @without_submitit
 def test_done_cells_are_skipped_and_failures_told(tmp_path: Path) -> None:
     config = paper.Config("table5", methods=("EASI paper",), seeds=(0,))
-    rows = [{"key": c.key, **dataclasses.asdict(c)} for c in paper.cells(config)]
+    rows = [
+        {"key": c.key, **dataclasses.asdict(c), "recipe": recipe(c.method)}
+        for c in paper.cells(config)
+    ]
     assert len(rows) == 5
     text = "".join(json.dumps(r) + "\n" for r in rows)
     (tmp_path / "paper.jsonl").write_text(text)
