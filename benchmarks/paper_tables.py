@@ -190,7 +190,7 @@ def _table1(robot: str, rows: Sequence[Row]) -> list[str]:
             stated = PUBLISHED.get(f"{CHANGED[robot]}*{factor:g}", {})
             theirs = "EASI" if method == SEARCHES[0] else method
             cells.append(stated.get(theirs, ""))
-        lines.append((method, *cells))
+        lines.append((_named(method, robot, rows), *cells))
     name = CHANGED[robot]
     head = (
         *("method", f"{name}*0.25", "share", "published"),
@@ -204,6 +204,13 @@ def _table1(robot: str, rows: Sequence[Row]) -> list[str]:
         *_first(robot, by_target, rows),
         *_other_recipe(robot, rows),
     ]
+
+
+def _named(method: str, robot: str, rows: Sequence[Row]) -> str:
+    """A method, with the parameters that it has no word for."""
+    mine = (r for r in rows if (r["method"], r["robot"]) == (method, robot))
+    lacks = {name for r in mine for name in r.get("unreached", ())}
+    return f"{method} (without {', '.join(sorted(lacks))})" if lacks else method
 
 
 def _other_recipe(robot: str, rows: Sequence[Row]) -> list[str]:

@@ -9,9 +9,10 @@ A cell is one robot, setting, method and seed. Each seed draws its own machine, 
 parameter within 1.5 times its nominal value either way; searches start within 3 times.
 All methods get the same recording and the same budget of simulated control steps, a
 derivative counting as one: about what EASI takes at most, its least-squares finish
-included. A larger budget lets the others replay more of the recording, not only more
-often: with those here they replay all of it (on go2 a fifth, where EASI's finish fits a
-tenth). What train.gap simulates comes on top, and is in the seconds. Settings:
+included. All others get the whole recording. Where the budget does not pay for enough
+rounds on all of it, CMA-ES and DROPO replay a part drawn anew in each generation,
+random search judges its best on all of it, and mujoco.sysid and NPE get a part at even
+distances. What train.gap simulates comes on top, and is in the seconds. Settings:
 
     clean       logged commands, deterministic ones, no noise
     paired      the same with sensor noise, as in all that follow

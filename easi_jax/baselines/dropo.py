@@ -1,11 +1,18 @@
 """DROPO: the distribution under which logged next states are likeliest."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 
-from easi_jax.baselines.replay_cma_es import minimized, some_pieces
+from easi_jax.baselines.replay_cma_es import (
+    GENERATIONS,
+    affordable,
+    drawn,
+    minimized,
+    some_pieces,
+)
 from easi_jax.baselines.task import Budget, Identified, Task
 from easi_jax.data.segments import Segments
 from easi_jax.devices.mesh import sharded_map
@@ -33,8 +40,10 @@ class Dropo:
     """Individuals of a generation of CMA-ES."""
     samples: int = 10
     """K: models drawn for each individual."""
-    transitions: int = 200
-    """Logged transitions that each predicts."""
+    transitions: int | None = None
+    """Logged transitions that each predicts, the same in all generations as published;
+    not given: as many as the budget pays for in `GENERATIONS`, drawn anew from all of
+    them in each."""
     horizon: int = 1
     """Control steps of a transition."""
     epsilon: float = 1e-5
@@ -46,7 +55,9 @@ class Dropo:
         """The Gaussian that CMA-ES ends at."""
         n = task.space.size
         pieces = some_pieces(task, demonstrations, self.horizon, self.transitions)
-        each = self.population * self.samples * pieces.count * pieces.horizon
+        piece = self.population * self.samples * pieces.horizon
+        count = affordable(budget, GENERATIONS * piece, pieces, self.transitions)
+        each = piece * count
         rounds = budget.rounds(each)
         k_draw, k_run = jax.random.split(key)
         # The same draws for everybody: differences are then the individuals' own.
@@ -57,7 +68,7 @@ class Dropo:
         )
         mean, _ = minimized(
             task,
-            lambda x: self._cost(task, pieces, draws, x),
+            self._cost(task, pieces, count, draws),
             self.population,
             rounds,
             k_run,
@@ -69,8 +80,8 @@ class Dropo:
         return Identified(gaussian(task.space, center, cov), task.space, rounds * each)
 
     def _cost(
-        self, task: Task, pieces: Segments, draws: jax.Array, x: jax.Array
-    ) -> jax.Array:
+        self, task: Task, pieces: Segments, count: int, draws: jax.Array
+    ) -> Callable[[jax.Array, jax.Array], jax.Array]:
         """Negative log likelihood per transition of individuals ``(P, 2 n)``."""
         simulator, space, n = task.simulator, task.space, task.space.size
         low, high = space.unit_bounds
@@ -82,6 +93,8 @@ class Dropo:
         least = jnp.diag(jnp.maximum(self.epsilon, (noise / scale) ** 2))
 
         def costs(some: jax.Array, pieces: Segments) -> jax.Array:
+            w = pieces.weight / jnp.maximum(pieces.weight.sum(), 1.0)
+
             def one(item: jax.Array) -> jax.Array:
                 z = item[:n] + jnp.exp(_bounded(item[n:])) * draws
 
@@ -105,8 +118,12 @@ class Dropo:
 
             return jax.lax.map(one, some)
 
-        outside = (jnp.clip(x[:, :n], low, high) - x[:, :n]) ** 2
-        return sharded_map(costs, task.mesh, x, pieces) + outside.sum(-1)
+        def cost(x: jax.Array, key: jax.Array) -> jax.Array:
+            outside = (jnp.clip(x[:, :n], low, high) - x[:, :n]) ** 2
+            some = drawn(pieces, count, key)
+            return sharded_map(costs, task.mesh, x, some) + outside.sum(-1)
+
+        return cost
 
 
 def _bounded(log_std: jax.Array) -> jax.Array:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from easi_jax.baselines.replay_cma_es import channel_scale, some_pieces
+from easi_jax.baselines.replay_cma_es import affordable, channel_scale, some_pieces
 from easi_jax.baselines.task import Budget, Identified, Task
 from easi_jax.data.segments import Segments
 from easi_jax.devices.runtime import cores
@@ -19,6 +19,7 @@ from easi_jax.model.joint_space import Configuration
 from easi_jax.model.mujoco_warnings import warnings_to
 from easi_jax.simulation.mujoco_c import InMujoco
 
+_ITERATIONS = 20  # that Gauss-Newton needs from far away
 _TRIALS = 8  # simulations of a step's length, on average, that the budget allows for
 _FAR = 10.0  # initial ranges; the optimizer wants finite bounds
 
@@ -36,11 +37,13 @@ class MujocoSysid:
     where that is beyond all bounds, it is that of the start.
 
     MuJoCo C has no word for a joint's speed limit, nor for effects such as a delay:
-    these stay at the start with its spread, and in C there is no such limit or effect.
+    these stay at the start with its spread (`Identified.unreached`), and in C there is
+    no such limit or effect.
     """
 
-    pieces: int = 32
-    """Logged pieces that are replayed."""
+    pieces: int | None = None
+    """Logged pieces that are replayed; not given: as many as the budget pays for in 20
+    iterations."""
     horizon: int = 25
     """Control steps of a piece."""
     iterations: int = 200
@@ -56,9 +59,12 @@ class MujocoSysid:
         """
         del key  # nothing is random
         sysid = toolbox()
-        pieces = some_pieces(task, demonstrations, self.horizon, self.pieces)
+        every = some_pieces(task, demonstrations, self.horizon, self.pieces)
+        step = every.horizon * (task.space.size + _TRIALS)
+        count = affordable(budget, _ITERATIONS * step, every, self.pieces)
+        pieces = some_pieces(task, demonstrations, self.horizon, count)
         each = pieces.count * pieces.horizon
-        rounds = budget.rounds(each * (task.space.size + _TRIALS))
+        rounds = budget.rounds(step * count)
         write = InMujoco(task.simulator)
         logs = _Logs(task, pieces, write.base, sysid)
         start, free = np.asarray(task.start_mean, float), write.reaches
@@ -111,7 +117,8 @@ class MujocoSysid:
         distribution = gaussian(
             task.space, jnp.asarray(mean, float), jnp.asarray(cov, float)
         )
-        return Identified(distribution, task.space, simulated)
+        unreached = tuple(task.space.names[i] for i in np.flatnonzero(~free))
+        return Identified(distribution, task.space, simulated, unreached=unreached)
 
 
 def toolbox() -> Any:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from easi_jax.baselines.replay_cma_es import some_pieces
+from easi_jax.baselines.replay_cma_es import affordable, some_pieces
 from easi_jax.baselines.task import Budget, Identified, Task
 from easi_jax.data.segments import Segments
 from easi_jax.devices.mesh import sharded_map
@@ -22,6 +22,7 @@ from easi_jax.model.distribution import gaussian
 from easi_jax.simulation import open_loop
 from easi_jax.simulation.simulator import Simulator
 
+_ENOUGH = 1500  # simulations that a flow of a dozen parameters needs
 _LEAST = 100  # simulations that are worth training on
 _PROCESS = Path(__file__).with_name("_npe_process.py")
 
@@ -41,8 +42,9 @@ class NeuralPosterior:
     The network is trained in a process of its own: torch and jax do not share one well.
     """
 
-    pieces: int = 32
-    """Logged pieces that each simulation replays."""
+    pieces: int | None = None
+    """Logged pieces that each simulation replays; not given: as many as the budget pays
+    for with 1,500 simulations."""
     horizon: int = 25
     """Control steps of a piece."""
     density: str = "maf"
@@ -63,7 +65,9 @@ class NeuralPosterior:
         """
         if find_spec("sbi") is None:
             raise UserError("sbi is missing: pip install easi-jax[peers]")
-        pieces = some_pieces(task, demonstrations, self.horizon, self.pieces)
+        every = some_pieces(task, demonstrations, self.horizon, self.pieces)
+        some = affordable(budget, _ENOUGH * every.horizon, every, self.pieces)
+        pieces = some_pieces(task, demonstrations, self.horizon, some)
         each = pieces.count * pieces.horizon
         count = _LEAST * budget.rounds(_LEAST * each)
         k_draw, k_noise, k_train = jax.random.split(key, 3)

@@ -13,9 +13,11 @@ from easi_jax.devices.mesh import sharded_map
 from easi_jax.devices.runtime import fast_loops
 from easi_jax.estimation.pieces import effective_noise
 from easi_jax.model.distribution import gaussian
+from easi_jax.search.easi import pick
 from easi_jax.search.evolution import make_strategy
 from easi_jax.simulation import open_loop
 
+GENERATIONS = 60  # that a search needs at least, to get anywhere
 _LOST = 1e6  # cost of a simulation that is no longer finite
 _ELITE = 0.01  # share of a random search that says how sure it is
 
@@ -28,13 +30,15 @@ class PairedCmaEs:
     from logged states by a population of simulations, and CMA-ES minimizes the squared
     error. There the population is thousands on a GPU and the error that of joint
     positions; here the budget decides and errors of positions and velocities count
-    in units of their motion. CMA-ES: N. Hansen, arXiv:1604.00772, by evosax.
+    in units of their motion. CMA-ES: N. Hansen, arXiv:1604.00772, by evosax. PACE
+    restarts nothing, and neither does this.
     """
 
     population: int = 64
     """Individuals of a generation."""
-    pieces: int = 32
-    """Logged pieces that each replays."""
+    pieces: int | None = None
+    """Logged pieces that each replays, the same in all generations; not given: as many
+    as the budget pays for in `GENERATIONS`, drawn anew from all of them in each."""
     horizon: int = 25
     """Control steps of a piece."""
 
@@ -43,9 +47,11 @@ class PairedCmaEs:
     ) -> Identified:
         """The last mean and covariance of the strategy."""
         pieces = some_pieces(task, demonstrations, self.horizon, self.pieces)
-        each = self.population * pieces.count * pieces.horizon
+        piece = self.population * pieces.horizon
+        count = affordable(budget, GENERATIONS * piece, pieces, self.pieces)
+        each = piece * count
         rounds = budget.rounds(each)
-        cost = paired_cost(task, pieces)
+        cost = paired_cost(task, pieces, count)
         mean, cov = minimized(task, cost, self.population, rounds, key)
         return Identified(gaussian(task.space, mean, cov), task.space, rounds * each)
 
@@ -54,11 +60,13 @@ class PairedCmaEs:
 class RandomSearch:
     """Uniform draws from where a search starts; the best by the same error.
 
-    Bergstra and Bengio, JMLR 13, 2012: what any search has to beat.
+    Bergstra and Bengio, JMLR 13, 2012: what any search has to beat. Where the budget
+    does not pay for all pieces, the best percent, found on some, are judged on all.
     """
 
-    pieces: int = 32
-    """Logged pieces that each individual replays."""
+    pieces: int | None = None
+    """Logged pieces that each individual replays, the same for all; not given: as many
+    as the budget pays for with as many individuals as CMA-ES has."""
     horizon: int = 25
     """Control steps of a piece."""
 
@@ -67,22 +75,44 @@ class RandomSearch:
     ) -> Identified:
         """The best individual, with the spread of the best percent."""
         pieces = some_pieces(task, demonstrations, self.horizon, self.pieces)
-        each = pieces.count * pieces.horizon
-        count = budget.rounds(each)
-        drawn = jax.random.uniform(key, (count, task.space.size))
-        costs = jax.jit(paired_cost(task, pieces), compiler_options=fast_loops())(drawn)
-        best = drawn[jnp.argsort(costs)[: max(2, round(_ELITE * count))]]
+        piece = pieces.horizon
+        some = affordable(
+            budget, GENERATIONS * PairedCmaEs.population * piece, pieces, self.pieces
+        )
+        count = budget.rounds(some * piece)
+        if some < pieces.count:  # the last round is paid for, too
+            count = max(2, int(count / (1 + _ELITE * pieces.count / some)))
+        kept = max(2, round(_ELITE * count))
+        units = jax.random.uniform(key, (count, task.space.size))
+        first, all_of = (
+            jax.jit(paired_cost(task, pieces, n), compiler_options=fast_loops())
+            for n in (some, pieces.count)
+        )
+        best = units[jnp.argsort(first(units, key))[:kept]]
+        simulated = count * some * piece
+        if some < pieces.count:
+            best = best[jnp.argsort(all_of(best, key))]
+            simulated += kept * pieces.count * piece
         cov = jnp.cov(best, rowvar=False).reshape(task.space.size, task.space.size)
-        return Identified(gaussian(task.space, best[0], cov), task.space, count * each)
+        return Identified(gaussian(task.space, best[0], cov), task.space, simulated)
 
 
 def some_pieces(
-    task: Task, demonstrations: Segments, horizon: int, count: int
+    task: Task, demonstrations: Segments, horizon: int, count: int | None = None
 ) -> Segments:
-    """At most ``count`` pieces at even distances, of at most a trajectory's length."""
+    """At most ``count`` pieces at even distances, all of them where not given, of at
+    most a trajectory's length."""
     steps = min(horizon, demonstrations.weight.shape[1])
     found = windows(demonstrations, steps, steps, task.simulator.past_steps)
-    return found.spread(count) if count < found.count else found
+    return found.spread(count) if count and count < found.count else found
+
+
+def affordable(budget: Budget, piece: int, pieces: Segments, given: int | None) -> int:
+    """How many of the ``pieces`` a method replays at once: all of them where a number
+    was ``given``, else as many as the budget pays for where each costs ``piece``
+    control steps in all."""
+    paid = max(1, budget.simulated // piece)
+    return min(paid, pieces.count) if given is None else pieces.count
 
 
 def channel_scale(task: Task, pieces: Segments) -> jax.Array:
@@ -95,16 +125,19 @@ def channel_scale(task: Task, pieces: Segments) -> jax.Array:
     return jnp.maximum(rms, noise)
 
 
-def paired_cost(task: Task, pieces: Segments) -> Callable[[jax.Array], jax.Array]:
-    """``cost(population (P, n)) -> (P,)``, pure: mean squared error of predictions of
-    ``pieces``, each channel in units of `channel_scale`; `_LOST` where a simulation is
-    not finite."""
+def paired_cost(
+    task: Task, pieces: Segments, count: int
+) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    """``cost(population (P, n), key) -> (P,)``, pure: mean squared error of predictions
+    of ``count`` pieces, drawn by the key where there are more, each channel in units of
+    `channel_scale`; `_LOST` where a simulation is not finite."""
     simulator, space = task.simulator, task.space
-    w = pieces.weight[:, None, None]
-    total = jnp.maximum(w.sum() * pieces.horizon, 1.0)
     scale = channel_scale(task, pieces)
 
     def costs(population: jax.Array, pieces: Segments) -> jax.Array:
+        w = pieces.weight[:, None, None]
+        total = jnp.maximum(w.sum() * pieces.horizon, 1.0)
+
         def one(unit: jax.Array) -> jax.Array:
             error = open_loop.errors(
                 simulator, simulator.model(space.to_si(unit)), pieces
@@ -116,7 +149,17 @@ def paired_cost(task: Task, pieces: Segments) -> Callable[[jax.Array], jax.Array
             one, population, batch_size=max(1, simulator.batch // pieces.count)
         )
 
-    return lambda population: sharded_map(costs, task.mesh, population, pieces)
+    def cost(population: jax.Array, key: jax.Array) -> jax.Array:
+        return sharded_map(costs, task.mesh, population, drawn(pieces, count, key))
+
+    return cost
+
+
+def drawn(pieces: Segments, count: int, key: jax.Array) -> Segments:
+    """``count`` of the pieces that count, all of them where there are no more."""
+    if count >= pieces.count:
+        return pieces
+    return pieces.take(pick(key, pieces.weight, count))
 
 
 def minimized(
@@ -126,12 +169,11 @@ def minimized(
     rounds: int,
     key: jax.Array,
     start: tuple[jax.Array, jax.Array] | None = None,
-    shared: Any = (),
 ) -> tuple[jax.Array, jax.Array]:
     """CMA-ES in unit coordinates, clipped to the physical bounds.
 
     Args:
-        cost: ``cost(population (P, n), *shared) -> (P,)``.
+        cost: ``cost(population (P, n), key) -> (P,)``; a key a generation.
         start: mean and standard deviation ``(m,)``; the task's where not given.
 
     Returns:
@@ -148,7 +190,8 @@ def minimized(
         raw, state = strategy.ask(k_ask, state)
         inside = jnp.clip(raw, low, high) if clip else raw
         # A gentle slope back inside: clipped individuals are not as good as they seem.
-        costs = cost(inside, *shared) + ((raw - inside) ** 2).sum(-1)
+        costs = cost(inside, jax.random.fold_in(k, 1))
+        costs += ((raw - inside) ** 2).sum(-1)
         state = strategy.tell(k_tell, raw, costs, state)
         return (state, strategy.moments(state, raw, costs)), None
 

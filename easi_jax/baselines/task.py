@@ -102,7 +102,7 @@ class Task:
 @functools.partial(
     jax.tree_util.register_dataclass,
     data_fields=("distribution", "trace"),
-    meta_fields=("space", "simulated", "measured"),
+    meta_fields=("space", "simulated", "measured", "unreached"),
 )
 @dataclass(frozen=True)
 class Identified:
@@ -116,6 +116,7 @@ class Identified:
         measured: control steps of the real machine beyond the demonstrations.
         trace: mean and standard deviation after each generation, unit coordinates,
             ``(G, n)`` each; None where a method has no generations to show.
+        unreached: parameters that the method has no word for; they are as at the start.
     """
 
     distribution: Distribution
@@ -123,6 +124,7 @@ class Identified:
     simulated: int
     measured: int = 0
     trace: tuple[jax.Array, jax.Array] | None = None
+    unreached: tuple[str, ...] = ()
 
 
 class Method(Protocol):

@@ -18,7 +18,7 @@ from easi_jax.baselines import (
     SimOpt,
     Task,
 )
-from easi_jax.baselines.replay_cma_es import paired_cost, some_pieces
+from easi_jax.baselines.replay_cma_es import affordable, paired_cost, some_pieces
 from easi_jax.baselines.simopt import reps_weights
 from easi_jax.data.segments import Segments
 from easi_jax.errors import UserError
@@ -98,9 +98,39 @@ def test_pieces_know_what_was_sent_before_them() -> None:
     demos = jax.jit(lambda k: rig.record(late, theta, k, 4, 1.0))(jax.random.key(0))
     task = Task(late, jnp.zeros(4))
     pieces = some_pieces(task, demos, 10, 16)
-    costs = jax.jit(paired_cost(task, pieces))
+    cost = jax.jit(paired_cost(task, pieces, pieces.count))
+    costs = lambda x: cost(x, jax.random.key(0))  # noqa: E731
     right, wrong = costs(jnp.stack([late.space.to_unit(theta), jnp.full(7, 0.4)]))
     assert right < 1e-7 < 1e-4 < wrong
+
+
+def test_every_generation_draws_its_pieces_from_all(
+    task: Task, demonstrations: Segments
+) -> None:
+    pieces = some_pieces(task, demonstrations, 20)
+    assert pieces.count == 80
+    unit = jnp.full((1, task.space.size), 0.5)
+    some, everything = (jax.jit(paired_cost(task, pieces, n)) for n in (8, 80))
+    keys = [jax.random.key(k) for k in range(20)]
+    drawn = [float(some(unit, k)[0]) for k in keys]
+    assert len(set(drawn)) == 20
+    (whole,) = {float(everything(unit, k)[0]) for k in keys[:2]}
+    assert np.mean(drawn) == pytest.approx(whole, rel=0.2)
+
+
+def test_a_budget_says_how_much_is_replayed_at_once(
+    task: Task, demonstrations: Segments
+) -> None:
+    pieces = some_pieces(task, demonstrations, 20)
+    for steps, count in ((100, 1), (64 * 20 * 60 * 7, 7), (10**9, 80)):
+        assert affordable(Budget(steps), 64 * 20 * 60, pieces, None) == count
+    assert affordable(Budget(1), 10, some_pieces(task, demonstrations, 20, 5), 5) == 5
+    found = RandomSearch(horizon=20).fit(
+        task, demonstrations, Budget(64 * 20 * 60 * 7), jax.random.key(0)
+    )
+    # What comes first is judged on 7 pieces, its best on all 80.
+    assert found.simulated <= 64 * 20 * 60 * 7
+    assert found.simulated > 0.9 * 64 * 20 * 60 * 7
 
 
 def test_reps_keeps_to_its_bound() -> None:
