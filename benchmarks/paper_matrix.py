@@ -50,13 +50,17 @@ def paragraphs(rows: Iterable[Row]) -> list[str]:
     head = ("experiment", "robot", "cells run", "of these stale")
     head = (*head, "seeds complete", "on", "commits")
     out = [
+        "[The paper's claims](CLAIMS.md), one by one, are on a page of their own.",
         "`python -m benchmarks.paper NAME --robot ROBOT`; `status` in place of NAME "
         "says what the rest takes, `all` runs it. A commit with + had changes that "
         "were not committed.",
         markdown_table(head, lines),
     ]
+    reasons: dict[tuple[str, ...], list[str]] = {}
     for m in sorted({r["method"] for r in have.values() if is_stale(r)}):
-        out.append(f"Stale rows of {m} are from before this: {'; '.join(changes(m))}.")
+        reasons.setdefault(changes(m), []).append(m)
+    for why, methods in reasons.items():
+        out.append(f"Stale rows of {', '.join(methods)}: since then {'; '.join(why)}.")
     if none:
         out.append(f"Not run: {', '.join(none)}.")
     if idle:

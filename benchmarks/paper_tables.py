@@ -78,7 +78,8 @@ _LENGTHS = (
     "Oracle and EASI train anew, by as many steps as UDR. FineTune and GARAT go on "
     "from UDR's policy, GARAT by as many steps again: it may pass Oracle where a "
     "training of that length has not settled. With a warm start Oracle and EASI go on "
-    "from it, too (`--warm-start`)."
+    "from it, too. It harmed on neither robot, so `train.easi` has it by default (not "
+    "with the preset paper)."
 )
 
 Row = dict[str, Any]
@@ -131,7 +132,7 @@ def _title(name: str) -> str:
     }[words[0]] + (f": {words[-1]}" if words[0] != "appendix" else "")
 
 
-def _returns(
+def returns(
     rows: Sequence[Row], robot: str, target: str, trajectories: int = 200
 ) -> dict[str, dict[int, float]]:
     """Return by method and seed."""
@@ -154,7 +155,7 @@ def told(values: Sequence[float], digits: int = 1) -> str:
     return f"{mean(values):.{digits}f} ± {stdev(values):.{digits}f} ({each})"
 
 
-def _share(of: dict[int, float], udr: dict[int, float], best: dict[int, float]) -> str:
+def share(of: dict[int, float], udr: dict[int, float], best: dict[int, float]) -> str:
     """Of the way from UDR to Oracle, seeds that all three have."""
     seeds = sorted(of.keys() & udr.keys() & best.keys())
     way = sum(best[s] - udr[s] for s in seeds)
@@ -173,7 +174,7 @@ def _by_target(
     robot: str, rows: Sequence[Row]
 ) -> dict[float, dict[str, dict[int, float]]]:
     """Return by factor on the changed parameter, method and seed."""
-    return {x: _returns(rows, robot, f"{CHANGED[robot]}*{x:g}") for x in (0.25, 0.5)}
+    return {x: returns(rows, robot, f"{CHANGED[robot]}*{x:g}") for x in (0.25, 0.5)}
 
 
 def _table1(robot: str, rows: Sequence[Row]) -> list[str]:
@@ -186,7 +187,7 @@ def _table1(robot: str, rows: Sequence[Row]) -> list[str]:
             mine = found.get(method, {})
             cells.append(told([mine[s] for s in sorted(mine)]))
             ends = (found.get("UDR", {}), found.get("Oracle", {}))
-            cells.append(_judged(method, _share(mine, *ends)))
+            cells.append(_judged(method, share(mine, *ends)))
             stated = PUBLISHED.get(f"{CHANGED[robot]}*{factor:g}", {})
             theirs = "EASI" if method == SEARCHES[0] else method
             cells.append(stated.get(theirs, ""))
@@ -377,7 +378,7 @@ def _by_count(rows: Sequence[Row]) -> Named:
     """Rows of each robot; none without a training by less demonstrations than all."""
     found = Named()
     for robot, changed in CHANGED.items():
-        counts = [_returns(rows, robot, f"{changed}*0.5", n) for n in (1, 50, 100)]
+        counts = [returns(rows, robot, f"{changed}*0.5", n) for n in (1, 50, 100)]
         some = any(OURS in c for c in counts)
         found[robot] = [r for r in rows if r["robot"] == robot] if some else []
     return found
@@ -387,10 +388,10 @@ def _table3(found: dict[str, list[Row]]) -> list[str]:
     lines, mixed, shares = [], [], []
     for robot, rows in found.items():
         target = f"{CHANGED[robot]}*0.5"
-        full = _returns(rows, robot, target)
+        full = returns(rows, robot, target)
         udr, oracle = (full.get(m, {}) for m in ("UDR", "Oracle"))
         by_count = {
-            n: _returns(rows, robot, target, n).get(OURS, {}) for n in (1, 50, 100, 200)
+            n: returns(rows, robot, target, n).get(OURS, {}) for n in (1, 50, 100, 200)
         }
         cells = [told([m[s] for s in sorted(m)]) for m in (udr, *by_count.values())]
         lines.append((f"{robot}, {target}", *cells))
@@ -398,7 +399,7 @@ def _table3(found: dict[str, list[Row]]) -> list[str]:
             lines.append((f"{robot}, published", *_BY_COUNT[robot]))
         mixed += _mixed(rows, robot)
         if robot == "cartpole":
-            shares = [_share(by_count[n], udr, oracle) for n in (1, 200)]
+            shares = [share(by_count[n], udr, oracle) for n in (1, 200)]
     head = ("target", "UDR", "1", "50", "100", "200")
     out = [markdown_table(head, lines), *mixed]
     if shares and all(shares):
@@ -425,7 +426,7 @@ def _mixed(rows: Sequence[Row], robot: str) -> list[str]:
     return [f"{robot}, demonstrations by machine, each with UDR of its own: {told}."]
 
 
-def _with_setting(name: str, rows: Sequence[Row]) -> list[Row]:
+def with_setting(name: str, rows: Sequence[Row]) -> list[Row]:
     """Searches in which a setting was changed, each with its ``value``."""
     return [
         {**r, "value": float(word.partition("=")[2])}
@@ -439,8 +440,8 @@ def _table4(rows: Sequence[Row]) -> list[str]:
     return [
         *_swept(rows),
         "Weights of the better half alone are above zero "
-        "(`easi_jax.search.evolution.recombination_weights`), "
-        "so from μ/λ = 0.5 on it is the same search.",
+        "(`easi_jax.search.evolution.recombination_weights`); EASI default leaves the "
+        "others out, so that from μ/λ = 0.5 on it is the same search.",
     ]
 
 
@@ -501,7 +502,7 @@ def _by_start(rows: Sequence[Row]) -> list[tuple[str, ...]]:
     lines = []
     for method in SEARCHES:
         mine = [r for r in rows if r["method"] == method]
-        cells = [_from_start([r for r in mine if _start(r) == s]) for s in STARTS]
+        cells = [_from_start([r for r in mine if start_of(r) == s]) for s in STARTS]
         if mine:
             lines.append((method, *cells))
     return lines
@@ -566,7 +567,7 @@ def _drawn_fig4(rows: Sequence[Row]) -> str:
     panels = {}
     for name in shown:
         for start in STARTS:
-            mine = [r for r in traced if _start(r) == start]
+            mine = [r for r in traced if start_of(r) == start]
             panels[f"{name}, {_from(start)}"] = {
                 m: [_column(r, names.index(name)) for r in mine if r["method"] == m]
                 for m in SEARCHES
@@ -574,7 +575,7 @@ def _drawn_fig4(rows: Sequence[Row]) -> str:
     return ratios_by_generation(panels, columns=len(STARTS))
 
 
-def _start(row: Row) -> tuple[float, float] | None:
+def start_of(row: Row) -> tuple[float, float] | None:
     return None if row["start"] is None else tuple(row["start"])
 
 
@@ -608,7 +609,7 @@ def _drawn_fig6(rows: Sequence[Row]) -> str:
     robot = rows[0]["robot"]
     found: dict[str, dict[float, list[float]]] = {}
     for x in (0.25, 0.5, 2.0, 4.0):
-        by_method = _returns(rows, robot, f"{CHANGED[robot]}*{x:g}")
+        by_method = returns(rows, robot, f"{CHANGED[robot]}*{x:g}")
         for m in ("UDR", "EASI default", "Oracle"):
             if m in by_method:
                 found.setdefault(m, {})[x] = list(by_method[m].values())
@@ -633,7 +634,7 @@ def _drawn_appendix_a(rows: Sequence[Row]) -> str:
 
     panels = {
         f"factor off, {_from(start)}": {
-            m: [typical(r) for r in traced if r["method"] == m and _start(r) == start]
+            m: [typical(r) for r in traced if r["method"] == m and start_of(r) == start]
             for m in SEARCHES
         }
         for start in STARTS
@@ -657,7 +658,7 @@ _TITLE4 = "### Fig. 4: parameter error after the search, by where it starts"
 _TITLE_A = "### Appendix A: error of Go2's 25 parameters, by where the search starts"
 _TITLE_TIME = "### Run time: one program beside separate programs"
 _RATIO, _UPDATES = (
-    partial(_with_setting, name) for name in ("elite_ratio", "discriminator_updates")
+    partial(with_setting, name) for name in ("elite_ratio", "discriminator_updates")
 )
 SECTIONS = (
     _part(_TITLE, "table1", paper_matrix.paragraphs),

@@ -26,6 +26,7 @@ from benchmarks import (
     go2_in_air,
     imitation,
     lines,
+    paper_claims,
     paper_tables,
     parity,
     rivals_summary,
@@ -69,6 +70,8 @@ def run(config: Config) -> None:
     for module in (gap_summary, paper_tables, scaling_summary):
         for name, text in module.figures(config.results).items():
             atomic_write(config.results / name, text)
+    claims = config.results / "CLAIMS.md"
+    atomic_write(claims, paper_claims.page(config.results) + "\n")
     path = config.results / "README.md"
     atomic_write(path, "\n\n".join(parts) + "\n")
     say(f"written: {path}")

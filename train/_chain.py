@@ -80,7 +80,9 @@ def ready(
         noise=config.noise,
         refine=config.finishes,
         restarts=config.restarts,
-        warm_start=config.warm_start,
+        warm_start=config.preset != "paper"
+        if config.warm_start is None
+        else config.warm_start,
         eval_episodes=config.eval_episodes,
     )
     pipe = Pipeline(env, settings, start=config.start, real=real)

@@ -117,10 +117,10 @@ class ChainOptions:
     noise: tuple[float, ...] = ()
     """Sensor noise (standard deviations of positions, then velocities, SI): added to
     pseudo-real demonstrations; for logs it is estimated where not given."""
-    warm_start: bool = False
+    warm_start: bool | None = None
     """Final training goes on from the networks of the UDR policy in place of new ones
     (the Oracle's, too): it gets further where a training of its length has not settled.
-    """
+    Where not given, yes, but not for the preset paper."""
     eval_episodes: int = 100
     """Episodes of the final evaluation."""
 

@@ -56,7 +56,7 @@ class PipelineConfig:
     refine_pieces: int | None = None
     """Pieces that it takes at most; not given: as
     `easi_jax.estimation.posterior.finish_pieces` and `finish_rest` have it."""
-    warm_start: bool = False
+    warm_start: bool = True
     """Final training and Oracle go on from the networks of the policy that recorded the
     demonstrations, in place of new ones."""
     eval_episodes: int = 100

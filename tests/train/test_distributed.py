@@ -34,7 +34,6 @@ def test_udr_and_easi(tmp_path: Path) -> None:
         first = ("train.udr", "--out", root / "udr", "--seeds", 0, 1, *SMALL)
         ran(count, *first, "--chunk", 12)
         second = ("train.easi", "--udr", root / "udr", "--out", root / "easi")
-        second = (*second, "--warm-start")
         ran(count, *second, *SEARCH, *SMALL[2:], "--chunk", 12, "--search-chunk", 2)
         results.append(
             [read(root / run / "results.json")["returns"] for run in ("udr", "easi")]
