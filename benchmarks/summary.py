@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import (
+    brax_beside,
     circles,
     commands,
     compile_times,
@@ -413,6 +414,7 @@ SECTIONS = (
         go2_in_air.paragraphs,
     ),
     *walking.SECTIONS,
+    *brax_beside.SECTIONS,
     *imitation.SECTIONS,
     *circles.SECTIONS,
     Section(*("## MuJoCo's features", "parity.json", "parity", parity.paragraphs)),
