@@ -6,6 +6,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from easi_jax.gap.decisions import DECIDE
 from easi_jax.gap.table import Column, Place, name_of
 from easi_jax.model.contact_pairs import contact_pairs
 from easi_jax.model.effect_catalog import CATALOG, Effect, Part, Scales, Spot
@@ -18,7 +19,6 @@ from easi_jax.model.effect_numbers import (
 from easi_jax.model.joint_space import scalar_dofs
 from easi_jax.model.parameter_proposal import like_places
 
-_SELDOM = 0.02  # of the rows: a pair of geoms that touches less says nothing
 _PAIRS = 12  # at most, that are looked at one by one
 
 
@@ -78,7 +78,7 @@ def _objects(m: mujoco.MjModel, s: Scales) -> Iterator[_Object]:
             yield _Object(name_of(m, "body", b), (b,), Spot(m, "body", b, s))
     pairs = tuple(contact_pairs(m))
     yield _Object("", (), Spot(m, "model", 0, s, pairs))
-    often = [int(k) for k in np.argsort(-s.touching) if s.touching[k] > _SELDOM]
+    often = [int(k) for k in np.argsort(-s.touching) if s.touching[k] > DECIDE.touches]
     if len(often) > 1:
         for k in sorted(often[:_PAIRS]):
             yield _Object(pairs[k].name, (k,), Spot(m, "geom", k, s, (pairs[k],)))

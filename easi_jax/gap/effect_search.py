@@ -13,10 +13,11 @@ import mujoco
 import numpy as np
 
 from easi_jax.gap.candidates import places, ripples
+from easi_jax.gap.decisions import DECIDE
 from easi_jax.gap.discretization_error import within_a_step
 from easi_jax.gap.effect_set import Candidate, Model, keys, last
 from easi_jax.gap.fitting import Fitting
-from easi_jax.gap.model_comparison import HELPS, better, probability, rank, simplest
+from easi_jax.gap.model_comparison import better, probability, rank, simplest
 from easi_jax.gap.screening import expanded, screened, shortlist
 from easi_jax.gap.table import Place, covered, does
 from easi_jax.model.effect_catalog import Scales
@@ -24,15 +25,12 @@ from easi_jax.model.found_laws import law_of
 from easi_jax.model.joint_space import is_hinge, scalar_dofs
 from easi_jax.model.parameters import ParameterSpace
 
-MOST = 5  # effects
 RIVALS = 8  # names in the place of another that are followed up
 _STAGES = 8  # of adding one and taking out what has become needless
 _RIPPLES = [0.75 * k for k in range(3, 27)]  # cycles over the range of a joint
-_UNLIKELY = 0.3  # probability of an effect beside which a rival replaces it
 _BEAM = 3  # sets of effects that are followed
 _LIKELY = 60  # of a larger robot's names, that are tried beside all but the first
 _LOST = 0.25  # of the motion: errors of a model that does not follow it
-_NOTHING = 1e-3  # of the largest error: a change that shows nowhere
 
 Tell = Callable[[str], None]
 
@@ -191,7 +189,7 @@ class EffectSearch:
         """
         chosen, model, beam = at.selector, start, [start]
         for _ in range(_STAGES):
-            if len(model.places) >= MOST:
+            if len(model.places) >= DECIDE.most:
                 break
             model = at.weighed(model)
             if at.closed(model.fit.x):
@@ -260,12 +258,12 @@ class EffectSearch:
                 mine = last(model, place)
                 for rival in rivals[place.key][:RIVALS]:
                     p = probability(mine, rival)
-                    most = 1 + HELPS
+                    most = 1 + DECIDE.helps
                     if _body_for_joint(place, rival.places[-1]):
                         # Its three numbers do what one does, where there is one joint.
                         most = 1 / most
                     close = rank(rival) <= most * rank(mine)
-                    if p < _UNLIKELY and close and keys(rival) not in seen:
+                    if p < DECIDE.replaced_below and close and keys(rival) not in seen:
                         swaps.append((p, place, rival))
             if not swaps:
                 return model, rivals
@@ -284,7 +282,7 @@ class EffectSearch:
         left, and notes; ``step`` is that of the physics [s]."""
         model, rivals = self.exchanged(model)
         notes: list[str] = []
-        for _ in range(MOST):
+        for _ in range(DECIDE.most):
             brief = [p for p in model.places if self._brief(model, p, step)]
             idle = [p for p in model.places if p not in brief and self._idle(model, p)]
             if not (brief or idle):
@@ -309,7 +307,9 @@ class EffectSearch:
         chosen, kept = self.at.selector, [p for p in model.places if p is not place]
         x = chosen.without(model.fit.x, place, kept)
         mine, other = chosen.errors(np.stack([model.fit.x, x])).astype(float)
-        return float(np.abs(mine - other).max()) < _NOTHING * np.abs(mine).max()
+        return (
+            float(np.abs(mine - other).max()) < DECIDE.does_nothing * np.abs(mine).max()
+        )
 
     def _apart(
         self, model: Model, rivals: dict[str, list[Model]]

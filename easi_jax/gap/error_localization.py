@@ -9,14 +9,11 @@ import numpy as np
 
 from easi_jax.data.recording import Run
 from easi_jax.data.windows import fitted_velocity
+from easi_jax.gap.decisions import DECIDE
 from easi_jax.gap.gap_metric import Channels
 from easi_jax.gap.window_set import Rows, WindowSet
 from easi_jax.model.joint_space import scalar_dofs
 from easi_jax.model.quantities import actuator_name, body_name
-
-_TELLING = 1.3  # times as much error as elsewhere
-_FEW = 8  # windows that a condition needs
-_NEAR = 0.05  # of a joint's range
 
 
 @dataclass(frozen=True)
@@ -142,7 +139,7 @@ class Conditions:
         }
         if m.jnt_limited[j]:
             low, high = m.jnt_range[j]
-            near = np.minimum(q - low, high - q).min(1) < _NEAR * (high - low)
+            near = np.minimum(q - low, high - q).min(1) < DECIDE.near_end * (high - low)
             out["near a limit"] = near
         return out
 
@@ -204,12 +201,12 @@ def where(
         if dofs[0] in scalar:
             masks = {**found.of_joint(scalar[dofs[0]]), **masks}
         for text, mask in masks.items():
-            if min(mask.sum(), (~mask).sum()) < _FEW:
+            if min(mask.sum(), (~mask).sum()) < DECIDE.when_windows:
                 continue
             there, elsewhere = mine[mask], mine[~mask]
             times = there.mean() / max(elsewhere.mean(), 1e-300)
             sure = _welch(there, elsewhere)
-            if times > _TELLING and sure > surest:
+            if times > DECIDE.when_ratio and sure > surest:
                 when, ratio, surest = text, float(times), sure
         out.append(Where(joint, float(mine.sum() / total), when, ratio))
     return sorted(out, key=lambda w: -w.share)
@@ -244,7 +241,11 @@ def condition_errors(
         masks = {**everywhere, **found.of_joint(j), **found.general}
         joints.append(channels.joints[dof])
         rows.append(
-            {t: float(mine[k].mean()) for t, k in masks.items() if k.sum() >= _FEW}
+            {
+                t: float(mine[k].mean())
+                for t, k in masks.items()
+                if k.sum() >= DECIDE.when_windows
+            }
         )
     names = list(dict.fromkeys(name for row in rows for name in row))
     table = np.array([[row.get(name, np.nan) for name in names] for row in rows])

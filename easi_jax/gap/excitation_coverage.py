@@ -8,15 +8,12 @@ import numpy as np
 from easi_jax.data.recording import Run
 from easi_jax.data.unmeasured import hidden_in_any
 from easi_jax.data.windows import fitted_velocity
+from easi_jax.gap.decisions import DECIDE
 from easi_jax.model.joint_space import joint_name, scalar_dofs
 from easi_jax.model.quantities import actuator_name, joint_unit
 
-_ONE_WAY = 0.02  # share of the travel that the way back has at least
-_FASTER = 1.5  # times what the fitting data reach
 _PAST = 4  # rows that a command is foretold from
-_FED_BACK = 0.5  # share of what is new in commands that the state tells
 _STILL = 1e-6  # share of their variance, below which nothing is new in commands
-_ROWS = 50  # for each position, that can tell
 _MOST = 99.0  # percentile; single rows are outliers
 
 
@@ -47,7 +44,7 @@ def coverage_notes(
         unit = joint_unit("m/s", "rad/s")(m, j)
         mine, theirs = (np.concatenate([v[:, dof] for v in part]) for part in speeds)
         forth, back = np.maximum(mine, 0).sum(), np.maximum(-mine, 0).sum()
-        if forth + back > 0 and min(forth, back) < _ONE_WAY * (forth + back):
+        if forth + back > 0 and min(forth, back) < DECIDE.one_way * (forth + back):
             way = "positive" if forth > back else "negative"
             notes.append(
                 f"the fitting data move joint {name} in the {way} direction only: dry "
@@ -86,13 +83,13 @@ def _fed_back(runs: Sequence[Run]) -> list[int]:
     """
     state = np.concatenate([_new(r.qpos, r)[0] for r in runs])
     command = np.concatenate([_new(r.qpos, r)[1] for r in runs])
-    if len(command) < _ROWS * max(1, state.shape[1]):
+    if len(command) < DECIDE.fed_back_rows * max(1, state.shape[1]):
         return []
     known = np.linalg.lstsq(state, command, rcond=None)[0]
     left = (command - state @ known).var(0)
     whole = command.var(0)
     moved = np.concatenate([r.ctrl for r in runs]).var(0)
-    told = (whole > _STILL * moved) & (left < (1 - _FED_BACK) * whole)
+    told = (whole > _STILL * moved) & (left < (1 - DECIDE.fed_back) * whole)
     return np.flatnonzero(told).tolist()
 
 
@@ -115,7 +112,7 @@ def _new(qpos: np.ndarray, run: Run) -> tuple[np.ndarray, np.ndarray]:
 
 def _beyond(what: str, fit: np.ndarray, held: np.ndarray, unit: str) -> list[str]:
     mine, theirs = (float(np.percentile(np.abs(x), _MOST)) for x in (fit, held))
-    if theirs <= _FASTER * mine or theirs == 0:
+    if theirs <= DECIDE.faster * mine or theirs == 0:
         return []
     unit = f" {unit}" if unit else ""
     return [

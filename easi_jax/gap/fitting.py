@@ -10,6 +10,7 @@ from easi_jax.estimation.least_squares import AT_BOUND
 from easi_jax.estimation.starts import better_noise, floor, known_noise
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.batched_least_squares import Bounds, window_weights
+from easi_jax.gap.decisions import BLOCKS, DECIDE
 from easi_jax.gap.discretization_error import error_of_steps
 from easi_jax.gap.effect_set import Model
 from easi_jax.gap.forward_selection import Selector
@@ -23,9 +24,7 @@ from easi_jax.gap.window_set import WindowSet
 from easi_jax.gap.window_starts import window_starts
 from easi_jax.progress import Progress, silent
 
-_BLOCKS = 10  # of time, for cross-validation
 _DRAWS = 5  # of the noise of each window: its mean over all of them is wanted
-_CLOSED = 1.05  # times the floor: nothing left to explain, where not surely more
 _STEPS_SEEN = 0.75  # of the floor: less is lost in noise
 _WHOLE = 1.15  # of the error of steps; a finer simulation leaves some of it
 _BENT = 0.1  # second beside first differences of errors with a start: not linear
@@ -70,7 +69,7 @@ class Fitting:
         self.data, self.predictor, self.windows = data, predictor, windows
         self.steps, count = steps, len(windows)
         blocks = np.arange(-(-count // BLOCK))
-        group = np.arange(count) * min(_BLOCKS, count) // count
+        group = np.arange(count) * min(BLOCKS, count) // count
         self.selector = Selector(
             predictor, blocks, count, data.bounds, group, own, progress, steps + 1
         )
@@ -162,7 +161,7 @@ class Fitting:
         noise = floor(self.starts, x, moved, _DRAWS, self.data.resolution, rng)
         square, due = measure.squares(errors[:, after:]), noise[:, after:].mean((0, 1))
         low = openness(square, due, self.channels.scale).low
-        return bool(np.nanmax(low) <= _CLOSED)
+        return bool(np.nanmax(low) <= DECIDE.closed)
 
     def closed_by(self, model: Model) -> bool:
         """Whether a model of these windows leaves nothing to explain."""

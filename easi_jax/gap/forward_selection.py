@@ -18,6 +18,7 @@ from easi_jax.gap.batched_least_squares import (
     least_squares,
     lockstep,
 )
+from easi_jax.gap.decisions import DECIDE
 from easi_jax.gap.effect_set import Candidate, Model
 from easi_jax.gap.gap_metric import finite
 from easi_jax.gap.model_comparison import better, contains
@@ -29,7 +30,6 @@ from easi_jax.model.mujoco_warnings import warnings_to
 from easi_jax.progress import Progress, silent
 
 _LOST = 0.5  # of the windows not finite: beyond, a vector predicts nothing
-_FELT = 1e-3  # of the most that a number of an effect changes
 
 
 class Selector:
@@ -160,7 +160,7 @@ class Selector:
         change = change * self.bounds.size[self.columns(place)]
         if not np.isfinite(change).all() or not change.any():
             return sum(place.fitted)
-        return int((change > _FELT * change.max()).sum())
+        return int((change > DECIDE.felt * change.max()).sum())
 
     def fit(self, places: list[Place], x: np.ndarray) -> Model:
         """The best fit of some effects from ``x``."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from easi_jax.data.recording import Run
 from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
+from easi_jax.gap.decisions import DECIDE
 from easi_jax.model.joint_space import (
     FREE_WIDTH,
     dofs,
@@ -18,9 +19,6 @@ from easi_jax.model.joint_space import (
 )
 from easi_jax.model.results import UNMEASURED
 
-_VISIBLE = 5.0  # times the noise
-_ODD = 3.0  # times the error of other runs
-_FOLLOWED = 1.5  # times the floor: a run that the model predicts
 _DRAWS = 2000
 
 
@@ -85,13 +83,13 @@ def channels(
         elif widths(m, j)[0] == FREE_WIDTH:
             unbounded[list(dofs(m, j)[:2])] = True
     scale = np.where(unbounded, change, spread)
-    quiet = change < _VISIBLE * noise
+    quiet = change < DECIDE.visible * noise
     ignored = {
         names[d]: UNMEASURED
         if np.isinf(noise[d])
         else (
             f"moves by {_size(change[d], units[d])} over a horizon, less than "
-            f"{_VISIBLE:g} times its noise of {_size(noise[d], units[d])}"
+            f"{DECIDE.visible:g} times its noise of {_size(noise[d], units[d])}"
         )
         for d in np.flatnonzero(quiet).tolist()
     }
@@ -114,7 +112,9 @@ def with_moving(found: Channels, moved: np.ndarray, noise: np.ndarray) -> Channe
         noise: of readings, ``(c,)``; infinite where not measured.
     """
     size = np.maximum(np.sqrt(np.nanmedian(moved**2, 0)), found.change)
-    stuck = ~np.isfinite(found.scale) & np.isfinite(noise) & (size > _VISIBLE * noise)
+    stuck = (
+        ~np.isfinite(found.scale) & np.isfinite(noise) & (size > DECIDE.visible * noise)
+    )
     if not stuck.any():
         return found
     names = {found.names[d] for d in np.flatnonzero(stuck).tolist()}
@@ -172,7 +172,7 @@ def odd_runs(
     out = {}
     for r, mine in typical.items():
         others = float(np.median([x for k, x in typical.items() if k != r]))
-        if mine > _ODD * others:
+        if mine > DECIDE.odd_run * others:
             out[r] = mine / max(others, 1e-30)
     return out
 
@@ -189,7 +189,10 @@ def odd_of_two(
     first, second = (int(r) for r in np.unique(run))
     a, b = (float(np.median(error[run == r])) for r in (first, second))
     odd, mine, other = (first, a, b) if a > b else (second, b, a)
-    if other < _FOLLOWED * floor and mine > _ODD * _FOLLOWED * max(other, floor):
+    if (
+        other < DECIDE.followed * floor
+        and mine > DECIDE.odd_run * DECIDE.followed * max(other, floor)
+    ):
         return {odd: mine / max(other, 1e-30)}
     return {}
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from easi_jax.data.law_states import known_rows, memory_path
+from easi_jax.gap.decisions import DECIDE
 from easi_jax.gap.effect_set import Model
 from easi_jax.gap.fitting import Fitting
 from easi_jax.gap.linear_response import LinearResponse
@@ -25,11 +26,6 @@ from easi_jax.model.found_laws import FoundLaw
 from easi_jax.model.law_terms import Known, Memory, Term
 from easi_jax.model.own_laws import joints_of, names_alone
 
-_MOST = 4  # terms
-_SURE = 2.5  # standard errors between blocks: one of some hundred terms is the best
-_GAIN = 0.1  # of the loss that is left, that a term takes
-_MUCH = 0.02  # of the loss at first: less may be what linearizing leaves
-_AS_GOOD = 0.95  # of the best gain: then what takes less to say
 _HOLDS = 0.5  # of the windows, in which torques are linear
 _RIDGE = 1e-9  # of the largest information, that what is unseen has
 _STIFF = 2.0  # times as wide a sign as an explicit step could swing over
@@ -131,19 +127,23 @@ class LawSearch:
         chosen: list[int] = []
         losses = self._losses(columns[:0])
         first = float(losses.mean())
-        for _ in range(_MOST):
+        for _ in range(DECIDE.law_terms):
             norm = np.linalg.norm(free, axis=1)
             seen = norm > 1e-3 * size  # else it is what is known
             gain = np.where(seen, (free @ left) ** 2 / np.maximum(norm, 1e-300) ** 2, 0)
             best = float(gain.max(initial=0.0))
             if not best > 0:
                 break
-            near = [k for k in range(len(terms)) if gain[k] >= _AS_GOOD * best]
+            near = [
+                k for k in range(len(terms)) if gain[k] >= DECIDE.law_as_good * best
+            ]
             k = min(near, key=lambda k: (terms[k].parts, -gain[k]))
             new = self._losses(columns[[*chosen, k]])
             gained = losses.mean() - new.mean()
-            enough = gained > max(_GAIN * losses.mean(), _MUCH * first)
-            if not (enough and advantage(new, losses) > _SURE):
+            enough = gained > max(
+                DECIDE.law_gain * losses.mean(), DECIDE.law_of_first * first
+            )
+            if not (enough and advantage(new, losses) > DECIDE.law_sure):
                 break
             chosen.append(k)
             losses = new

@@ -5,27 +5,11 @@ from math import erf, sqrt
 
 import numpy as np
 
+from easi_jax.gap.decisions import DECIDE
 from easi_jax.gap.effect_set import Model
 from easi_jax.gap.table import Place
-from easi_jax.gap.verdict import GOAL
 
-_SURE = 1.7  # standard errors by which an effect has to help
-_LIKELY = 1.0  # by either measure
-HELPS = 0.05  # share of the squared gap by which each of its numbers has to help
-_LARGE = 0.3
-_CLOSER = 3.0  # times as much has to be gained where it is
 _TINY = 1e-300
-# Nats for each number: what is as often named wrongly as rightly, and how fast that
-# changes with the logarithm. Fitted once to 57 names of 37 generated machines, which
-# were not kept; `benchmarks.gap_confidence` tests them on others.
-_EVEN, _STEEP = 0.83, 2.6
-_SAME = 0.1  # of the noise: predictions that differ by less are one
-_RARE = 0.1  # relative loss by which a rare effect has to be better than others
-_ALIKE = 0.02  # difference of logarithms of losses that says nothing
-_AS_GOOD = 1.5  # standard errors within which the simpler of two candidates wins
-_NEARLY = 0.7  # share of what the best explains
-_FEW = 0.25  # share of the windows
-_LEAST = 3  # windows that can tell
 
 
 def advantage(a: np.ndarray, b: np.ndarray) -> float:
@@ -44,7 +28,7 @@ def _in_errors(d: np.ndarray, least: float) -> float:
 
 def rank(model: Model) -> float:
     """Cross-validated loss, with a handicap for what machines rarely have."""
-    return float(model.loss.mean()) * (1.0 + _RARE * model.unlikely)
+    return float(model.loss.mean()) * (1.0 + DECIDE.rare * model.unlikely)
 
 
 def better(model: Model, base: Model, floor: float) -> bool:
@@ -65,14 +49,14 @@ def better(model: Model, base: Model, floor: float) -> bool:
     Args:
         floor: the gap of a perfect model.
     """
-    helps = HELPS * max(1, len(model.fit.active) - len(base.fit.active))
-    if base.gap.mean() < (GOAL * floor) ** 2:
-        helps *= _CLOSER
+    helps = DECIDE.helps * max(1, len(model.fit.active) - len(base.fit.active))
+    if base.gap.mean() < (DECIDE.open_from * floor) ** 2:
+        helps *= DECIDE.helps_when_closed
     known = {p.key for p in base.places}
     rare = any(p.row.is_rare for p in model.places if p.key not in known)
     both = ((model.loss, base.loss), (model.gap, base.gap))
     gain = [1 - a.mean() / max(b.mean(), 1e-300) for a, b in both]
-    large = min(gain) > _LARGE
+    large = min(gain) > DECIDE.large_gain
     sure = [_sure(a, b, large) for a, b in both]
     acting = _acting(model, base)
     if len(acting):
@@ -81,8 +65,8 @@ def better(model: Model, base: Model, floor: float) -> bool:
         ones = [_sure(a, b, large) / sqrt(2) for a, b in single]
         sure = [max(pair) for pair in zip(sure, ones, strict=True)]
     if rare:
-        return min(sure) > _SURE and min(gain) > 2 * helps
-    likely = min(sure) > _LIKELY and sum(sure) > 2 * _SURE
+        return min(sure) > DECIDE.sure and min(gain) > 2 * helps
+    likely = min(sure) > DECIDE.likely and sum(sure) > 2 * DECIDE.sure
     return likely and max(gain) > helps and min(gain) > helps / 3
 
 
@@ -106,7 +90,7 @@ def _acting(model: Model, base: Model) -> np.ndarray:
 def _few(windows: np.ndarray) -> np.ndarray:
     """Indices of windows ``(W,)``, where those are few that can tell; else none."""
     found = np.flatnonzero(windows)
-    few = _LEAST <= len(found) <= _FEW * len(windows)
+    few = DECIDE.least_windows <= len(found) <= DECIDE.few_windows * len(windows)
     return found if few else found[:0]
 
 
@@ -140,11 +124,11 @@ def simplest(models: Sequence[Model], base: Model) -> Model:
     for m in models[1:]:
         if _within(m, best):
             whole = base.loss.mean() - best.loss.mean()
-            if base.loss.mean() - m.loss.mean() > _NEARLY * whole:
+            if base.loss.mean() - m.loss.mean() > DECIDE.nearly * whole:
                 best = m
         elif len(m.fit.active) < len(best.fit.active) or _tied(m) > _tied(best):
-            close = m.loss.mean() < (1 + HELPS) * best.loss.mean()
-            if close and advantage(best.loss, m.loss) < _AS_GOOD:
+            close = m.loss.mean() < (1 + DECIDE.helps) * best.loss.mean()
+            if close and advantage(best.loss, m.loss) < DECIDE.as_good:
                 best = m
     return best
 
@@ -166,7 +150,7 @@ def probability(model: Model, rival: Model) -> float:
     for mine, theirs in ((model.loss, rival.loss), (model.gap, rival.gap)):
         # Of numbers whose spread nobody knows, the log density is that of the spread.
         d = np.log(theirs + _TINY) - np.log(mine + _TINY)
-        t += 0.5 * _in_errors(d, _ALIKE)
+        t += 0.5 * _in_errors(d, DECIDE.says_nothing)
     apart = _few(np.abs(model.windows - rival.windows).max(0, initial=0.0) > 1.0)
     if len(apart):
         mine, theirs = (np.log(x.windows[:, apart] + _TINY) for x in (model, rival))
@@ -189,7 +173,7 @@ def cost(model: Model, less: Model) -> float:
 
 
 def confidence(
-    lost: float, odds: float, even: float = _EVEN, steep: float = _STEEP
+    lost: float, odds: float, even: float = DECIDE.even, steep: float = DECIDE.steep
 ) -> float:
     """Probability that an effect of this name acts at this place.
 
@@ -211,4 +195,4 @@ def confidence(
 def are_twins(model: Model, rival: Model) -> bool:
     """Whether two models predict the same, so that no such data tell them apart."""
     mine, theirs = model.fit.residual, rival.fit.residual
-    return bool(np.sqrt(np.mean((mine - theirs) ** 2)) < _SAME)
+    return bool(np.sqrt(np.mean((mine - theirs) ** 2)) < DECIDE.twins)

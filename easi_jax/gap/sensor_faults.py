@@ -16,6 +16,7 @@ import numpy as np
 from easi_jax.data.cleaning import rows_of
 from easi_jax.data.recording import Run
 from easi_jax.data.windows import fitted_velocity
+from easi_jax.gap.decisions import DECIDE
 from easi_jax.model.joint_space import joint_name
 from easi_jax.model.sensors import (
     reads_joints,
@@ -25,19 +26,13 @@ from easi_jax.model.sensors import (
 )
 
 _LONGEST = 0.1  # s
-_LATE = 0.003  # s; less is the velocity fit's own doing
-_ALIKE = 0.5  # share of the squared difference that the shift has to explain
 PIECES = 10
 
 _LONGEST = 0.1  # s
-_OFF = 3.0  # standard errors
-_SMALL = 0.01  # of what moves: a constant below it is no news
-_OWN_STEPS = 1.5  # physics steps: readings taken before a step are that late
 _SAME_STEP = 1e-6
 # Rows, and steps [rad, m, rad/s, m/s], in which a sensor's share of what is hidden
 # shows beyond rounding.
 _TRIED, _TRY, _ROUNDING = 5, 0.1, 1e-9
-_GEOMETRY = 0.5  # of the confidence, where the model's lengths may be wrong instead
 _NO_NUMBER = {"CLOCK", "USER", "PLUGIN"}
 _KINDS = {mujoco.mjtDataType.mjDATATYPE_REAL, mujoco.mjtDataType.mjDATATYPE_POSITIVE}
 _STAGES = {mujoco.mjtStage.mjSTAGE_POS, mujoco.mjtStage.mjSTAGE_VEL}
@@ -150,7 +145,7 @@ def _faults(
     parts = np.array_split(off - middle, PIECES)
     costs = np.array([np.nansum(p**2, (0, 2)) for p in parts])
     found = []
-    least = _OWN_STEPS * m.opt.timestep
+    least = DECIDE.own_steps * m.opt.timestep
     lag = shift_of(costs.sum(0), dt, least)
     if lag is not None:
         alone = [shift_of(c, dt, least) for c in costs]
@@ -160,7 +155,9 @@ def _faults(
     means = np.array([np.nanmean(p, 0) for p in np.array_split(rest, PIECES)])
     bias = middle[best]
     error = np.nanstd(means, 0, ddof=1) / np.sqrt(PIECES)
-    large = np.abs(bias) > np.maximum(_OFF * error, _SMALL * moved)
+    large = np.abs(bias) > np.maximum(
+        DECIDE.bias_sure * error, DECIDE.bias_small * moved
+    )
     large &= bias**2 > 0.5 * np.nanmean(rest**2, 0)
     if large.any():
         shown = np.abs(means) > 0.5 * np.abs(bias)
@@ -168,7 +165,7 @@ def _faults(
             PIECES + 2
         )
         if not reads_joints(m, i):
-            sure *= _GEOMETRY
+            sure *= DECIDE.geometry
         unit = sensor_unit(m, i)
         many = len(bias) > 1
         words = [f"bias.{k}" if many else "bias" for k in range(len(bias))]
@@ -307,5 +304,9 @@ def shift_of(cost: np.ndarray, dt: float, least: float = 0.0) -> float | None:
     if 0 < best < len(cost) - 1:
         a, b, c = cost[best - 1 : best + 2]
         lag += 0.5 * (a - c) / max(a - 2 * b + c, 1e-300)
-    enough = lag * dt > max(_LATE, 0.5 * dt, least)
-    return float(lag * dt) if enough and cost[best] < _ALIKE * cost[0] else None
+    enough = lag * dt > max(DECIDE.late, 0.5 * dt, least)
+    return (
+        float(lag * dt)
+        if enough and cost[best] < DECIDE.late_explains * cost[0]
+        else None
+    )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from easi_jax.gap import gap_metric as measure
+from easi_jax.gap.decisions import DECIDE
 from easi_jax.gap.effect_search import RIVALS, EffectSearch
 from easi_jax.gap.effect_set import Model, last
 from easi_jax.gap.fitting import Fitting
@@ -20,9 +21,6 @@ from easi_jax.gap.result import Figures, Found, Numbers, Outcome, Part
 from easi_jax.gap.table import Place
 from easi_jax.gap.verdict import Openness, openness, surely_better, verdict_of
 from easi_jax.model.parameters import ParameterSpace
-
-_ROUNDING = 0.005  # of the gap
-_TOLD = 0.8  # of the gap without the own steps' error: worth a note
 
 
 @dataclass
@@ -91,7 +89,7 @@ def stated(
         refit = end = _looked(at, held_out, base)
     x = end.model.fit.x
     fair = held_out.figures(at.plain(x), at.share(x)).gap
-    if fair < _TOLD * end.figures.gap:
+    if fair < DECIDE.steps_told * end.figures.gap:
         notes.append(
             f"the model's physics step of {1000 * step:.3g} ms makes much of "
             f"the gap itself: {end.figures.gap:.3g} would be {fair:.3g} without "
@@ -224,7 +222,7 @@ class _Judge:
         d = measure.gap(weights @ theirs, scale) - measure.gap(weights @ mine, scale)
         # Twins differ by rounding alone.
         gap = measure.gap(mine.mean(0), scale)
-        return bool(np.quantile(d, 0.025) <= _ROUNDING * gap)
+        return bool(np.quantile(d, 0.025) <= DECIDE.no_difference * gap)
 
 
 def _not_named(model: Model, fine: bool) -> str:

@@ -6,9 +6,8 @@ from statistics import NormalDist
 import numpy as np
 
 from easi_jax.gap import gap_metric as measure
+from easi_jax.gap.decisions import DECIDE
 
-GOAL = 1.25  # times the floor: a channel whose error is beyond that is open
-_SURE = 0.95  # of all channels together
 _MISSED = 1e-12  # of a floor that errors are divided by
 
 
@@ -27,13 +26,14 @@ class Openness:
 
     @property
     def is_open(self) -> np.ndarray:
-        """Surely beyond `GOAL`, ``(nv + 1,)`` bool."""
-        return self.low > GOAL
+        """Surely beyond `Decisions.open_from`, ``(nv + 1,)`` bool."""
+        return self.low > DECIDE.open_from
 
     @property
     def undecided(self) -> np.ndarray:
-        """Perhaps beyond `GOAL`, ``(nv + 1,)`` bool: more data would tell."""
-        return (self.high > GOAL) & ~self.is_open
+        """Perhaps beyond `Decisions.open_from`, ``(nv + 1,)`` bool: more data would
+        tell."""
+        return (self.high > DECIDE.open_from) & ~self.is_open
 
 
 def openness(square: np.ndarray, floor: np.ndarray, scale: np.ndarray) -> Openness:
@@ -57,7 +57,7 @@ def openness(square: np.ndarray, floor: np.ndarray, scale: np.ndarray) -> Openne
     spread = np.log(np.maximum(drawn, 1e-300)).std(0)
     # Of many intervals that are to hold together (Bonferroni).
     count = int(used.sum()) + 1
-    times = NormalDist().inv_cdf(1 - (1 - _SURE) / 2 / count)
+    times = NormalDist().inv_cdf(1 - (1 - DECIDE.interval) / 2 / count)
     known = np.append(used, True)
     return Openness(
         np.where(known, ratio, np.nan),
@@ -84,4 +84,4 @@ def surely_better(after: np.ndarray, before: np.ndarray, scale: np.ndarray) -> b
     """Whether held-out errors fell by more than chance; mean squares ``(W, nv)``."""
     weights = measure.resampled(len(after), 3)
     fell = measure.gap(weights @ after, scale) - measure.gap(weights @ before, scale)
-    return bool(np.quantile(fell, _SURE) < 0)
+    return bool(np.quantile(fell, DECIDE.interval) < 0)
