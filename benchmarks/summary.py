@@ -31,6 +31,7 @@ from benchmarks import (
     paper_tables,
     parity,
     rivals_summary,
+    same_twice,
     scaling_summary,
     slow_tests,
     strangers,
@@ -428,6 +429,7 @@ SECTIONS = (
     Section(
         *("## Same result on other devices", "devices_*.json", "devices", _devices)
     ),
+    *same_twice.SECTIONS,
     *crash_summary.SECTIONS,
     *gap_summary.SECTIONS,
     *floor.SECTIONS,
