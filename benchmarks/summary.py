@@ -69,7 +69,7 @@ def run(config: Config) -> None:
     if by_hand.is_file():
         parts.append(by_hand.read_text().strip())
     parts += shown(SECTIONS, config.results)
-    for module in (gap_summary, paper_tables, scaling_summary):
+    for module in (gap_summary, go2_in_air, paper_tables, scaling_summary):
         for name, text in module.figures(config.results).items():
             atomic_write(config.results / name, text)
     claims = config.results / "CLAIMS.md"

@@ -209,7 +209,7 @@ effects:
 """
 ORDER = (
     *("index", "your_own_robot", "export", "gap", "importers", "batch", "engines"),
-    "imitation",
+    *("imitation", "real_go2"),
 )
 NOT_RUN = ("method", "reference", "user_files")  # pages of reading, not of doing
 

@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from benchmarks.go2_in_air import BLOCK, blocks
+from benchmarks._common import RESULTS
+from benchmarks.go2_in_air import BLOCK, blocks, figures
 
 
 def test_blocks_are_dealt_out_in_turns(tmp_path: Path) -> None:
@@ -17,3 +18,13 @@ def test_blocks_are_dealt_out_in_turns(tmp_path: Path) -> None:
     found = [line for lines in read.values() for line in lines[1:]]
     assert sorted(found) == sorted(rows[:600])
     assert all(len(lines) == BLOCK / 0.01 + 1 for lines in read.values())
+
+
+def test_pictures_come_from_the_committed_figures(tmp_path: Path) -> None:
+    drawn = figures(RESULTS)
+    assert set(drawn) == {"go2_in_air_errors.svg", "go2_in_air_values.svg"}
+    for text in drawn.values():
+        assert text.lstrip().startswith("<") and "</svg>" in text
+    assert "FL thigh" in drawn["go2_in_air_errors.svg"]
+    assert "calf kv" in drawn["go2_in_air_values.svg"]
+    assert figures(tmp_path) == {}
