@@ -16,7 +16,6 @@ Tables and figures are made from that file alone
 (``python -m benchmarks.summary``).
 """
 
-import dataclasses
 from typing import Any
 
 from benchmarks import paper_status, paper_twin
@@ -33,14 +32,13 @@ def run(config: Config) -> None:
     from benchmarks.paper_runtime import timed
 
     if config.experiment in WHOLE:
-        # Says what is wrong with the other options.
-        cells(dataclasses.replace(config, experiment="table1"))
+        paper_status.check(config)
         if config.experiment == "status":
             return paper_status.status(config)
         return paper_status.run_all(config)
 
     def result(c: Cell) -> dict[str, Any]:
-        made = {"recipe": recipe(c.method)}
+        made = {"recipe": recipe(c.method, c.robot)}
         if c.method in WAYS:
             return timed(c) | made
         if c.target == paper_twin.TWIN:

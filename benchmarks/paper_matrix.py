@@ -57,8 +57,10 @@ def paragraphs(rows: Iterable[Row]) -> list[str]:
         markdown_table(head, lines),
     ]
     reasons: dict[tuple[str, ...], list[str]] = {}
-    for m in sorted({r["method"] for r in have.values() if is_stale(r)}):
-        reasons.setdefault(changes(m), []).append(m)
+    stale = {(r["method"], r["robot"]) for r in have.values() if is_stale(r)}
+    for m, robot in sorted(stale):
+        methods = reasons.setdefault(changes(m, robot), [])
+        methods += [m] * (m not in methods)
     for why, methods in reasons.items():
         out.append(f"Stale rows of {', '.join(methods)}: since then {'; '.join(why)}.")
     if none:

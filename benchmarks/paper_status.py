@@ -8,6 +8,7 @@ each seed completes a row of its table.
 import dataclasses
 import os
 import queue
+import signal
 import statistics
 import subprocess
 import sys
@@ -131,13 +132,31 @@ def status(config: Config) -> None:
     every = _each(found)
     say(f"all that is left, cells shared by experiments once: {costs.sum(every)}")
     say("a seed's UDR training, once a robot and budget, comes on top")
-    stale = {c.method for p in found for c in p.stale}
-    for method in sorted(stale):
-        say(f"stale, {method}: {'; '.join(changes(method))}")
+    stale = {(c.method, changes(c.method, c.robot)) for p in found for c in p.stale}
+    for method, why in sorted(stale):
+        say(f"stale, {method}: {'; '.join(why)}")
+
+
+def check(config: Config) -> None:
+    """Raises UserError for options that status and all do not have, or that make no
+    sense."""
+    from easi_jax.errors import UserError, nearest
+
+    cells(dataclasses.replace(config, experiment="table1", methods=()))
+    for m in config.methods:
+        if m not in METHODS + WAYS:
+            raise UserError(f'--methods "{m}": unknown{nearest(m, METHODS + WAYS)}')
+    if config.list or config.only or config.shard != "1/1":
+        raise UserError(
+            f"--list, --only and --shard are of one experiment: {config.experiment} "
+            "goes without them"
+        )
 
 
 def run_all(config: Config) -> None:
     """Runs what is left, one cell a process; see `Config` for workers and minutes.
+
+    A cell whose cost nobody knows is not begun where there is a limit.
 
     Raises:
         UserError: a cell that failed, after the others ended; no such options.
@@ -159,6 +178,8 @@ def run_all(config: Config) -> None:
     for _ in range(config.workers - cores.qsize()):
         cores.put(-1)
 
+    skipped: list[str] = []
+
     def one(run: tuple[str, Cell]) -> str | None:
         """What went wrong, where something did."""
         experiment, cell = run
@@ -166,26 +187,35 @@ def run_all(config: Config) -> None:
         try:
             left = None if end is None else end - time.monotonic()
             if left is not None and (expected is None or expected > left):
+                skipped.append(cell.key)
                 return None
-            words = _words(config, experiment, cell)
             limit = max(_LEAST, _HANGS * (expected or 0.0))
-            limit = limit if left is None else min(limit, left)
-            try:
-                ended = subprocess.run(
-                    words, timeout=limit, preexec_fn=lambda: _pin(core), check=False
-                )
-            except subprocess.TimeoutExpired:
+            status = ran(_words(config, experiment, cell), core, limit)
+            if status is None:
                 return f"{cell.key}: stopped after {limit:.0f} s"
-            return (
-                f"{cell.key}: status {ended.returncode}" if ended.returncode else None
-            )
+            return f"{cell.key}: status {status}" if status else None
         finally:
             cores.put(core)
 
     with ThreadPoolExecutor(config.workers) as pool:
         failed = [text for text in pool.map(one, runs) if text]
+    if skipped:
+        say(f"{len(skipped)} cells take longer than is left, or nobody knows how long")
     if failed:
         raise UserError("; ".join(failed))
+
+
+def ran(words: list[str], core: int, limit: float) -> int | None:
+    """Exit status of a process on one core (any where below 0); None where it did not
+    end within ``limit`` seconds, and was killed with all that it had started."""
+    with subprocess.Popen(words, start_new_session=True) as process:
+        if core >= 0:
+            os.sched_setaffinity(process.pid, {core})
+        try:
+            return process.wait(limit)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            return None
 
 
 def _words(config: Config, experiment: str, cell: Cell) -> list[str]:
@@ -216,15 +246,12 @@ def _each(found: Sequence[Part]) -> list[Cell]:
 
 
 def _device() -> str:
-    import jax
-
-    return jax.devices()[0].device_kind
+    """Asked in a process of its own: this one starts others, and on a GPU leaves them
+    the memory."""
+    words = [sys.executable, "-c", "import jax; print(jax.devices()[0].device_kind)"]
+    asked = subprocess.run(words, capture_output=True, text=True, timeout=300)
+    return asked.stdout.strip()
 
 
 def _cores() -> set[int]:
     return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set()
-
-
-def _pin(core: int) -> None:
-    if core >= 0:
-        os.sched_setaffinity(0, {core})

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.paper_cells import Cell, udr_run
+from benchmarks.paper_cells import Cell, recipe, udr_run
 from benchmarks.rival_cells import AFTER_GAP
 
 TWIN = "twin"
@@ -67,7 +67,9 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
     }
     policy, found = first, None
     if cell.method != "UDR":
-        place = folder / re.sub(r"\W+", "_", cell.key)
+        # What an earlier recipe of the method has left there is not gone on with.
+        made = recipe(cell.method, cell.robot)
+        place = folder / re.sub(r"\W+", "_", f"{cell.key}, recipe {made}")
         place.mkdir(parents=True, exist_ok=True)
         found = identified(cell, place, env, first, twin, logs)
         policy = trained(cell, place, with_effects(env, place), found)

@@ -4,6 +4,8 @@
 #   sh scripts/same_twice_on_gpu.sh [FOLDER]
 python=${PYTHON:-python3}
 out=${1:-benchmarks/results}
-timeout 240 "$python" -m benchmarks.same_twice --robot cartpole --folder "$out"
+status=0
+timeout 240 "$python" -m benchmarks.same_twice --robot cartpole --folder "$out" || status=1
 timeout 340 "$python" -m benchmarks.same_twice --robot ant --env-steps 200000 \
-  --folder "$out"
+  --folder "$out" || status=1
+exit $status

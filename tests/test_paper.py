@@ -74,7 +74,7 @@ def row(method: str, target: str, seed: int, **values: Any) -> dict[str, Any]:
     return {
         **given,
         "key": Cell(**named).key,
-        "recipe": recipe(method),
+        "recipe": recipe(method, "cartpole"),
         **values,
         "versions": VERSIONS,
     }

@@ -2,9 +2,9 @@
 
 import dataclasses
 import json
-import subprocess
+import sys
+import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,7 +19,11 @@ HERE = {"commit": "0123456789", "runtime": {"device_kind": "cpu"}}
 
 
 def row(cell: Cell, seconds: float, **more: Any) -> dict[str, Any]:
-    given = {"key": cell.key, **dataclasses.asdict(cell), "recipe": recipe(cell.method)}
+    given = {
+        "key": cell.key,
+        **dataclasses.asdict(cell),
+        "recipe": recipe(cell.method, cell.robot),
+    }
     return {**given, "seconds": seconds, "versions": HERE, **more}
 
 
@@ -37,7 +41,7 @@ def test_a_row_from_before_a_change_is_stale_and_is_run_again(
 ) -> None:
     old = row(some("EASI paper"), 5.0, **{"return": 1.0}, recipe=0)
     assert is_stale(old) and not is_stale(row(some("Oracle"), 1.0))
-    assert not is_stale({**old, "recipe": recipe("EASI paper")})
+    assert not is_stale({**old, "recipe": recipe("EASI paper", "cartpole")})
     out = tmp_path / "paper.jsonl"
     add_row(out, old)
     add_row(out, row(some("Oracle"), 1.0))
@@ -90,13 +94,13 @@ def ran(monkeypatch: Any, config: Config, status: int = 0) -> list[str]:
     """Cells in the order in which processes are started for them."""
     keys: list[str] = []
 
-    def run(words: list[str], timeout: float, **_: Any) -> Any:
-        assert words[1:3] == ["-m", "benchmarks.paper"] and timeout > 0
+    def run(words: list[str], core: int, limit: float) -> int:
+        assert words[1:3] == ["-m", "benchmarks.paper"] and limit > 0
         assert words[3] in paper_experiments.EXPERIMENTS
         keys.append(words[words.index("--only") + 1])
-        return SimpleNamespace(returncode=status)
+        return status
 
-    monkeypatch.setattr(subprocess, "run", run)
+    monkeypatch.setattr(paper_status, "ran", run)
     paper.run(config)
     return keys
 
@@ -122,13 +126,16 @@ def test_all_runs_each_cell_once_the_cheapest_part_first(
     assert max(map(keys.index, table)) < min(sweep)
 
 
-def test_minutes_leave_out_what_would_not_end(tmp_path: Path, monkeypatch: Any) -> None:
+def test_minutes_leave_out_what_would_not_end(
+    tmp_path: Path, monkeypatch: Any, capsys: Any
+) -> None:
     out = tmp_path / "paper.jsonl"
     takes = {"Oracle": 50.0, "GARAT": 5000.0}
     for c in cells(Config("table1", seeds=(0,))):
         add_row(out, row(c, takes.get(c.method, 1.0)))
     config = Config("all", robot="cartpole", seeds=(0, 1), out=out, minutes=1.5)
     keys = ran(monkeypatch, config)
+    assert "take longer" in capsys.readouterr().out
     assert any("Oracle" in k for k in keys)
     assert not any("GARAT" in k or "elite_ratio" in k for k in keys)
 
@@ -141,19 +148,31 @@ def test_minutes_leave_out_what_would_not_end(tmp_path: Path, monkeypatch: Any) 
         (["all", "--workers", 0], "workers"),
         (["all", "--minutes", -1], "--minutes"),
         (["status", "--robot", "cartpol"], "cartpole"),
+        (["all", "--list"], "goes without them"),
+        (["all", "--shard", "1/2"], "goes without them"),
+        (["status", "--methods", "GARATT"], "GARAT"),
     ],
 )
 def test_mistakes_are_one_line(words: list[Any], said: str, capsys: Any) -> None:
     assert said in refused(capsys, paper, *words)
 
 
+def test_a_process_that_hangs_is_killed_with_what_it_started(tmp_path: Path) -> None:
+    mark = tmp_path / "alive"
+    child = f"import time, pathlib; time.sleep(3); pathlib.Path({str(mark)!r}).touch()"
+    parent = (
+        f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
+    )
+    assert paper_status.ran([sys.executable, "-c", parent], -1, 0.5) is None
+    time.sleep(3.5)
+    assert not mark.exists()
+    assert paper_status.ran([sys.executable, "-c", "raise SystemExit(3)"], 0, 60) == 3
+
+
 def test_a_cell_that_fails_is_named(
     tmp_path: Path, monkeypatch: Any, capsys: Any
 ) -> None:
-    def run(words: list[str], **_: Any) -> Any:
-        return SimpleNamespace(returncode=1)
-
-    monkeypatch.setattr(subprocess, "run", run)
+    monkeypatch.setattr(paper_status, "ran", lambda *_: 1)
     out = tmp_path / "paper.jsonl"
     words = ["all", "--robot", "cartpole", "--seeds", 0, "--methods", "Oracle"]
     assert "status 1" in refused(capsys, paper, *words, "--out", out)

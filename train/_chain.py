@@ -78,11 +78,9 @@ def ready(
         training=training,
         trajectories=config.trajectories,
         noise=config.noise,
-        refine=config.finishes,
+        refine=config.refine and search.finish,
         restarts=config.restarts,
-        warm_start=config.preset != "paper"
-        if config.warm_start is None
-        else config.warm_start,
+        warm_start=config.warm_start and search.goes_on,
         eval_episodes=config.eval_episodes,
     )
     pipe = Pipeline(env, settings, start=config.start, real=real)

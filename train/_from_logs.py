@@ -32,10 +32,9 @@ def run(config: Any) -> None:
         from easi_jax.estimation.held_out import ready_errors
         from train._log_results import sound, write
 
+        refines = config.refine and search.config.finish
         finish = started(
-            lambda: ready_finish(
-                problem, search, config.finishes, config.restarts or 0, say
-            )
+            lambda: ready_finish(problem, search, refines, config.restarts or 0, say)
         )
         data = search_data(problem)
         states = searched(folder, config, search, data, problem.notes, seeds)

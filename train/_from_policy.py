@@ -61,7 +61,7 @@ def _check_options(config: Any) -> None:
                 f"{flag} goes without --policy: where a robot is simulated under its "
                 "controller, no piece starts at a row of the log"
             )
-    if config.stand and not config.finishes:
+    if config.stand and not config.refine:
         raise UserError("--stand goes without --no-refine: the fit has use for it")
 
 
@@ -103,6 +103,8 @@ def read_problem(config: Any) -> "tuple[UnpairedProblem, Any, dict[str, Any]]":
             "no policy is trained from logs: leave source and "
             "policy_updates_per_generation alone with --data"
         )
+    if config.stand and not settings.finish:
+        raise UserError("--stand goes with a fit after the search: --set finish=true")
     if sends:
         name, mj_model, space, fixed = env.name, env.mj_model, env.space, env.fixed
         step = command_step(max(runs.fit, key=len))
@@ -277,7 +279,7 @@ def _finished(
     from train._log_results import write_found
 
     search, pieces = simulated.search, problem.pieces(problem.fit)
-    known = [NOTHING] * len(seeds)
+    known, refines = [NOTHING] * len(seeds), config.refine and search.config.finish
     if stand is not None:
         n = slice(stand.simulator.space.size)
         ends = states.result_mean[:, n], states.result_cov[:, n, n]
@@ -286,7 +288,7 @@ def _finished(
     found = {}
     for k, seed in enumerate(seeds):
         end = states.result_mean[k], states.result_cov[k]
-        given = simulated, pieces, *end, keys[k], config.finishes, say
+        given = simulated, pieces, *end, keys[k], refines, say
         found[seed] = found_of(*given, known[k])
     good = {s: f for s, f in found.items() if np.isfinite(f.mean).all()}
     lost = {s: "too few simulations stay on their feet" for s in seeds if s not in good}

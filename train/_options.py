@@ -94,18 +94,13 @@ class SearchOptions:
     start: tuple[float, float] | None = None
     """Where the search starts, as factors on the nominal values; not given: where UDR
     trained."""
-    refine: bool | None = None
-    """Finish with least squares on the paired data; where not given, yes, but not for
-    the preset paper, which has no such finish."""
+    refine: bool = True
+    """Finish with least squares on the paired data. The preset paper has no such finish
+    unless --set finish=true asks for it."""
     restarts: int | None = None
     """More starts of the least-squares finish, drawn from the search's spread; the best
     fit counts. Not given: 2 for noisy data, none for clean ones, larger robots and
     logs."""
-
-    @property
-    def finishes(self) -> bool:
-        """Whether least squares follow the search."""
-        return self.preset != "paper" if self.refine is None else self.refine
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,10 +112,10 @@ class ChainOptions:
     noise: tuple[float, ...] = ()
     """Sensor noise (standard deviations of positions, then velocities, SI): added to
     pseudo-real demonstrations; for logs it is estimated where not given."""
-    warm_start: bool | None = None
+    warm_start: bool = True
     """Final training goes on from the networks of the UDR policy in place of new ones
     (the Oracle's, too): it gets further where a training of its length has not settled.
-    Where not given, yes, but not for the preset paper."""
+    The preset paper trains anew unless --set goes_on=true."""
     eval_episodes: int = 100
     """Episodes of the final evaluation."""
 

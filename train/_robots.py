@@ -99,7 +99,7 @@ def search_config(
 
     base = make(preset)
     known = asdict(base)
-    chosen = _PAPER.get(robot, {}) if preset == "paper" else {}
+    chosen = dict(_PAPER.get(robot, {})) if preset == "paper" else {}
     chosen |= {k: v for k, v in changes.items() if v is not None}
     for setting in settings:
         name, sign, text = setting.partition("=")

@@ -17,8 +17,6 @@ def run(config: Config) -> None:
         check_seeds(config.seeds)
     if config.restarts is not None and config.restarts < 0:
         raise UserError(f"--restarts is {config.restarts}: give 0 or more")
-    if config.data and config.warm_start:
-        raise UserError("--warm-start goes without --data: logs have no training")
     if config.data and config.env and not config.policy:
         raise UserError("--env goes without --data: give --model and --parameters")
     if config.data:

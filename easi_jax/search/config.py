@@ -85,6 +85,10 @@ class SearchConfig:
     """Give the result the initial spread along what the data leave open."""
     log_scale: bool = True
     """Search positive parameters on a logarithmic scale."""
+    finish: bool = True
+    """Least squares on paired data may follow the search."""
+    goes_on: bool = True
+    """The policy's final training may go on from the first policy's networks."""
 
     def __post_init__(self) -> None:
         """Checks names and sizes; raises UserError."""
@@ -161,6 +165,8 @@ PAPER = SearchConfig(
     spread_about="new_mean",
     informed_spread=False,
     log_scale=False,
+    finish=False,
+    goes_on=False,
 )
 """The reference's recipe, defects included, with Cartpole's 10 discriminator steps
 (Ant and Ballbalance have 20; commands know)."""

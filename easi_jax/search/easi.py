@@ -186,6 +186,13 @@ class Search:
     def _width(self, data: SearchData) -> int:
         """How many numbers the discriminator sees."""
         if self.config.observation_inputs:
+            if isinstance(data.segments.seen, tuple):
+                raise UserError(
+                    "search observation_inputs compares what the controller saw, which "
+                    "these demonstrations do not hold: record them with sees=True "
+                    "(easi_jax.simulation.rollout.collect), or set "
+                    "observation_inputs=false"
+                )
             return int(data.segments.seen.shape[1])
 
         def inputs(s: Segments) -> tuple[jax.Array, jax.Array]:
@@ -221,7 +228,8 @@ class Search:
         real, fake, weight, finite, observed = simulated
         trained, loss = self._train_critic(state.critic, k_critic, real, fake, weight)
         fitness = critic.fitness(self.critic_config, trained, fake, weight)
-        told, cost = _only_finite(population, -fitness, finite)
+        neutral = None if c.positive_weights else state.mean
+        told, cost = _only_finite(population, -fitness, finite, neutral)
         es_new = self.strategy.tell(k_tell, told, cost, es)
         mean, cov = self.strategy.moments(es_new, told, cost)
         # A generation without one finite simulation, or with all of one score, teaches
@@ -562,16 +570,21 @@ def moments(x: jax.Array, weight: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _only_finite(
-    population: jax.Array, cost: jax.Array, finite: jax.Array
+    population: jax.Array,
+    cost: jax.Array,
+    finite: jax.Array,
+    neutral: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Ranks non-finite individuals last, in places where they pull nothing.
 
     Their coordinates become those of finite individuals in turn, so that a strategy
-    which recombines many never moves towards a failure.
+    which recombines many never moves towards a failure; where the last may weigh less
+    than nothing, those of the mean, ``neutral (n,)``.
     """
     order = jnp.argsort(jnp.where(finite, cost, jnp.inf))
     count = jnp.maximum(finite.sum(), 1)
     stand_in = order[jnp.arange(cost.shape[0]) % count]
     worst = jnp.max(jnp.where(finite, cost, -jnp.inf))
-    population = jnp.where(finite[:, None], population, population[stand_in])
+    instead = population[stand_in] if neutral is None else neutral
+    population = jnp.where(finite[:, None], population, instead)
     return population, jnp.where(finite, cost, worst + 1.0)

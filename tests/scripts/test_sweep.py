@@ -64,7 +64,7 @@ def call(folder: Path, *words: object, **env: str) -> subprocess.CompletedProces
 def test_done_cells_are_skipped_and_failures_told(tmp_path: Path) -> None:
     config = paper.Config("table5", methods=("EASI paper",), seeds=(0,))
     rows = [
-        {"key": c.key, **dataclasses.asdict(c), "recipe": recipe(c.method)}
+        {"key": c.key, **dataclasses.asdict(c), "recipe": recipe(c.method, c.robot)}
         for c in paper.cells(config)
     ]
     assert len(rows) == 5

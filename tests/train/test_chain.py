@@ -1,11 +1,10 @@
 """train.udr, train.easi, train.evaluate and train.pipeline, end to end and small."""
 
-import dataclasses
 import json
 import re
 import shutil
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +25,8 @@ from easi_jax.simulation.rollout import policy_rollout
 from tests.commands import command, refused
 from tests.tiny_robot.env import XML, Tiny
 from train import easi, evaluate, export, pipeline, udr
+from train._chain import ready
+from train._effects import Given
 from train._robots import load_policies, search_config, training_config
 
 # The whole chain is compiled here; on a busy machine that takes its time.
@@ -226,11 +227,12 @@ def test_demonstrations_of_the_preset_paper() -> None:
     """They cross resets, hold what is seen, and begin with a stale observation."""
     search = search_config("paper", ("rollout_steps=40",), "ant")
     assert search.discriminator_updates == 20 and search.stale_first_observation
+    assert search.rollout_steps == 40
+    assert search_config("paper", (), "ant").rollout_steps == 200  # none is remembered
     assert not search_config("paper", (), "cartpole").stale_first_observation
     env = Tiny()
-    config = PipelineConfig(training_config(env, 2400), trajectories=6)
-    config = dataclasses.replace(config, search=search)
-    pipe = Pipeline(env, config)
+    training = training_config(env, 2400)
+    pipe = Pipeline(env, PipelineConfig(search, training, trajectories=6))
     wide = pipe.spread(pipe.udr(), 1)
     policies = pipe.policies(pipe.train_init(seed_keys([0]), wide))
     target = jnp.asarray(env.space.nominal)
@@ -246,10 +248,21 @@ def test_demonstrations_of_the_preset_paper() -> None:
     assert not np.isclose(states[..., 0, :], seen[..., 0, :size]).all(-1).any()
 
 
-def test_the_preset_paper_has_no_finish_unless_asked_for() -> None:
-    options = easi.Config(preset="paper")
-    assert not options.finishes and dataclasses.replace(options, refine=True).finishes
-    assert easi.Config().finishes
+@pytest.mark.parametrize(
+    ("more", "refine", "warm"),
+    [
+        ({}, True, True),
+        ({"refine": False, "warm_start": False}, False, False),
+        ({"preset": "paper"}, False, False),
+        ({"preset": "paper", "set": ("finish=true", "goes_on=true")}, True, True),
+    ],
+)
+def test_the_preset_paper_has_no_finish_unless_asked_for(
+    more: dict[str, Any], refine: bool, warm: bool
+) -> None:
+    config = easi.Config(**more, target=("gear*0.5",))
+    setup = ready(config, Tiny(), Given(), training_config(Tiny(), 2400), (0,))
+    assert (setup.pipe.config.refine, setup.pipe.config.warm_start) == (refine, warm)
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from easi_jax.devices.mesh import make_mesh
 from easi_jax.errors import UserError
 from easi_jax.model.parameters import Parameter, ParameterSpace
 from easi_jax.search.config import PAPER, SearchConfig, preset
-from easi_jax.search.easi import Search, SearchData
+from easi_jax.search.easi import Search, SearchData, _only_finite
 from easi_jax.simulation import rollout
 from easi_jax.simulation.env import EnvState
 from easi_jax.simulation.simulator import Simulator
@@ -317,6 +317,25 @@ def test_exploding_individuals_are_counted_and_ranked_last() -> None:
     assert new.mean[0] < limit
     for leaf in raw(new.critic):
         assert np.isfinite(leaf).all()
+
+
+@pytest.mark.fault("simulations that explode, parameters at absurd corners")
+def test_lost_ones_pull_nothing_where_the_last_weigh_less_than_nothing() -> None:
+    population = jnp.array([[0.0], [1.0], [2.0], [jnp.nan]])
+    finite = jnp.array([True, True, True, False])
+    cost = jnp.array([3.0, 1.0, 2.0, jnp.nan])
+    neutral = jnp.array([0.25])
+    told, ranks = _only_finite(population, cost, finite, neutral)
+    np.testing.assert_array_equal(told[:, 0], [0.0, 1.0, 2.0, 0.25])
+    assert ranks[3] > ranks[:3].max()
+    told, _ = _only_finite(population, cost, finite)
+    assert told[3, 0] in (0.0, 1.0, 2.0)
+
+
+def test_what_a_controller_saw_has_to_be_recorded() -> None:
+    bare = dataclasses.replace(measured(), seen=())
+    with pytest.raises(UserError, match="sees=True"):
+        make(SEEN).init(jax.random.key(0), SearchData(bare, jnp.zeros(2), POLICY))
 
 
 @pytest.mark.fault("simulations that explode, parameters at absurd corners")
