@@ -88,6 +88,13 @@ def not_run(command: str) -> str:
     return f"Not run: `python -m benchmarks.{command}`."
 
 
+def named(method: str, rows: Iterable[Mapping[str, Any]]) -> str:
+    """A method, with the parameters that by its rows it has no word for."""
+    mine = (r for r in rows if r["method"] == method)
+    lacks = {name for r in mine for name in r.get("unreached", ())}
+    return f"{method} (without {', '.join(sorted(lacks))})" if lacks else method
+
+
 def table(rows: Iterable[Any], columns: Mapping[str, Column]) -> str:
     """A Markdown table of rows.
 

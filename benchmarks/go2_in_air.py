@@ -176,6 +176,7 @@ def figures(folder: Path) -> dict[str, str]:
     """Pictures by file name: held-out errors of each joint, and values of the two
     halves of the recording."""
     from benchmarks._page import load
+    from benchmarks.go2_in_air_figures import errors_by_joint, values_of_halves
 
     r = load(folder, "go2_in_air.json")
     if r is None:
@@ -185,73 +186,11 @@ def figures(folder: Path) -> dict[str, str]:
     errors = {"as given": held["before"], "identified": after}
     halves = [half["parameters"] for half in r["halves"]]
     return {
-        "go2_in_air_errors.svg": _errors(held["channels"], errors, held["noise_floor"]),
-        "go2_in_air_values.svg": _values(*halves),
+        "go2_in_air_errors.svg": errors_by_joint(
+            held["channels"], errors, held["noise_floor"]
+        ),
+        "go2_in_air_values.svg": values_of_halves(*halves),
     }
-
-
-def _errors(
-    joints: list[str], errors: dict[str, list[float]], floor: list[float]
-) -> str:
-    import numpy as np
-
-    from easi_jax.io.report.figure_style import DASHED, SERIES, grid, styled, svg
-
-    @styled
-    def drawn() -> str:
-        figure, (axis,) = grid(1, 1, 2.8)
-        at, width = np.arange(len(joints)), 0.8 / len(errors)
-        for k, (name, values) in enumerate(errors.items()):
-            x = at + (k - (len(errors) - 1) / 2) * width
-            axis.bar(x, 1e3 * np.array(values), width, color=SERIES[k], label=name)
-        for x, low in zip(at, 1e3 * np.array(floor), strict=True):
-            axis.plot([x - 0.42, x + 0.42], [low, low], **DASHED)
-        axis.plot([], [], label="noise of the readings", **DASHED)
-        short = [j.removesuffix("_joint").replace("_", " ") for j in joints]
-        axis.set_xticks(at, short, rotation=45, ha="right")
-        axis.set_ylabel("held-out error over 0.2 s [mrad]")
-        axis.legend(ncol=3, loc="upper left")
-        return svg(figure)
-
-    return drawn()
-
-
-def _values(even: dict[str, Any], odd: dict[str, Any]) -> str:
-    import numpy as np
-
-    from easi_jax.io.report.figure_style import DASHED, SERIES, grid, styled, svg
-
-    names = list(even)
-
-    @styled
-    def drawn() -> str:
-        figure, (axis,) = grid(1, 1, 0.24 * len(names) + 1.0)
-        at = np.arange(len(names))[::-1]
-        for k, (half, found) in enumerate((("even", even), ("odd", odd))):
-            # As shares of what both halves say together.
-            middle = [math.sqrt(even[n]["mean"] * odd[n]["mean"]) for n in names]
-            mean = np.array([found[n]["mean"] for n in names]) / middle
-            std = np.array([found[n]["std"] for n in names]) / middle
-            axis.errorbar(
-                *(mean, at + (0.16 - 0.32 * k)),
-                xerr=np.stack([np.minimum(std, 0.9 * mean), std]),
-                fmt="o",
-                ms=4,
-                capsize=2,
-                color=SERIES[k],
-                label=f"{half} blocks",
-            )
-        axis.axvline(1.0, **DASHED)
-        axis.set_xscale("log")
-        axis.set_xlim(0.15, 4.0)
-        axis.set_xticks([0.2, 0.5, 1, 2, 4], ["0.2", "0.5", "1", "2", "4"])
-        axis.set_xticks([], minor=True)
-        axis.set_yticks(at, [n.replace("_joint", "").replace("_", " ") for n in names])
-        axis.set_xlabel("value and one deviation, over the middle of both halves")
-        axis.legend(loc="upper right")
-        return svg(figure)
-
-    return drawn()
 
 
 if __name__ == "__main__":

@@ -14,15 +14,22 @@ from benchmarks._common import markdown_table
 from benchmarks._page import load
 from benchmarks.paper_cells import WARM, is_stale
 from benchmarks.paper_experiments import CHANGED, SEARCHES, STARTS
-from benchmarks.paper_tables import returns, share, start_of, whole, with_setting
-from benchmarks.paper_twin import TWIN
+from benchmarks.paper_tables import (
+    GOAL,
+    OURS,
+    in_twin,
+    returns,
+    share,
+    start_of,
+    whole,
+    with_setting,
+)
+from benchmarks.rival_cells import AFTER_GAP
 
 Row = dict[str, Any]
-PAPER, DEFAULT = SEARCHES[0], "EASI default"
+PAPER, DEFAULT = SEARCHES[0], OURS
 EASI = (PAPER, DEFAULT, WARM[1])
-_TWINS = ("EASI after train.gap",)
 FACTORS = (0.25, 0.5, 2.0, 4.0)
-GOAL = 0.9  # of the way from UDR to Oracle, of EASI default
 MINUTES = 10.0  # of a search, on a desktop's GPU
 
 
@@ -88,7 +95,9 @@ def page(folder: Path) -> str:
             )
         )
     head = ("the paper", "its figures", "here", "verdict", "why it differs")
-    stale = sorted({r["method"] for r in rows.paper if is_stale(r)} & {*EASI, *_TWINS})
+    stale = sorted(
+        {r["method"] for r in rows.paper if is_stale(r)} & {*EASI, AFTER_GAP}
+    )
     older = f" Of older code than their method: {', '.join(stale)}." if stale else ""
     return "\n\n".join(
         [
@@ -246,14 +255,12 @@ def _twin(
     beside: dict[str, Callable[[Row], Any]] | None = None,
 ) -> Answer:
     """Whether each of ``measures`` is below UDR's; what is ``beside`` is shown only."""
-    mine = [r for r in rows.paper if (r["robot"], r["target"]) == (robot, TWIN)]
-    names = list(dict.fromkeys(r["method"] for r in mine))
+    found = in_twin(robot, rows.paper)
     figures, holds = [], []
     for what, value in {**measures, **(beside or {})}.items():
         by = {}
-        for m in names:
-            values = [value(r) for r in mine if r["method"] == m]
-            known = [v for v in values if v is not None]
+        for m, mine in found.items():
+            known = [v for v in map(value, mine) if v is not None]
             if known:
                 by[m] = mean(known)
         if "UDR" not in by:

@@ -15,7 +15,7 @@ from typing import Any
 from benchmarks import paper_matrix
 from benchmarks._cells import read_rows
 from benchmarks._common import markdown_table
-from benchmarks._page import Named, Section, each_of, met, table, those
+from benchmarks._page import Named, Section, each_of, met, named, table, those
 from benchmarks.paper_cells import METHODS, WARM
 from benchmarks.paper_experiments import CHANGED, MUST, ON_HARDWARE, SEARCHES, STARTS
 from benchmarks.paper_runtime import WAYS
@@ -191,7 +191,7 @@ def _table1(robot: str, rows: Sequence[Row]) -> list[str]:
             stated = PUBLISHED.get(f"{CHANGED[robot]}*{factor:g}", {})
             theirs = "EASI" if method == SEARCHES[0] else method
             cells.append(stated.get(theirs, ""))
-        lines.append((_named(method, robot, rows), *cells))
+        lines.append((named(method, rows), *cells))
     name = CHANGED[robot]
     head = (
         *("method", f"{name}*0.25", "share", "published"),
@@ -205,13 +205,6 @@ def _table1(robot: str, rows: Sequence[Row]) -> list[str]:
         *_first(robot, by_target, rows),
         *_other_recipe(robot, rows),
     ]
-
-
-def _named(method: str, robot: str, rows: Sequence[Row]) -> str:
-    """A method, with the parameters that it has no word for."""
-    mine = (r for r in rows if (r["method"], r["robot"]) == (method, robot))
-    lacks = {name for r in mine for name in r.get("unreached", ())}
-    return f"{method} (without {', '.join(sorted(lacks))})" if lacks else method
 
 
 def _other_recipe(robot: str, rows: Sequence[Row]) -> list[str]:
@@ -314,7 +307,7 @@ def _of(rows: Sequence[Row], value: Callable[[Row], Any], digits: int) -> str:
     return told([v for v in map(value, rows) if v is not None], digits)
 
 
-def _in_twin(robot: str, rows: Sequence[Row]) -> dict[str, list[Row]]:
+def in_twin(robot: str, rows: Sequence[Row]) -> dict[str, list[Row]]:
     """Rows by method, in the order of seeds."""
     mine = [r for r in rows if (r["robot"], r["target"]) == (robot, TWIN)]
     mine.sort(key=lambda r: r["seed"])
@@ -353,7 +346,7 @@ def _fig7(found: dict[str, list[Row]]) -> list[str]:
 def _drawn_fig7(rows: Sequence[Row]) -> str:
     from benchmarks.paper_figures import motion_and_speed
 
-    mine = _in_twin("go2", rows)
+    mine = in_twin("go2", rows)
     first = {m: found[0] for m, found in mine.items()}
     if "UDR" not in first or first["UDR"]["spectrum"]["twin"] is None:
         return ""
@@ -669,7 +662,7 @@ SECTIONS = (
     ),
     _part(
         *("### Table 2: balancing in a twin", "table2", _table2),
-        partial(_in_twin, "cartpole"),
+        partial(in_twin, "cartpole"),
     ),
     _part(
         "### Table 3: return by number of demonstrations",
@@ -678,7 +671,7 @@ SECTIONS = (
     _part("### Table 4: parameter error by μ/λ", "table4", _table4, _RATIO),
     _part(_TITLE5, "table5", _swept, _UPDATES),
     _part(_TITLE4, "fig4", _fig4, those(_traced)),
-    _part("### Fig. 7: walking in a twin", "fig7", _fig7, partial(_in_twin, "go2")),
+    _part("### Fig. 7: walking in a twin", "fig7", _fig7, partial(in_twin, "go2")),
     _part(_TITLE_A, "appendix_a", _appendix_a, those(lambda r: r["options"])),
     _part(_TITLE_TIME, "runtime", _runtime, those(lambda r: r["method"] in WAYS)),
     _part("", "{name}", _shown, _drawn),

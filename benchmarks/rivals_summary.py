@@ -7,7 +7,7 @@ from statistics import median
 from typing import Any
 
 from benchmarks._common import commits_of, markdown_table
-from benchmarks._page import Section, table, those
+from benchmarks._page import Section, named, table, those
 from benchmarks.rival_cells import AFTER_GAP, METHODS, ROBOTS, SETTINGS, Cell
 
 OURS = METHODS[0]
@@ -90,10 +90,7 @@ def _errors(rows: Sequence[Row]) -> str:
         lines.append((name, *cells))
     for method in METHODS:
         cells = [_cell(rows, setting, method) for setting in SETTINGS]
-        mine = (r for r in rows if r["method"] == method)
-        lacks = {name for r in mine for name in r.get("unreached", ())}
-        without = f" (without {', '.join(sorted(lacks))})" if lacks else ""
-        lines.append((method + without, *cells))
+        lines.append((named(method, rows), *cells))
     return markdown_table(("method", *SETTINGS), lines)
 
 

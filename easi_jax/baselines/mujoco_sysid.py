@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from easi_jax.baselines.replay_cma_es import affordable, channel_scale, some_pieces
+from easi_jax.baselines.replay_cma_es import channel_scale, paid_pieces
 from easi_jax.baselines.task import Budget, Identified, Task
 from easi_jax.data.segments import Segments
 from easi_jax.devices.runtime import cores
@@ -59,12 +59,11 @@ class MujocoSysid:
         """
         del key  # nothing is random
         sysid = toolbox()
-        every = some_pieces(task, demonstrations, self.horizon, self.pieces)
-        step = every.horizon * (task.space.size + _TRIALS)
-        count = affordable(budget, _ITERATIONS * step, every, self.pieces)
-        pieces = some_pieces(task, demonstrations, self.horizon, count)
+        step = task.space.size + _TRIALS
+        chosen = demonstrations, self.horizon, self.pieces
+        pieces = paid_pieces(task, *chosen, budget, _ITERATIONS * step)
         each = pieces.count * pieces.horizon
-        rounds = budget.rounds(step * count)
+        rounds = budget.rounds(each * step)
         write = InMujoco(task.simulator)
         logs = _Logs(task, pieces, write.base, sysid)
         start, free = np.asarray(task.start_mean, float), write.reaches

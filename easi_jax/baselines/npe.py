@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from easi_jax.baselines.replay_cma_es import affordable, some_pieces
+from easi_jax.baselines.replay_cma_es import paid_pieces
 from easi_jax.baselines.task import Budget, Identified, Task
 from easi_jax.data.segments import Segments
 from easi_jax.devices.mesh import sharded_map
@@ -65,9 +65,8 @@ class NeuralPosterior:
         """
         if find_spec("sbi") is None:
             raise UserError("sbi is missing: pip install easi-jax[peers]")
-        every = some_pieces(task, demonstrations, self.horizon, self.pieces)
-        some = affordable(budget, _ENOUGH * every.horizon, every, self.pieces)
-        pieces = some_pieces(task, demonstrations, self.horizon, some)
+        chosen = demonstrations, self.horizon, self.pieces
+        pieces = paid_pieces(task, *chosen, budget, _ENOUGH)
         each = pieces.count * pieces.horizon
         count = _LEAST * budget.rounds(_LEAST * each)
         k_draw, k_noise, k_train = jax.random.split(key, 3)

@@ -115,6 +115,21 @@ def affordable(budget: Budget, piece: int, pieces: Segments, given: int | None) 
     return min(paid, pieces.count) if given is None else pieces.count
 
 
+def paid_pieces(
+    task: Task,
+    demonstrations: Segments,
+    horizon: int,
+    given: int | None,
+    budget: Budget,
+    times: int,
+) -> Segments:
+    """Pieces at even distances that a method replays throughout: as many as ``given``
+    or, where not, as the budget pays for with ``times`` simulations of each."""
+    every = some_pieces(task, demonstrations, horizon, given)
+    count = affordable(budget, times * every.horizon, every, given)
+    return some_pieces(task, demonstrations, horizon, count)
+
+
 def channel_scale(task: Task, pieces: Segments) -> jax.Array:
     """RMS motion of each channel or, where that is more, its noise, ``(2 nv,)``."""
     w = pieces.weight[:, None, None]

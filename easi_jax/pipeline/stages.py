@@ -289,7 +289,7 @@ class Pipeline:
             stale = None
             if search.stale_first_observation:
                 before = trajectories(jax.random.fold_in(k_run, 1))
-                stale = last_seen(before, env.obs_size)
+                stale = last_seen(before.seen, env.obs_size)
             return measured(
                 *(trajectories(k_run, stale), self.noise, k_noise),
                 self.simulator.configuration,

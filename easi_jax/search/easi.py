@@ -362,13 +362,14 @@ class Search:
         c, seen = self.config, fake.seen
         ok = jnp.isfinite(seen).all(-1)
         seen = jnp.where(ok[..., None], seen, 0.0)
-        stale = c.stale_first_observation
-        last = last_seen(dataclasses.replace(fake, seen=seen), self.env.obs_size)
+        last = ()
+        if c.stale_first_observation:
+            last = last_seen(seen, self.env.obs_size)
         told, weight = real.seen, fake.weight * ok
         if c.standardize_inputs:
             mid, std = moments(data.segments.seen, data.segments.weight)
             told, seen = (told - mid) / std, (seen - mid) / std
-        return told, seen, weight, ok.all(1), last if stale else ()
+        return told, seen, weight, ok.all(1), last
 
     def _replay(
         self, data: SearchData, theta: jax.Array, center: jax.Array, key: Any

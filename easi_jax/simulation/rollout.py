@@ -117,10 +117,10 @@ def collect(
     return jax.vmap(one)(jax.random.split(key, trajectories), stale)
 
 
-def last_seen(trajectories: Segments, obs_size: int) -> jax.Array:
-    """The last observation of trajectories ``(B, T, ...)`` that hold what was seen,
-    ``(B, obs_size)``."""
-    return trajectories.seen[:, -1, -obs_size:]
+def last_seen(seen: jax.Array, obs_size: int) -> jax.Array:
+    """The last observation of trajectories, ``(B, obs_size)``, from what was seen and
+    done in them, ``(B, T, obs_size + action_size + obs_size)``."""
+    return seen[:, -1, -obs_size:]
 
 
 def measured(

@@ -104,7 +104,7 @@ def test_what_is_seen_and_done_is_kept() -> None:
     # It moves from where it is, by what it does about what it sees.
     np.testing.assert_allclose(stale[:, 0, 2], before[:, 0] + 0.17, rtol=1e-5)
     np.testing.assert_allclose(
-        rollout.last_seen(Segments(*(0,) * 6, seen=stale), 1), stale[:, -1, 2:]
+        rollout.last_seen(jnp.asarray(stale), 1), stale[:, -1, 2:]
     )
 
 
