@@ -16,6 +16,7 @@ from easi_jax.model.found_effects import EffectEntry
 
 _STEPS_AGREE = 1e-3
 _AGREES = 0.1
+_NOISIER = 1.3  # times the noise that was estimated, that it may be
 _ODD = 20.0  # times the noise
 _ODD_ALONE = 3.0  # times the largest of the others
 _FEWEST = 5  # rows between two leaps, of which a velocity can be told
@@ -238,25 +239,63 @@ def true_readings(
     return out
 
 
-def trusted_velocity(run: Run) -> np.ndarray:
-    """Velocities ``(T, nv)``: those measured where they are the positions' derivative,
-    else that derivative, and that of the guess where hidden.
+def trusted_velocities(runs: Sequence[Run]) -> np.ndarray:
+    """Which measured velocities are the derivatives of the positions in all of
+    ``runs``, ``(nv,)`` bool; none that is hidden, or not measured in one of them.
 
-    They are where they agree with the fitted one (within a tenth of its RMS or three
-    times its noise), or where they integrate to the positions from row to row (within
-    a tenth): what swings as fast as rows follow each other escapes the fit.
+    They agree with the fitted velocity within a tenth of its RMS or three times its
+    noise; or, for what swings as fast as rows follow each other escapes the fit, their
+    means from row to row are off the steps of the positions by no more than that tenth
+    beyond what noise makes. And of the latter no more than a tenth goes with velocity
+    and acceleration, as it does of what is scaled, late or filtered.
     """
+    first, step = runs[0], runs[0].dt
+    if not all(run.qvel_measured for run in runs):
+        return np.zeros(first.qvel.shape[1], bool)
+    nv = first.qvel.shape[1]
+    fitted = [fitted_velocity(r.qpos, r.dt, r.configuration) for r in runs]
+    usual = _rms(np.concatenate(fitted))
+    derived = [estimate_noise(replace(run, qvel_measured=False)) for run in runs]
+    slack = 3 * np.median(derived, 0)[nv:]
+    off = _rms(np.concatenate([r.qvel - x for r, x in zip(runs, fitted, strict=True)]))
+    agrees = off <= np.maximum(_AGREES * usual, slack)
+    moved, between = [], []
+    for run in runs:
+        steps = run.configuration.difference(run.qpos[:-1], run.qpos[1:])
+        moved.append(steps / run.dt)
+        between.append(0.5 * (run.qvel[:-1] + run.qvel[1:]))
+    apart = [a - b for a, b in zip(between, moved, strict=True)]
+    noise = np.median([estimate_noise(run) for run in runs], 0)
+    made = np.hypot(math.sqrt(2.0) * noise[:nv] / step, noise[nv:] / math.sqrt(2.0))
+    least = _AGREES * _rms(np.concatenate(moved))
+    agrees |= _rms(np.concatenate(apart)) <= np.hypot(least, _NOISIER * made)
+    agrees &= _going_with_motion(runs, apart) <= least
+    return agrees & ~np.any([run.hidden for run in runs], 0)
+
+
+def _going_with_motion(runs: Sequence[Run], apart: Sequence[np.ndarray]) -> np.ndarray:
+    """RMS ``(nv,)`` of what in ``apart (T - 1, nv)`` goes with velocity and
+    acceleration, by the measured velocities of the rows on either side, whose noise has
+    no part in it."""
+    long = [k for k, run in enumerate(runs) if len(run) > 3]
+    out = np.zeros(runs[0].qvel.shape[1])
+    if not long:
+        return out
+    left = np.concatenate([apart[k][1:-1] for k in long])
+    around = [(runs[k].qvel[:-3], runs[k].qvel[3:]) for k in long]
+    before, after = (np.concatenate(x) for x in zip(*around, strict=True))
+    for d in range(len(out)):
+        goes = np.stack([before[:, d] + after[:, d], after[:, d] - before[:, d]], 1)
+        gain = np.linalg.lstsq(goes, left[:, d], rcond=None)[0]
+        out[d] = np.sqrt(np.mean((goes @ gain) ** 2))
+    return out
+
+
+def velocities(run: Run, trusted: np.ndarray) -> np.ndarray:
+    """Velocities ``(T, nv)``: those measured of ``trusted (nv,)``, the others from the
+    positions, and of the guess where hidden."""
     fitted = fitted_velocity(run.qpos, run.dt, run.configuration)
-    if not run.qvel_measured:
-        return fitted
-    nv = run.qvel.shape[1]
-    slack = 3 * estimate_noise(replace(run, qvel_measured=False))[nv:]
-    off = _rms(run.qvel - fitted)
-    agrees = off <= np.maximum(_AGREES * _rms(fitted), slack)
-    moved = run.configuration.difference(run.qpos[:-1], run.qpos[1:]) / run.dt
-    between = 0.5 * (run.qvel[:-1] + run.qvel[1:])
-    agrees |= _rms(between - moved) <= _AGREES * _rms(moved)
-    return np.where(agrees & ~run.hidden, run.qvel, fitted)
+    return np.where(trusted, run.qvel, fitted)
 
 
 def _rms(x: np.ndarray) -> np.ndarray:

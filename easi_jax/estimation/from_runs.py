@@ -27,15 +27,17 @@ from easi_jax.estimation.pieces import effective_noise, few, segments_from_runs
 from easi_jax.estimation.posterior import (
     Estimate,
     as_fitted,
+    begun,
     diverged,
-    estimate,
     no_region,
     polished,
     widened,
 )
 from easi_jax.estimation.prediction_error import (
+    believed,
     misfit_of,
     outlier_weights,
+    white_noise,
 )
 from easi_jax.estimation.problem import Problem
 from easi_jax.model.parameters import ParameterSpace
@@ -60,6 +62,7 @@ _FINISH = 0.5  # s, of pieces in the least-squares finish
 _FEW = 24
 _COMPARED = 8  # runs at most that are fitted alone as well
 _FAR, _DIFFERENT = 5.0, 0.1  # standard deviations, and log ratio, that contradict
+_READABLE = 8  # steps at least of pieces whose errors tell the noise
 _OUTLIER = 2.5  # times the median error: windows beyond it weigh less
 
 
@@ -166,13 +169,14 @@ class _Last:
     Attributes:
         found: so far.
         weight: of each piece by how well it fits, ``(M,)``; ``weighed`` the pieces.
-        misfit: what the model errs by.
+        misfit: what the model errs by, and ``noise`` of the readings.
     """
 
     found: Estimate
     weight: jax.Array
     weighed: Segments
     misfit: jax.Array
+    noise: jax.Array
 
 
 class _Finish:
@@ -182,8 +186,8 @@ class _Finish:
         whole: all pieces, M of them; `pieces` those that many trials are made with.
         owner: recording of each of ``whole``, ``(M,)``.
         simulator: reads ``sensors``, N numbers, that are fitted as well.
+        told: noise as the rows tell it: where motion is rough, too much.
         hidden: misfit that leaves out velocities that were derived from positions.
-        start: what is known of starts.
         doubts: what the model may lack; None where nothing is refined.
         lacking: what it may lack as well where it errs by more than the noise.
     """
@@ -216,13 +220,11 @@ class _Finish:
         self.owner = np.repeat([r.recording for r in problem.fit], starts)
         self.pieces = few(simulator, self.whole, _FEW) if refined else self.whole
         noise = np.concatenate([problem.noise, self.sensors.noise(problem.fit)[0]])
-        self.noise = jnp.asarray(noise, jnp.result_type(float))
+        self.told = jnp.asarray(noise, jnp.result_type(float))
         # Velocities derived from the positions say nothing that those do not.
         nv, count = simulator.mj_model.nv, len(self.sensors)
         seen = np.concatenate([np.ones(nv), problem.measured, np.ones(count)])
-        self.hidden = jnp.asarray(np.where(seen > 0, 0.0, np.inf), self.noise.dtype)
-        assumed = effective_noise(simulator, self.whole, self.noise)
-        self.start = start_spread(problem, assumed[: 2 * nv])
+        self.hidden = jnp.asarray(np.where(seen > 0, 0.0, np.inf), self.told.dtype)
         self.mesh = search.mesh or make_mesh()
 
     def compile(self) -> None:
@@ -230,8 +232,8 @@ class _Finish:
         ending = None
         if self.refined:
             ending = distributed.started(lambda: self.ending(self.doubts))
-        n = self.search.space.size
-        like = jnp.zeros(n), jnp.eye(n), self.pieces, self.hidden, _ROBUST, False
+        n, known = self.search.space.size, self.known(self.told)
+        like = jnp.zeros(n), jnp.eye(n), self.pieces, self.hidden, known, _ROBUST, False
         self._fit = jax.jit(self.fit).lower(*placed(like)).compile(quick_compile())
         if ending is not None:
             ending()
@@ -246,37 +248,56 @@ class _Finish:
     def ending(self, doubts: Doubts | None) -> Any:
         """The compiled last steps with ``doubts``."""
         if doubts not in self.endings:
-            n = self.search.space.size
-            like = placed((jnp.zeros(n), jnp.eye(n), self.whole, self.hidden))
+            n, known = self.search.space.size, self.known(self.told)
+            like = placed((jnp.zeros(n), jnp.eye(n), self.whole, self.hidden, known))
             program = jax.jit(partial(self.end, doubts)).lower(*like)
             self.endings[doubts] = program.compile(quick_compile())
         return self.endings[doubts]
 
-    def paired(self, pieces: Any, misfit: Any) -> PairedFit:
+    def known(self, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The noise, and what is known of starts."""
+        assumed = effective_noise(self.simulator, self.whole, noise)
+        motion = assumed[: len(self.problem.noise)]
+        return noise, start_spread(self.problem, motion)
+
+    def paired(self, pieces: Any, misfit: Any, known: Any) -> PairedFit:
         """What is fitted."""
-        search = self.search
+        search, (noise, start) = self.search, known
         return PairedFit(
-            *(self.simulator, search.space, pieces, self.noise, search.mesh),
-            start=self.start,
+            *(self.simulator, search.space, pieces, noise, search.mesh),
+            start=start,
             misfit=misfit,
         )
 
     def fit(
-        self, mean: Any, cov: Any, pieces: Any, misfit: Any, robust: Any, near: Any
+        self,
+        mean: Any,
+        cov: Any,
+        pieces: Any,
+        misfit: Any,
+        known: Any,
+        robust: Any,
+        near: Any,
     ) -> tuple[Estimate, jax.Array]:
         """A fit from ``mean``, and what it leaves."""
-        found = estimate(
-            *(self.paired(pieces, misfit), mean, cov, self.refined),
+        found = begun(
+            *(self.paired(pieces, misfit, known), mean, cov, self.refined),
             *(self.search.config.informed_spread, robust, near, self.restarts),
         )
         return found, self.errors(found, pieces)
 
     def end(
-        self, doubts: Doubts | None, center: Any, cov: Any, whole: Any, misfit: Any
+        self,
+        doubts: Doubts | None,
+        center: Any,
+        cov: Any,
+        whole: Any,
+        misfit: Any,
+        known: Any,
     ) -> tuple[Estimate, jax.Array]:
         """The last steps, on all pieces and with ``doubts``."""
         informed = self.search.config.informed_spread
-        given = self.paired(whole, misfit), center, cov, informed
+        given = self.paired(whole, misfit, known), center, cov, informed
         found = polished(*given, doubts=doubts)
         return found, self.errors(found, whole, doubts)
 
@@ -299,14 +320,16 @@ class _Finish:
         # What sensors read is taken for what the fit to the motion leaves of it.
         motion = jnp.arange(len(self.hidden)) < len(self.problem.noise)
         misfit = jnp.where(motion, self.hidden, jnp.inf)
-        weighed = pieces
+        weighed, noise = pieces, self.told
         # The last steps on all pieces learn it, too.
         fewer = self.refined and pieces.count < self.whole.count
         passes = _PASSES - 1 if fewer else _PASSES
         for k in range(passes):
-            given = center, cov, weighed, misfit, 0 if k else _ROBUST, k > 0
+            robust, near = 0 if k else _ROBUST, k > 0
+            given = center, cov, weighed, misfit, self.known(noise), robust, near
             found, error = distributed.local(self._fit(*placed(given)))
-            misfit, weight = self.judged(error, weighed, pieces)
+            noise = self.learned(error)
+            misfit, weight = self.judged(error, weighed, pieces, noise)
             weighed = replace(pieces, weight=pieces.weight * weight)
             center = jax.block_until_ready(found.fit)
             self.tell(f"least-squares finish: pass {k + 1} of {passes}")
@@ -314,7 +337,7 @@ class _Finish:
             return replace(found, search_mean=mean, search_cov=cov), weight
         if fewer:
             weighed = self.whole
-        undoubted = _Last(found, weight, weighed, misfit)
+        undoubted = _Last(found, weight, weighed, misfit, noise)
         last = self.ended(undoubted, cov, self.doubts, "", self.lacks)
         if self.lacks(last.found):
             more = ", with more in doubt"
@@ -339,11 +362,13 @@ class _Finish:
         """The last steps on all pieces with ``doubts``; fewer where they are ``over``,
         since others follow."""
         for k in range(_ENDINGS):
-            given = last.found.fit, cov, last.weighed, last.misfit
+            known = self.known(last.noise)
+            given = last.found.fit, cov, last.weighed, last.misfit, known
             found, error = distributed.local(self.ending(doubts)(*placed(given)))
-            misfit, weight = self.judged(error, last.weighed, self.whole)
+            noise = self.learned(error)
+            misfit, weight = self.judged(error, last.weighed, self.whole, noise)
             weighed = replace(self.whole, weight=self.whole.weight * weight)
-            last = _Last(jax.block_until_ready(found), weight, weighed, misfit)
+            last = _Last(jax.block_until_ready(found), weight, weighed, misfit, noise)
             self.tell(f"on all of the logs{what}: pass {k + 1} of {_ENDINGS}")
             if self.lost(found) or over(found):
                 break
@@ -365,11 +390,22 @@ class _Finish:
         """Whether a fit is none."""
         return bool(diverged(found, self.search.space.names))
 
+    def learned(self, error: jax.Array) -> jax.Array:
+        """Noise ``(2 nv + N,)`` as what a fit leaves shows it, where that is no more
+        than rows alone tell; as it was given, if it was."""
+        if self.problem.noise_given or error.shape[1] < _READABLE:
+            return self.told
+        return believed(white_noise(error), self.told)
+
     def judged(
-        self, error: jax.Array, weighed: Segments, pieces: Segments
+        self,
+        error: jax.Array,
+        weighed: Segments,
+        pieces: Segments,
+        noise: jax.Array,
     ) -> tuple[jax.Array, jax.Array]:
         """What the model errs by, and new weights, from what a fit leaves."""
-        assumed = effective_noise(self.simulator, pieces, self.noise)
+        assumed = effective_noise(self.simulator, pieces, noise)
         misfit = misfit_of(error, assumed, weighed.weight)
         misfit = jnp.maximum(misfit, self.hidden)
         return misfit, outlier_weights(error, assumed, misfit, _OUTLIER)
@@ -424,6 +460,7 @@ class _Finish:
             given = (
                 *(found.fit, found.search_cov),
                 *(replace(self.whole, weight=mine), found.misfit),
+                (found.noise, found.start),
             )
             alone = distributed.local(end(*placed(given)))[0]
             notes += _contradiction(self.search.space, name, alone, found)

@@ -18,13 +18,12 @@ from easi_jax.devices.mesh import placed
 from easi_jax.devices.runtime import quick_compile
 from easi_jax.estimation.from_runs import spread_of_starts
 from easi_jax.estimation.pieces import segments_from_runs
-from easi_jax.estimation.prediction_error import rms_of_steps
+from easi_jax.estimation.prediction_error import believed, rms_of_steps
 from easi_jax.estimation.problem import Problem
 from easi_jax.estimation.starts import (
     DRAWS,
     Simulate,
     Starts,
-    better_noise,
     floor,
     known_noise,
     starts_about,
@@ -104,7 +103,7 @@ class WindowErrors:
         starts.noise = self.rows
         moved, found = starts.solve(x, self.still)
         least = self.resolution / math.sqrt(12.0)
-        starts.noise = better_noise(starts, found, self.rows, least)
+        starts.noise = believed(starts.measured_noise(found), self.rows, least)
         return moved, found
 
     def _rms(self, found: np.ndarray) -> np.ndarray:

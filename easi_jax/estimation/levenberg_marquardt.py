@@ -50,7 +50,7 @@ _ROUNDING = 3e-6  # of the cost, which the best of many trials takes for progres
 _ROUGH = 1e-3  # of the cost: less progress than that is not to be had by differences
 _NEAR_ENOUGH = 1e-2  # of the cost, for the first stage
 _MOVING, _LOOKING, _FINISHED = range(3)
-_SHORT, _WHOLE, _DROPPING, _RETURNING, _LOOK, _FREED, _RAISED = range(7)
+_SHORT, _WHOLE, _DROPPING, _RETURNING, _RAISED = range(5)
 _HELD = 8  # rounds in which limits move alone
 
 
@@ -115,7 +115,7 @@ def refine(
     starts = unit[None] if others is None else jnp.concatenate([unit[None], others])
     stages = _Stage.all(starts, near, robust, others is not None)
     place, costs = fit.place(unit, paired.unmoved), jnp.zeros(iterations + 2)
-    begin = _Found(place, place, costs, unit, jnp.zeros(unit.size, bool))
+    begin = _Found(place, place, costs, jnp.zeros(unit.size, bool))
     # As a scan, so that a stage is compiled once.
     found, (at, hessian, steps) = jax.lax.scan(fit.stage, begin, stages)
     best = found.best
@@ -141,9 +141,7 @@ class _Stage:
     wanted: jax.Array
     short: jax.Array  # from there, the beginnings of the pieces alone
     dropping: jax.Array  # without what fits far worse
-    freed: jax.Array
-    raised: jax.Array
-    looks: jax.Array  # only
+    raised: jax.Array  # a look only
     whole: jax.Array  # what it finds may be the result
     robust: jax.Array  # rounds
     patience: jax.Array
@@ -154,16 +152,15 @@ class _Stage:
     def all(cls, starts: jax.Array, near: Any, robust: Any, apart: bool) -> "_Stage":
         """The beginnings of the pieces, then all of them, from each start ``(K, n)``;
         with ``apart``, a fit without what fits far worse, and one of all from there;
-        then a look at the result, a fit of what may not be at a plateau's edge, and a
-        look at what is raised."""
+        then a look at what is raised."""
         kinds = [_SHORT, _WHOLE] * len(starts) + [_DROPPING, _RETURNING] * apart
-        at = np.arange(len(kinds) + 3)
-        kind = np.array([*kinds, _LOOK, _FREED, _RAISED])
-        short, whole, dropping, returning, look, freed, raised = (
-            jnp.asarray(kind == k) for k in range(7)
+        at = np.arange(len(kinds) + 1)
+        kind = np.array([*kinds, _RAISED])
+        short, whole, dropping, returning, raised = (
+            jnp.asarray(kind == k) for k in range(5)
         )
-        wanted = jnp.where(near, at == 1, True) | freed
-        quick = short | near | freed
+        wanted = jnp.where(near, at == 1, True)
+        quick = short | near
         robust = jnp.where(short | dropping | returning, 0, robust)
         patience = jnp.where(quick, *_PATIENCE)
         # Without what fits far worse, limits are looked for once the rest has settled.
@@ -174,10 +171,8 @@ class _Stage:
             wanted=wanted,
             short=short,
             dropping=dropping,
-            freed=freed,
             raised=raised,
-            looks=look | raised,
-            whole=wanted & (whole | returning | freed),
+            whole=wanted & (whole | returning),
             robust=robust,
             patience=patience,
             least=least + dropping * _BISECTED,
@@ -195,7 +190,6 @@ class _Place:
     reach: limits.Reach
     pieces: jax.Array  # their costs
     hessian: jax.Array  # of the place before
-    above: jax.Array  # that place, what is in a dip put beyond its edge
 
 
 @flax.struct.dataclass
@@ -205,7 +199,6 @@ class _Found:
     last: _Place
     best: _Place
     costs: jax.Array  # by rounds, of the fit that ended at the best place
-    freed: jax.Array  # what may not be at a plateau's edge put beyond it
     unmet: jax.Array  # parameters that met no limit
 
 
@@ -277,7 +270,7 @@ class _Fit:
         """Where a stage begins."""
         n, fresh = self.space.size, limits.Reach.fresh(self.space)
         none = jnp.ones(len(shift)), jnp.zeros((n, n))
-        return _Place(unit, shift, jnp.asarray(1e-3), fresh, *none, unit)
+        return _Place(unit, shift, jnp.asarray(1e-3), fresh, *none)
 
     def stage(self, found: _Found, item: _Stage) -> tuple[_Found, Any]:
         """From where ``found`` ended, or ``item.begun``, to a best fit; parameters and
@@ -298,15 +291,14 @@ class _Fit:
         best, unmoved = found.best, self.whole.unmoved
         u = jnp.where(item.short, item.begun, found.last.unit)
         shift = jnp.where(item.short, unmoved, found.last.shift)
-        from_best = item.looks | item.dropping
-        u = jnp.where(from_best, best.unit, jnp.where(item.freed, found.freed, u))
+        from_best = item.raised | item.dropping
+        u = jnp.where(from_best, best.unit, u)
         u = jnp.where(item.raised, raised_to_range(self.space, u), u)
-        shift = jnp.where(from_best | item.freed, best.shift, shift)
-        still = item.freed & (found.freed == best.unit).all()
+        shift = jnp.where(from_best, best.shift, shift)
         even = ~weights.far_worse(best.pieces, self.weight).any()
-        still |= (item.dropping | (item.held > 0)) & even
+        still = (item.dropping | (item.held > 0)) & even
         phase = jnp.where(item.wanted & ~still, _MOVING, _FINISHED)
-        return jnp.where(item.looks, _LOOKING, phase), self.place(u, shift)
+        return jnp.where(item.raised, _LOOKING, phase), self.place(u, shift)
 
     def round(self, found: _Found, item: _Stage, state: _State) -> _State:
         """A step, and whether it was the last one."""
@@ -334,7 +326,7 @@ class _Fit:
         best = found.best
         off = place.unit - best.unit
         merged = (off @ best.hessian @ off < 1.0) & (cost < found.costs[-1] + 1.0)
-        merged &= item.whole & ~item.first & ~item.freed & fitting
+        merged &= item.whole & ~item.first & fitting
         costs = jnp.where(merged, jnp.inf, costs)
         return jnp.where(merged, _FINISHED, phase), k + 1, costs, new
 
@@ -344,10 +336,8 @@ class _Fit:
         """What a stage that began with ``phase`` hands on."""
         _, _, costs, at = state
         best, unmet = found.best, limits.unmet(at.hessian)
-        # A plateau is wide, and likelier than a dip that noise may have dug.
-        flat = item.freed & (found.freed != best.unit) & unmet
-        least = found.costs[-1] + limits.EDGE * flat.sum()
-        better = item.whole & (item.first | (costs[-1] < least)) & (phase != _FINISHED)
+        better = item.whole & (item.first | (costs[-1] < found.costs[-1]))
+        better &= phase != _FINISHED
         # What met no limit: to where the first piece would. And starts that were bent,
         # so that none had to be met: as measured.
         bent = item.dropping & weights.far_worse(at.pieces, self.weight)
@@ -361,7 +351,6 @@ class _Fit:
             last=last,
             best=_where(better, at, best),
             costs=jnp.where(better, costs, found.costs),
-            freed=jnp.where(item.looks, at.above, found.freed),
             unmet=jnp.where(item.dropping, unmet, found.unmet),
         )
 
@@ -377,7 +366,7 @@ class _Fit:
         here = _data(each[:1], trust)
         units, shifts, each = self.best_starts(units, shifts, each)
         data = _data(each, trust)
-        costs = data + self.prior(units) + self.barred(eq, now)
+        costs = data + self.prior(units) + self.barred(now)
         costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
         home = len(costs) - 1
         looking = jnp.where(now.first & (costs[home] < costs[0]), home, 0)
@@ -388,7 +377,6 @@ class _Fit:
         level = data[_STEPS:home].reshape(2, -1)
         taken = (jnp.arange(level.size) == best - _STEPS).reshape(level.shape)
         told = reach.after(level, here, moving & taken)
-        up, n = jnp.diagonal(hops[0]), space.size
         new = _Place(
             unit=units[best],
             shift=shifts[best],
@@ -396,9 +384,6 @@ class _Fit:
             reach=_where(moving, told, reach),
             pieces=each[best],
             hessian=eq.hessian,
-            # Over a jump upwards the cost hardly rises, though its curvature foretells
-            # it.
-            above=limits.beyond_dips(at.unit, up, level[0, :n] - here, eq.hessian),
         )
         shown = jnp.where(now.first, home, 0)
         return new, each[shown].sum() + self.prior(units[shown])
@@ -409,21 +394,14 @@ class _Fit:
         left_out = now.moving & now.item.dropping & weights.far_worse(pieces, weight)
         return jnp.where(left_out, 0.0, jnp.where(now.trusting, 1.0, robust))
 
-    def barred(self, eq: Normal, now: _Now) -> jax.Array:
+    def barred(self, now: _Now) -> jax.Array:
         """Cost on top, of steps, jumps, and where the fit began: infinite where these
         are not allowed now."""
-        # What was put onto a plateau does not leave it for a dip.
-        entering = now.moving * limits.EDGE * self.on_plateau(eq, now)
-        ways = len(limits.jumps(self.space)[0])
-        jumps = jnp.zeros(ways).at[: self.space.size].set(entering)
-        jumps += jnp.where(now.loose.all(), 0.0, jnp.inf)
+        jumps = jnp.where(now.loose.all(), 0.0, jnp.inf)
+        jumps = jnp.full(2 * len(limits.jumps(self.space)[0]), jumps)
         # Where the fit began is where it was led astray.
         home = jnp.where(now.item.held > 0, jnp.inf, 0.0)
-        return jnp.concatenate([jnp.zeros(_STEPS), jnp.tile(jumps, 2), home[None]])
-
-    def on_plateau(self, eq: Normal, now: _Now) -> jax.Array:
-        """Which parameters were put onto a plateau, and are there, ``(n,)``."""
-        return now.item.freed & limits.unmet(eq.hessian)
+        return jnp.concatenate([jnp.zeros(_STEPS), jumps, home[None]])
 
     def away(self, unit: jax.Array) -> jax.Array:
         """How far ``unit (..., n)`` is from ``anchor``, in initial ranges.
@@ -454,8 +432,6 @@ class _Fit:
         grad = eq.gradient + self.pull * slope * away
         hess = eq.hessian + jnp.diag(self.pull * slope**2 + _TINY)
         free = ~held_back(u, grad, *self.space.unit_bounds) & now.loose
-        # There the prior alone would draw them back to the edge.
-        free &= ~self.on_plateau(eq, now)
         du = bounded_step(hess, grad, free, at.damping * _TRIED)
         newton = self.space.clip(moved(self.space, u, du))
         followed = jnp.einsum("mdn,kn->kmd", eq.start_gain, newton - u)

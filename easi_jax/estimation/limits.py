@@ -2,8 +2,8 @@
 
 A speed limit that no simulation reaches has no slope, yet the data may show that it is
 lower. Noise digs a dip into the edge of such a plateau: what fits hardly better there
-is put back onto the plateau, where nothing is known of it. The common scale of all
-masses and forces jumps as well.
+is put back onto the plateau, where nothing is known of it
+(`easi_jax.estimation.polish`). The common scale of all masses and forces jumps as well.
 """
 
 import flax.struct
@@ -17,8 +17,8 @@ from easi_jax.model.parameters import ParameterSpace
 EDGE = 4.0  # of the cost, that a place beyond a plateau's edge has to be better by
 _UNSEEN = 1.0  # information of a unit coordinate: nothing
 _FARTHEST = 0.8, 2.5  # jump that is tried, in initial ranges, in log ratios
-_SHALLOW = 0.1  # of what its curvature foretells, that the cost rises beyond a dip
-_DUG = 50 * EDGE  # of the cost, starts as they are: more than that noise does not dig
+_SURE = 0.95  # probability that a limit is in a dip: less, and it may not be met at all
+_NARROW = 0.05  # initial ranges: no plateau is taken for narrower
 _INSIDE = 0.4  # initial ranges beyond the edge, where a plateau is entered
 
 
@@ -79,23 +79,40 @@ def unmet(hessian: jax.Array) -> jax.Array:
     return jnp.diag(hessian) < _UNSEEN
 
 
-def shallow(rise: jax.Array, foretold: jax.Array) -> jax.Array:
-    """Whether the cost rises over a jump by so much less than its curvature has
-    foretold, ``(n,)``, that noise may have dug the dip below."""
-    return (rise < _SHALLOW * foretold) & (rise < _DUG)
+def of(space: ParameterSpace) -> list[int]:
+    """Which parameters are limits of a force, a speed or a command."""
+    return [
+        i
+        for i, p in enumerate(space.parameters)
+        if any(part.endswith("limit") for a in p.addresses for part in a.split("."))
+    ]
 
 
-def beyond_dips(
-    unit: jax.Array, up: jax.Array, rise: jax.Array, hessian: jax.Array
-) -> jax.Array:
-    """``unit (n,)``, what lies in a dip put beyond its edge; costs ``rise (n,)`` over
-    jumps to ``up (n,)``."""
-    foretold = 0.5 * jnp.diag(hessian) * (up - unit) ** 2
-    dip = (foretold > 2 * EDGE / _SHALLOW) & shallow(rise, foretold)
-    return beyond_edge(unit, dip, up)
+def edge(unit: jax.Array, information: jax.Array) -> jax.Array:
+    """By how much the cost of a dip must be less than that of the plateau beyond for
+    the limit to be sure to be in the dip, with a probability of `_SURE`, ``()``.
+
+    Both are weighed by the evidence (Laplace's approximation, all else held): a dip is
+    narrow, and has to make up for that.
+
+    Args:
+        unit: where the dip is, in the initial range.
+        information: of the limit there.
+    """
+    plateau = jnp.maximum(1.0 - unit, _NARROW)
+    dip = jnp.sqrt(2.0 * jnp.pi / jnp.maximum(information, _UNSEEN))
+    return np.log(_SURE / (1.0 - _SURE)) + jnp.maximum(jnp.log(plateau / dip), 0.0)
 
 
-def beyond_edge(unit: jax.Array, limits: jax.Array, most: jax.Array) -> jax.Array:
-    """``unit (n,)`` with ``limits (n,)`` on the plateau beyond the edge of a dip."""
+def beyond_edges(unit: jax.Array, limits: jax.Array, most: jax.Array) -> jax.Array:
+    """``unit (n,)`` with ``limits (n,)`` on the plateau beyond the edge of a dip, at
+    ``most (n,)``."""
     middle = jnp.minimum(most, jnp.maximum(0.5, unit + _INSIDE))
     return jnp.where(limits, middle, unit)
+
+
+def beyond_edge(space: ParameterSpace, unit: jax.Array, way: jax.Array) -> jax.Array:
+    """``unit (n,)`` with the limit ``way`` on the plateau; as it is where ``way`` is
+    negative."""
+    here = jnp.arange(space.size) == way
+    return beyond_edges(unit, here, space.unit_bounds[1])

@@ -7,12 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from easi_jax.data.activations import activation_guess
-from easi_jax.data.cleaning import _STEPS_AGREE, trusted_velocity
+from easi_jax.data.cleaning import _STEPS_AGREE, trusted_velocities, velocities
 from easi_jax.data.law_states import law_states, times
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import Segments, cut, join, windows
 from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
-from easi_jax.data.windows import fitted_velocity
 from easi_jax.errors import UserError
 from easi_jax.simulation.open_loop import motion
 from easi_jax.simulation.simulator import Simulator
@@ -32,7 +31,8 @@ def visible_steps(
     RMS change of every measured position and velocity, at least ``ratio``
     times its noise ``(2 nv,)``: in shorter pieces a search would see mostly noise.
     """
-    states = [(run, trusted_velocity(run)) for run in runs]
+    trusted = trusted_velocities(runs)
+    states = [(run, velocities(run, trusted)) for run in runs]
     known = np.isfinite(noise)
     for steps in range(1, most):
         square, rows = np.zeros(len(noise)), 0
@@ -70,15 +70,13 @@ def segments_from_runs(
         UserError: no run is longer than ``horizon`` steps.
         ValueError: a run of another control step.
     """
-    parts = []
+    parts, trusted = [], trusted_velocities(runs)
+    if fitted:
+        trusted[:] = False
     for run in runs:
         if abs(run.dt / simulator.dt - 1) > _STEPS_AGREE:
             raise ValueError(f"{run.name}: control step {run.dt}, not {simulator.dt}")
-        qvel = (
-            fitted_velocity(run.qpos, run.dt, run.configuration)
-            if fitted
-            else trusted_velocity(run)
-        )
+        qvel = velocities(run, trusted)
         act = activation_guess(simulator.mj_model, run)
         given = run.qpos, qvel, run.ctrl, horizon, every, simulator.past_steps
         more = act, run.before, _read_in_steps(sensors, run)

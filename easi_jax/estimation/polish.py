@@ -1,17 +1,24 @@
-"""A few last Gauss-Newton steps of a fit, on more pieces than it was found with.
+"""The last Gauss-Newton steps of a fit, and what is told of the place where they end.
 
 What makes a fit long, its many trials, jumps and restarts, has to find the valley; a
 tenth of a long recording shows where that is. How far along it the best place lies is a
 matter of all the data, and near it a few steps are enough.
+
+Of a limit that nothing meets the data say only that it is no lower. Noise digs dips
+into the edge of such a plateau: a value there may fit a little better, and its
+curvature looks like knowledge. So every limit that is met is put onto the plateau as
+well, with all else fitted anew, and stays there unless the dip is surely better
+(`easi_jax.estimation.limits`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 
+from easi_jax.estimation import limits
 from easi_jax.estimation.least_squares import (
     Damping,
     bounded_step,
@@ -34,6 +41,7 @@ _PULL = 0.1  # information added to a unit coordinate, for what the data do not 
 _BEGUN = 1e-6  # damping of the first step
 _DAMPING = Damping(falls=0.1, rises=10.0, wakes=1e-2)
 _SHORTER, _LONGER = 0.3, 3.0  # share of its step that a start takes, likewise
+_NEARER = 0.5  # of what a place is worse by, that each look at a plateau leaves at most
 
 
 @flax.struct.dataclass
@@ -52,9 +60,17 @@ class _Look:
     least: jax.Array  # cost of the best place
     seen: jax.Array  # information at the place looked at last
     cost: jax.Array
+    rival: (
+        jax.Array
+    )  # cost of a place that it is compared with; inf where there is none
 
 
-def polish(paired: PairedFit, unit: jax.Array, doubts: int = 0) -> RefineResult:
+def polish(
+    paired: PairedFit,
+    unit: jax.Array,
+    doubts: int = 0,
+    starts: jax.Array | None = None,
+) -> RefineResult:
     """A fit ``unit (n,)`` after steps on all pieces of ``paired``, which may come from
     others; pure, for use inside jit.
 
@@ -62,18 +78,24 @@ def polish(paired: PairedFit, unit: jax.Array, doubts: int = 0) -> RefineResult:
         doubts: how many of the last parameters are effects of which something is known
             before: a unit coordinate of 0, with a standard deviation of 1. The last
             step of all takes them beyond their bounds where the data lead there.
+        starts: corrections that it begins with, ``(M, S)``; by default none.
 
     Returns:
         The place of least cost among the fit's own, its starts as they were measured,
-        and those after each step; information, starts and costs, ``(K,)`` and infinite
-        where it had settled, are those of ``paired``. A piece that the simulation
-        does not get through at ``unit`` counts nothing; at a place where one of the
-        others explodes the cost is infinite.
+        and those after each step; limits on the plateau beyond, where that is as
+        likely. Information, starts and costs, ``(K,)`` and infinite where it had
+        settled, are those of ``paired``. A piece that the simulation does not get
+        through at ``unit`` counts nothing; at a place where one of the others explodes
+        the cost is infinite.
     """
     space, segments, weight = paired.space, paired.segments, paired.weight
     doubted = jnp.arange(space.size) >= space.size - doubts
     fit = _Steps(paired, weight, jnp.where(doubted, 1.0, 0.0), _LOOKS[doubts > 0])
-    end = jax.lax.while_loop(lambda c: c.phase < _FINISHED, fit.look, fit.begin(unit))
+    starts = paired.unmoved if starts is None else starts
+    # The fit itself, then each limit: as a scan, so that a look is compiled once.
+    ways = [-1, *(i for i in limits.of(space) if i < space.size - doubts)]
+    begin = fit.begin(unit, starts)
+    end, looks = jax.lax.scan(fit.trip, begin, jnp.array(ways))
     unit, starts, told = end.best
     below = (raised_to_range(space, unit) != unit).any()
     if doubts:
@@ -88,7 +110,7 @@ def polish(paired: PairedFit, unit: jax.Array, doubts: int = 0) -> RefineResult:
         raised=raised_to_range(space, unit),
         raised_hessian=jnp.where(below, end.seen, told.hessian),
         excess=excess(jnp.where(end.used, told.costs, jnp.inf), weight),
-        simulated=1.0 * whole * end.k,
+        simulated=1.0 * whole * looks.sum(),
         gradients=told.gradients,
     )
 
@@ -109,25 +131,47 @@ class _Steps:
     known: jax.Array
     looks: int
 
-    def begin(self, unit: jax.Array) -> _Look:
+    def begin(self, unit: jax.Array, starts: jax.Array) -> _Look:
         """Before anything was looked at."""
-        unmoved = self.paired.unmoved
-        like = jax.eval_shape(self.paired.normal, unit, unmoved, self.weight)
+        like = jax.eval_shape(self.paired.normal, unit, starts, self.weight)
         nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
         return _Look(
             k=jnp.asarray(0),
             progressed=jnp.asarray(0),
             phase=jnp.asarray(_STEPPING),
             unit=unit,
-            starts=unmoved,
-            share=jnp.ones(len(unmoved)),
+            starts=starts,
+            share=jnp.ones(len(starts)),
             damping=jnp.asarray(_BEGUN),
-            best=(unit, unmoved, nothing),
-            used=jnp.ones(len(unmoved), bool),
+            best=(unit, starts, nothing),
+            used=jnp.ones(len(starts), bool),
             least=jnp.asarray(jnp.inf),
             seen=nothing.hessian,
             cost=jnp.full(self.looks, jnp.inf),
+            rival=jnp.asarray(jnp.inf),
         )
+
+    def trip(self, found: _Look, way: jax.Array) -> tuple[_Look, jax.Array]:
+        """The steps from where ``found`` begins and, with a ``way`` that is not
+        negative, those from the plateau of that limit: the likelier end of both, and
+        how many looks that took."""
+        first = way < 0
+        unit, starts, told = found.best
+        place = limits.beyond_edge(self.paired.space, unit, way)
+        going = first | ~limits.unmet(told.hessian)[way] & (place != unit).any()
+        there = self.begin(place, starts)
+        there = replace(
+            jax.tree.map(lambda x, y: jnp.where(first, x, y), found, there),
+            phase=jnp.where(going, _STEPPING, _FINISHED),
+            used=found.used,
+            rival=found.least,
+        )
+        end = jax.lax.while_loop(lambda c: c.phase < _FINISHED, self.look, there)
+        flat = limits.unmet(end.best[2].hessian)[way]
+        allowed = limits.edge(unit[way], told.hessian[way, way])
+        taken = first | going & flat & (end.least < found.least + allowed)
+        best = jax.tree.map(lambda x, y: jnp.where(taken, x, y), end, found)
+        return best, end.k
 
     def step(
         self, at: jax.Array, told: Normal, damping: Any, loose: Any = False
@@ -144,7 +188,8 @@ class _Steps:
         weight = self.weight * c.used[:, None, None]
         eq = self.paired.normal(c.unit, c.starts, weight)
         stepping = c.phase == _STEPPING
-        used = jnp.where(c.k == 0, jnp.isfinite(eq.costs), c.used)
+        alone = jnp.isinf(c.rival)
+        used = jnp.where(alone & (c.k == 0), jnp.isfinite(eq.costs), c.used)
         cost = jnp.where(used, eq.costs, 0.0).sum()
         cost += 0.5 * jnp.sum(self.known * c.unit**2)
         better = stepping & ((c.k == 0) | (cost < c.least))
@@ -171,6 +216,8 @@ class _Steps:
         still = is_settled(jnp.abs(c.least - cost), cost, _SETTLED, _STARTED)
         done = ~stepping | (still & (foretold < _SETTLED)) | (c.k + 1 >= self.looks)
         done |= c.k - progressed >= _STALE
+        worse = jnp.maximum(c.least - c.rival, 0.0)
+        done |= ~alone & (c.k > 0) & (cost - c.rival > _NEARER * worse + limits.EDGE)
         raised = raised_to_range(space, at)
         below = (raised != at).any() & stepping
         over = jnp.where(below, _RAISING, _FINISHED)
@@ -188,4 +235,5 @@ class _Steps:
             least=jnp.where(better, cost, c.least),
             seen=eq.hessian,
             cost=jnp.where(here & stepping, cost, c.cost),
+            rival=c.rival,
         )

@@ -82,8 +82,7 @@ def estimate(
     cov: jax.Array,
     refined: bool,
     informed: bool = True,
-    robust: int | jax.Array = 6,
-    near: bool | jax.Array = False,
+    robust: int = 6,
     restarts: int = 0,
     adjusted: bool = False,
     rest: Segments | None = None,
@@ -103,8 +102,7 @@ def estimate(
     Args:
         paired: the pieces, their noise as it is measured.
         refined: whether a fit follows.
-        robust, near: as in `easi_jax.estimation.levenberg_marquardt.refine`.
-        restarts: draws of the search's spread that it starts from as well.
+        informed, robust, restarts: as in `begun`.
         adjusted: whether what the fitted starts add to the score is taken off
             (`easi_jax.estimation.profile_score`); not where starts are exact, nor where
             slopes are differences (`Simulator.by_differences`).
@@ -112,19 +110,41 @@ def estimate(
             (`easi_jax.estimation.polish`).
         doubts: the fit ends with these, on the same pieces.
     """
-    given, paired = paired, _floored(paired)
+    fit = begun(paired, mean, cov, refined, informed, robust, restarts=restarts)
+    if not refined:
+        return fit
+    pieces = paired.segments if rest is None else rest
+    whole = replace(paired, segments=pieces, start=fit.start)
+    starts = fit.delta if rest is None else None
+    ends = {"adjusted": adjusted, "doubts": doubts, "starts": starts}
+    more = polished(whole, fit.fit, cov, informed, **ends)
+    return replace(more, search_mean=mean, simulated=fit.simulated + more.simulated)
+
+
+def begun(
+    paired: PairedFit,
+    mean: jax.Array,
+    cov: jax.Array,
+    refined: bool,
+    informed: bool = True,
+    robust: int | jax.Array = 6,
+    near: bool | jax.Array = False,
+    restarts: int = 0,
+) -> Estimate:
+    """The `estimate` before its last steps: where the fit is, and not yet all that is
+    to be said of it; pure.
+
+    Args:
+        informed: whether the data have a part in the covariance.
+        robust, near: as in `easi_jax.estimation.levenberg_marquardt.refine`.
+        restarts: draws of the search's spread that it starts from as well.
+    """
+    paired = _floored(paired)
     if not refined:
         return _of_search(paired, mean, cov, informed)
     others = _draws(mean, cov, restarts) if restarts else None
     fit = refine(paired, mean, robust=robust, near=near, others=others)
-    if adjusted:
-        fit = _adjusted(paired, fit)
-    if rest is None and doubts is None:
-        return _of_fit(paired, fit, mean, cov, informed)
-    pieces = given.segments if rest is None else rest
-    whole = replace(given, segments=pieces, start=paired.spread)
-    more = polished(whole, fit.unit, cov, informed, doubts=doubts)
-    return replace(more, search_mean=mean, simulated=fit.simulated + more.simulated)
+    return _of_fit(paired, fit, mean, cov, informed)
 
 
 def polished(
@@ -134,6 +154,7 @@ def polished(
     informed: bool = True,
     adjusted: bool = False,
     doubts: Doubts | None = None,
+    starts: jax.Array | None = None,
 ) -> Estimate:
     """The `estimate` of a fit at ``center (n,)`` after `easi_jax.estimation.polish`;
     pure.
@@ -143,15 +164,16 @@ def polished(
             information are theirs.
         cov: of the search, ``(n, n)``.
         informed, adjusted, doubts: as in `estimate`.
+        starts: corrections that it begins with, ``(M, S)``; by default none.
     """
     paired = _floored(paired)
     if doubts is not None:
         wider = replace(paired, simulator=doubts.simulator, space=doubts.space)
         begin = jnp.concatenate([center, jnp.zeros(doubts.count)])
-        fit, told = without(polish(wider, begin, doubts.count), doubts.count)
+        fit, told = without(polish(wider, begin, doubts.count, starts), doubts.count)
         found = _of_fit(paired, fit, center, cov, informed)
         return replace(found, doubts=told, doubted=doubts.parameters)
-    fit = polish(paired, center)
+    fit = polish(paired, center, starts=starts)
     if adjusted:
         fit = _adjusted(paired, fit)
     return _of_fit(paired, fit, center, cov, informed)

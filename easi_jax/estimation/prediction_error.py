@@ -4,7 +4,14 @@ them."""
 import jax
 import jax.numpy as jnp
 
+from easi_jax.estimation.least_squares import A, array_module
 from easi_jax.estimation.weights import huber
+
+# Second differences of white noise, their variance, and how many of them count as one
+# independent number (1 + 2 (16 + 1) / 36).
+_DIFFERENCED, _ALIKE = 6.0, 1.94
+_LEAST_NOISE = 1e-2  # times that of the rows: where nothing moves a fit leaves no error
+_SAME_NOISE = 1.05  # times the noise that rows tell: as much
 
 
 def rms_of_steps(error: jax.Array, instead: jax.Array) -> jax.Array:
@@ -30,6 +37,37 @@ def misfit_of(error: jax.Array, noise: jax.Array, weight: jax.Array) -> jax.Arra
     together = error.shape[1] * (share @ error.mean(1) ** 2)
     alike = jnp.clip(together / jnp.maximum(square, 1e-30), 1.0, error.shape[1])
     return jnp.sqrt(jnp.maximum(square - noise**2, 0.0) * alike)
+
+
+def white_noise(error: jax.Array) -> jax.Array:
+    """Noise of readings, ``(n,)``, by what errors of predictions leave white; pure.
+
+    Second differences along a piece keep white noise and little of what a model errs
+    by, which is smooth; the median over pieces keeps out those in which it jumps. In
+    the readings themselves fast motion would pass for noise.
+
+    Args:
+        error: ``(M, H, n)``; at least three steps.
+    """
+    bent = jnp.diff(error, 2, axis=1)
+    square = jnp.nanmedian((bent**2).mean(1), 0) / _DIFFERENCED
+    # A chi-square's median (Wilson and Hilferty, PNAS 17, 1931).
+    free = bent.shape[1] / _ALIKE
+    return jnp.sqrt(square) / (1.0 - 2.0 / (9.0 * jnp.maximum(free, 0.5))) ** 1.5
+
+
+def believed(seen: A, told: A, least: A | float = 0.0) -> A:
+    """Noise ``(n,)`` as the errors of a fit show it, where that is no more than rows
+    alone tell: rows may take motion for noise, and a model its own errors.
+
+    Args:
+        seen: in the errors.
+        told: by rows alone.
+        least: what resolution makes.
+    """
+    xp = array_module(told)
+    seen = xp.maximum(seen, xp.maximum(least, _LEAST_NOISE * told))
+    return xp.where(seen < _SAME_NOISE * told, seen, told)
 
 
 def outlier_weights(

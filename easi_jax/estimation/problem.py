@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from easi_jax.data.cleaning import true_readings, trusted_velocity
+from easi_jax.data.cleaning import true_readings, trusted_velocities
 from easi_jax.data.measured import MeasuredRuns
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import to_device
@@ -54,6 +54,7 @@ class Problem:
         horizon: the same in seconds.
         notes: what the user should know of the data.
         sensors: whose readings the finish fits, too.
+        noise_given: whether the user said what the noise is.
     """
 
     name: str
@@ -68,6 +69,7 @@ class Problem:
     horizon: float
     notes: list[str]
     sensors: Sensors = NO_SENSORS
+    noise_given: bool = False
 
     @cached_property
     def fitted_sensors(self) -> Sensors:
@@ -185,6 +187,7 @@ def problem_of(
             *sensed,
         ],
         sensors,
+        len(noise) > 0,
     )
 
 
@@ -206,11 +209,7 @@ def _measured(
 ) -> tuple[np.ndarray, list[str]]:
     """Velocities that were measured and can be trusted, ``(nv,)`` bool; and a note on
     others that were measured."""
-    measured = (
-        ~hidden
-        & np.array([run.qvel_measured for run in fit]).all()
-        & np.all([(trusted_velocity(run) == run.qvel).all(0) for run in fit], axis=0)
-    )
+    measured = trusted_velocities(fit) & ~hidden
     fine = measured | hidden
     if not any(run.qvel_measured for run in fit) or fine.all():
         return measured, []

@@ -28,7 +28,7 @@ from easi_jax.estimation.least_squares import (
     moved,
     raised_to_range,
 )
-from easi_jax.estimation.limits import EDGE, beyond_edge, jumps, shallow
+from easi_jax.estimation.limits import EDGE, beyond_edges
 from easi_jax.estimation.normal_equations import RESOLVED, PairedFit
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.slopes import shift_start
@@ -244,7 +244,6 @@ def adjust(paired: PairedFit, unit: jax.Array) -> Adjusted:
     end, rounds = jax.lax.scan(root.search, begin, jnp.array([False, True]))
     u, found = end.here
     points = (1 + _DRAWS) * _TURNS * fit.points * rounds.sum()
-    points += len(rounds) * space.size  # of `in_dip`
     return Adjusted(
         unit=u,
         hessian=root.worth(found),
@@ -312,21 +311,11 @@ class _Root:
         down = jnp.where(space.log, jnp.exp(-2.0 * space.log_width * unit), 1.0)
         return jnp.diag(s.hessian) * down
 
-    def in_dip(self, unit: jax.Array, found: Score) -> jax.Array:
-        """Which parameters' cost hardly rises far above ``unit (n,)``."""
-        n, high = unit.size, self.space.unit_bounds[1]
-        up = jnp.minimum(unit + jumps(self.space)[1][:n], high)
-        hops = jnp.where(jnp.eye(n, dtype=bool), up, unit)
-        starts = jnp.broadcast_to(found.delta, (n, *found.delta.shape))
-        rise = self.fit.costs(hops, starts, self.weight).sum(1) - found.cost
-        told = jnp.diag(found.hessian)
-        return (told > _PULL) & shallow(rise, 0.5 * told * (up - unit) ** 2)
-
     def search(self, found: _Carry, again: jax.Array) -> tuple[_Carry, jax.Array]:
         """From where it begins; then from what was found, with that beyond its limit
-        which was held, or costs next to nothing there."""
-        edges = found.held | self.in_dip(*found.here)
-        beyond = beyond_edge(found.here[0], edges, self.space.unit_bounds[1])
+        which was held."""
+        edges = found.held
+        beyond = beyond_edges(found.here[0], edges, self.space.unit_bounds[1])
         begun = jnp.where(again, beyond, found.at)
         phase = jnp.where(edges.any(), _FIRST, _DONE)
         start = replace(

@@ -33,8 +33,6 @@ _LINEARIZED = 4  # times, at most, that slopes are taken
 _WORTH = 0.05  # of half the weighted squared error of a row: worth new slopes
 _FAR = 2.0  # times what noise makes of a row: far off
 _NEAREST, _NEAR = 4, 3  # rows at least, and what part of them, that are met first
-_LEAST_NOISE = 1e-2  # times the same: where nothing moves, a fit leaves no error
-_SAME_NOISE = 1.05  # times the noise that rows tell: as much
 _TOGETHER = 4  # draws of the noise that are simulated at once
 
 
@@ -293,22 +291,6 @@ def starts_about(
         np.concatenate([np.where(np.isfinite(free), free, by_rows), act]),
         parts if len(noise) == len(position) else None,
     )
-
-
-def better_noise(
-    starts: Starts, errors: np.ndarray, told: np.ndarray, least: np.ndarray
-) -> np.ndarray:
-    """Noise ``(c,)`` as the errors at fitted starts show it, where that is no more than
-    rows alone tell: rows may take motion for noise, and a model its own errors.
-
-    Args:
-        errors: of `Starts.fit`, ``(W, T, c)``.
-        told: by rows alone, ``(c,)``.
-        least: what resolution makes, ``(c,)``.
-    """
-    least = np.maximum(least, _LEAST_NOISE * told)
-    seen = np.maximum(starts.measured_noise(errors), least)
-    return np.where(seen < _SAME_NOISE * told, seen, told)
 
 
 def floor(

@@ -7,7 +7,8 @@ import numpy as np
 
 from easi_jax.errors import UserError
 from easi_jax.estimation.least_squares import AT_BOUND
-from easi_jax.estimation.starts import better_noise, floor, known_noise
+from easi_jax.estimation.prediction_error import believed
+from easi_jax.estimation.starts import floor, known_noise
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.batched_least_squares import Bounds, window_weights
 from easi_jax.gap.decisions import BLOCKS, DECIDE
@@ -140,7 +141,7 @@ class Fitting:
                 "or shorten --horizon"
             )
         least = known_noise(data.resolution / math.sqrt(12), data.motion)
-        starts.noise = better_noise(starts, errors, data.noise, least)
+        starts.noise = believed(starts.measured_noise(errors), data.noise, least)
         self.sticks |= starts.bent > _BENT
         if self.sticks:
             chosen.moved = still

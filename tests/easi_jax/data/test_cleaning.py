@@ -12,7 +12,7 @@ from easi_jax.data.cleaning import (
     split_at_resets,
     to_common_step,
     true_readings,
-    trusted_velocity,
+    trusted_velocities,
     without_odd_ends,
 )
 from easi_jax.data.noise import estimate_noise
@@ -23,8 +23,10 @@ from easi_jax.errors import UserError
 from easi_jax.estimation.held_out import ready_errors
 from easi_jax.estimation.pieces import segments_from_runs, visible_steps
 from easi_jax.estimation.prediction_error import (
+    believed,
     misfit_of,
     outlier_weights,
+    white_noise,
 )
 from easi_jax.estimation.problem import Problem
 from easi_jax.io.logs.reader import read_logs
@@ -107,9 +109,11 @@ def test_measured_velocities_have_their_own_noise():
 def test_late_velocities_are_not_trusted():
     run = make_run(sine())
     late = dataclasses.replace(run, qvel=np.roll(run.qvel, 8, 0), qvel_measured=True)
-    np.testing.assert_array_equal(trusted_velocity(late), run.qvel)
+    assert not trusted_velocities([late]).any()
     close = dataclasses.replace(run, qvel=1.02 * run.qvel, qvel_measured=True)
-    np.testing.assert_array_equal(trusted_velocity(close), close.qvel)
+    assert trusted_velocities([close]).all()
+    assert not trusted_velocities([close, late]).any()
+    assert not trusted_velocities([close, run]).any(), "one run has none"
 
 
 def test_velocities_too_fast_for_the_fit_are_trusted_where_they_integrate():
@@ -119,11 +123,37 @@ def test_velocities_too_fast_for_the_fit_are_trusted_where_they_integrate():
     qpos = np.sin(0.63 * t)[:, None]
     qvel = 0.63 / slow.dt * np.cos(0.63 * t)[:, None]
     fast = dataclasses.replace(slow, qpos=qpos, qvel=qvel, qvel_measured=True)
-    np.testing.assert_array_equal(trusted_velocity(fast), qvel)
-    late = dataclasses.replace(fast, qvel=np.roll(qvel, 2, 0))
-    fitted = trusted_velocity(dataclasses.replace(fast, qvel_measured=False))
+    fitted = fitted_velocity(qpos, slow.dt, slow.configuration)
     assert np.abs(fitted - qvel).max() > 0.1 * qvel.max()
-    np.testing.assert_array_equal(trusted_velocity(late), fitted)
+    assert trusted_velocities([fast]).all()
+    assert not trusted_velocities(
+        [dataclasses.replace(fast, qvel=np.roll(qvel, 2, 0))]
+    ).any()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_of_positions_does_not_make_velocities_doubtful(seed):
+    """Positions whose noise hides the motion from row to row; runs of two seconds."""
+    rng, rows, dt = np.random.default_rng(seed), 100, 0.02
+    t = dt * np.arange(-20, rows)
+    # Motion of a drive that follows new targets all the time.
+    pushes = np.repeat(rng.normal(size=len(t) // 4), 4)
+    speed = 0.08 * np.convolve(pushes, np.exp(-np.arange(20) / 6.0) / 3.0)[: len(t)]
+
+    def runs(late: int = 0, gain: float = 1.0) -> list[Run]:
+        out = []
+        for _ in range(10):
+            fine = np.cumsum(0.5 * dt * (speed + np.r_[0.0, speed[:-1]]))
+            read = gain * np.roll(speed, late) + 4e-3 * rng.normal(size=len(t))
+            qpos = (fine + 5e-4 * rng.normal(size=len(t)))[20:]
+            run = make_run(qpos, dt=dt)
+            qvel = read[20:, None]
+            out.append(dataclasses.replace(run, qvel=qvel, qvel_measured=True))
+        return out
+
+    assert trusted_velocities(runs()).all()
+    assert not trusted_velocities(runs(late=1)).any()
+    assert not trusted_velocities(runs(gain=1.3)).any()
 
 
 def test_visible_steps_grow_with_noise():
@@ -296,6 +326,21 @@ def test_misfit_counts_only_what_noise_does_not_explain():
     steady = jnp.broadcast_to(3 * white[:, :1], white.shape)  # the same in each step
     expected = np.sqrt((9 - 1) * 30)
     np.testing.assert_allclose(misfit_of(steady, noise, ones), expected, rtol=0.15)
+
+
+def test_noise_is_what_errors_leave_white():
+    """Whatever a model errs by in slow waves, and in jumps of a tenth of the pieces."""
+    rng, sigma = np.random.default_rng(3), np.array([0.01, 0.02])
+    wave = np.sin(2 * np.pi * (np.arange(25) / 25 + rng.uniform(size=(300, 1))))
+    jump = 0.5 * (np.arange(25) > 12) * (np.arange(300) % 10 == 0)[:, None]
+    error = sigma * rng.normal(size=(300, 25, 2))
+    error[..., 1] += 0.2 * wave + jump
+    error[7] = np.nan
+    np.testing.assert_allclose(white_noise(jnp.asarray(error)), sigma, rtol=0.05)
+    # Rows that tell less than that are right: then the model errs from row to row.
+    told = jnp.array([0.008, 0.3])
+    found = believed(white_noise(jnp.asarray(error)), told)
+    np.testing.assert_allclose(found, [0.008, 0.02], rtol=0.05)
 
 
 def test_outliers_weigh_less():

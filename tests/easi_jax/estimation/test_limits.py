@@ -2,9 +2,10 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from easi_jax.estimation import weights
-from easi_jax.estimation.limits import Reach, beyond_dips, jumps, unmet
+from easi_jax.estimation.limits import Reach, beyond_edge, edge, jumps, of, unmet
 from easi_jax.model.parameters import Parameter, ParameterSpace
 
 
@@ -47,13 +48,32 @@ def test_a_jump_is_bisected_to_the_edge_of_a_plateau() -> None:
     assert not new.unchanged.any()
 
 
-def test_a_dip_that_noise_may_have_dug_is_left_for_the_plateau() -> None:
-    hessian = jnp.diag(jnp.array([1e4, 1e4, 1e-3]))
-    unit, up = jnp.array([0.2, 0.2, 0.2]), jnp.array([1.2, 1.2, 1.2])
-    rise = jnp.array([3.0, 2e3, 0.0])
-    found = beyond_dips(unit, up, rise, hessian)
-    assert found[0] > 0.5 and found[1:].tolist() == unit[1:].tolist()
-    assert unmet(hessian).tolist() == [False, False, True]
+def test_limits_are_known_by_their_addresses() -> None:
+    named = ParameterSpace(
+        tuple(
+            Parameter(name, (name,), 1.0, (0.5, 2.0), (0.01, 100.0), unit="N")
+            for name in (
+                "actuator.drive.force_limit",
+                "joint.limited.damping",
+                "effect.limit.drive",
+            )
+        )
+    )
+    assert of(named) == [0, 2]
+    here = jnp.array([0.2, 0.9, 0.2])
+    assert beyond_edge(named, here, jnp.asarray(0)).tolist() > here.tolist()
+    assert (beyond_edge(named, here, jnp.asarray(-1)) == here).all()
+
+
+def test_a_narrow_dip_has_to_be_deeper() -> None:
+    """Against the evidence by brute force: a plateau of 0, a Gaussian dip."""
+    unit, log_odds = 0.2, np.log(0.95 / 0.05)
+    for std in (0.001, 0.02):
+        depth = float(edge(jnp.asarray(unit), jnp.asarray(std**-2.0)))
+        x = np.linspace(unit - 6 * std, unit + 6 * std, 4001)
+        dip = np.exp(depth - 0.5 * ((x - unit) / std) ** 2).sum() * (x[1] - x[0])
+        assert np.log(dip / (1.0 - unit)) == pytest.approx(log_odds, abs=0.01)
+    assert unmet(jnp.diag(jnp.array([1e4, 1e-3]))).tolist() == [False, True]
 
 
 def test_what_fits_far_worse_counts_less() -> None:

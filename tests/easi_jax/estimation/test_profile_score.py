@@ -12,6 +12,7 @@ from easi_jax.data.segments import Segments
 from easi_jax.devices.runtime import quick_compile
 from easi_jax.estimation.levenberg_marquardt import RefineResult, refine
 from easi_jax.estimation.normal_equations import PairedFit
+from easi_jax.estimation.polish import polish
 from easi_jax.estimation.profile_score import Adjusted, adjust, less_scatter
 from easi_jax.model.parameters import ParameterSpace, declare
 from easi_jax.simulation.simulator import Simulator
@@ -162,7 +163,8 @@ def test_a_limit_that_was_not_met_is_not_known(limit: float) -> None:
 
     def run(key: jax.Array) -> Adjusted:
         pieces = recorded(simulator, key, jnp.asarray(_SPEED))
-        return adjust(PairedFit(simulator, space, pieces, _NOISE), start)
+        paired = PairedFit(simulator, space, pieces, _NOISE)
+        return adjust(paired, polish(paired, start).unit)
 
     compiled = jax.jit(run, compiler_options=quick_compile())
     for seed in range(3):

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from easi_jax.estimation.starts import Starts, better_noise, floor
+from easi_jax.estimation.prediction_error import believed
+from easi_jax.estimation.starts import Starts, floor
 
 W, T, ROWS, DT = 400, 31, 11, 0.01
 NOISE = np.array([2e-3])
@@ -82,10 +83,10 @@ def test_noise_is_read_off_the_first_rows() -> None:
 def test_noise_of_what_does_not_move_stays_above_zero() -> None:
     starts, _ = made(3)
     _, errors = fitted(starts)
-    told = better_noise(starts, 0.0 * errors, NOISE, np.zeros(1))
+    told = believed(starts.measured_noise(0.0 * errors), NOISE)
     assert 0 < told[0] < NOISE[0]
     # A model that errs makes no noise of it.
-    assert better_noise(starts, 5.0 * errors, NOISE, np.zeros(1)) == NOISE
+    assert believed(starts.measured_noise(5.0 * errors), NOISE) == NOISE
 
 
 def test_what_small_errors_become() -> None:
