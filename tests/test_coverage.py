@@ -59,19 +59,20 @@ def test_the_page_counts_what_is_inside(tmp_path: Path) -> None:
         row: dict = {"seed": seed, "rank": 4, "versions": {"commit": "0123456789"}}
         for way, size in zip(coverage.WAYS, (3.0, 0.2, 1.0), strict=True):
             square = float((rng.normal(size=4) ** 2).sum())
-            row[way] = {"distance": size**2 * square, "bound": 2.25 * square}
+            row[way] = {"distance": size**2 * square, "bound": square}
         lines.append(json.dumps(row))
     (tmp_path / "coverage.jsonl").write_text("\n".join(lines) + "\n")
     text = "\n".join(shown(coverage_summary.SECTIONS, tmp_path))
     rows = {
         w: next(x for x in text.splitlines() if f"| {w} |" in x) for w in coverage.WAYS
     }
-    assert ", met | 1." in rows["refined"]
+    assert rows["refined"].count("], met |") == 2
     middle, most = (x.strip() for x in rows["refined"].strip("|").split("|")[-2:])
     assert middle.endswith(", met")
-    # 1.5 times a chi with four degrees of freedom over its root.
-    assert float(most) == pytest.approx(1.5 * (9.49 / 4) ** 0.5, rel=0.1)
-    assert "| 100% [" in rows["search"] and "], **missed** |" in rows["search"]
+    # A chi with four degrees of freedom over its root.
+    assert float(most) == pytest.approx((9.49 / 4) ** 0.5, rel=0.1)
+    assert rows["search"].count("100% [") == 2
+    assert rows["search"].count("], **missed** |") == 2
     assert "missed" not in rows["search, own spread"]
     inside = coverage_summary.covered([json.loads(x) for x in lines], "refined", 0.5)
     assert inside.mean() == pytest.approx(0.5, abs=0.08)
@@ -94,14 +95,31 @@ def test_what_is_stated_of_the_unseen_is_counted(tmp_path: Path) -> None:
         assert said in "\n".join(shown(coverage_summary.SECTIONS, tmp_path))
 
 
+def test_a_mean_that_is_off_is_told(tmp_path: Path) -> None:
+    lines = []
+    for seed, off in enumerate((0.3, 0.5, 0.4) * 100):
+        row: dict = {"seed": seed, "rank": 1, "versions": {"commit": "0123456789"}}
+        row |= {w: {"distance": 1.0, "bound": 1.0} for w in coverage.WAYS}
+        row[coverage.WAYS[-1]] |= {"off": [off, -0.01, 9.0], "std": [1.0, 0.1, 1.0]}
+        row["determined"] = [True, True, False]
+        lines.append(json.dumps(row))
+    (tmp_path / "coverage.jsonl").write_text("\n".join(lines) + "\n")
+    page = "\n".join(shown(coverage_summary.SECTIONS, tmp_path))
+    assert "Of 2 parameters" in page and "is 0.40 of its stated" in page
+    assert "(by 300 targets, standard error 0.06); goal 0.2: **missed**" in page
+
+
 @pytest.mark.slow
-def test_a_limit_that_no_piece_meets_is_not_stated_as_known(tmp_path: Path) -> None:
-    """Noise dug a dip for this target's force limit, beside a speed limit that many
-    pieces meet: it was stated 55 % too low, within 1 %."""
-    out = tmp_path / "coverage.jsonl"
-    coverage.run(coverage.Config(targets=15, shard="15/15", out=out))
+@pytest.mark.parametrize("seed", [14, 356])
+def test_a_limit_that_no_piece_meets_is_not_stated_as_known(
+    tmp_path: Path, seed: int
+) -> None:
+    """Noise dug dips for these targets' force limits, beside speed limits that many
+    pieces meet: they were stated 55 and 43 % too low, within 1 %."""
+    out, count = tmp_path / "coverage.jsonl", seed + 1
+    coverage.run(coverage.Config(targets=count, shard=f"{count}/{count}", out=out))
     (row,) = (json.loads(x) for x in out.read_text().splitlines())
-    assert row["seed"] == 14 and row["rank"] == 7
+    assert row["seed"] == seed and row["rank"] == 7
     force, speed = row["refined"]["std"][-2:]
     assert speed < 0.01 < 0.3 < force
 
@@ -125,6 +143,7 @@ def test_late_targets_have_a_table_of_their_own(tmp_path: Path) -> None:
     said = next(line for line in page.splitlines() if "| 5 ms" in line)
     late, count, *shares, ratio, none = [x.strip() for x in said.strip("|").split("|")]
     assert (late, count, none) == ("5 ms", "100", "5")
+    shares = [x.split(" [")[0] for x in shares]
     plain, stated = (
         [float(x[:-1]) for x in shares[:2]],
         [float(x[:-1]) for x in shares[2:]],

@@ -78,9 +78,9 @@ def ready(
         training=training,
         trajectories=config.trajectories,
         noise=config.noise,
-        refine=config.refine and search.finish,
+        refine=config.refine,
         restarts=config.restarts,
-        warm_start=config.warm_start and search.goes_on,
+        warm_start=config.warm_start,
         eval_episodes=config.eval_episodes,
     )
     pipe = Pipeline(env, settings, start=config.start, real=real)
@@ -174,7 +174,7 @@ class Chunked:
         )
         if found is not None:
             return found.state
-        refined = setup.pipe.config.refine
+        refined = setup.pipe.config.finishes
         say(
             "least squares on the paired data ..."
             if refined

@@ -46,7 +46,7 @@ class PipelineConfig:
     noise: tuple[float, ...] = ()
     """Measurement noise of positions, then velocities (SI); empty: none."""
     refine: bool = False
-    """Finish with least squares on the paired data."""
+    """Finish with least squares on the paired data, where the search has a finish."""
     restarts: int | None = None
     """More starts of the least-squares finish, drawn from the search's spread; the best
     fit counts. Not given: 2 for noisy data, none for clean ones and larger robots."""
@@ -58,9 +58,19 @@ class PipelineConfig:
     `easi_jax.estimation.posterior.finish_pieces` and `finish_rest` have it."""
     warm_start: bool = True
     """Final training and Oracle go on from the networks of the policy that recorded the
-    demonstrations, in place of new ones."""
+    demonstrations, in place of new ones, where the search's recipe allows that."""
     eval_episodes: int = 100
     """Episodes of a final evaluation."""
+
+    @property
+    def finishes(self) -> bool:
+        """Whether searches end with least squares."""
+        return self.refine and self.search.finish
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether trainings go on from the first policy."""
+        return self.warm_start and self.search.goes_on
 
     def __post_init__(self) -> None:
         """Raises UserError for values that cannot work."""
@@ -345,7 +355,7 @@ class Pipeline:
                 demo,
                 self.noise,
                 any(x > 0 for x in c.noise),
-                c.refine,
+                c.finishes,
                 c.search.informed_spread,
                 self.mesh,
                 c.restarts,
@@ -443,7 +453,7 @@ class Pipeline:
         if oracle:
             there = self if self.real is self.env else Pipeline(self.real, self.config)
             point = there.spread(there.point(target), len(keys))
-            warm = first if self.config.warm_start else None
+            warm = first if self.config.goes_on else None
             train(
                 *("oracle", "oracle", point, n),
                 lambda: there.train_init(k["oracle"], point, warm),
@@ -468,10 +478,10 @@ class Pipeline:
         self, keys: jax.Array, dist: Any, search: SearchState, first: Any = None
     ) -> Any:
         """Where final training starts: with what the search trained, with the networks
-        of ``first`` (`PipelineConfig.warm_start`), or afresh."""
+        of ``first`` (`PipelineConfig.goes_on`), or afresh."""
         if self.search.trainer:
             return search.training
-        return self.train_init(keys, dist, first if self.config.warm_start else None)
+        return self.train_init(keys, dist, first if self.config.goes_on else None)
 
     def final_iterations(self) -> int:
         """Steps of final training; those made inside the search are taken off."""

@@ -262,7 +262,7 @@ def test_the_preset_paper_has_no_finish_unless_asked_for(
 ) -> None:
     config = easi.Config(**more, target=("gear*0.5",))
     setup = ready(config, Tiny(), Given(), training_config(Tiny(), 2400), (0,))
-    assert (setup.pipe.config.refine, setup.pipe.config.warm_start) == (refine, warm)
+    assert (setup.pipe.config.finishes, setup.pipe.config.goes_on) == (refine, warm)
 
 
 @pytest.mark.slow
