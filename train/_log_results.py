@@ -67,8 +67,10 @@ def write(
     results = seed_results(problem.sensing, space, estimates)
     means = [found.distribution.mean for found in estimates]
     errors = held_out_errors(problem, space, means, ready)
-    seen = np.flatnonzero(np.isfinite(problem.noise))
-    noise = {problem.simulator.state_names[i]: problem.noise[i].item() for i in seen}
+    learned = np.asarray(estimates[errors.best].noise, float)[: len(problem.noise)]
+    scatter = np.minimum(problem.noise, learned)
+    seen = np.flatnonzero(np.isfinite(scatter))
+    noise = {problem.simulator.state_names[i]: scatter[i].item() for i in seen}
     given = folder, problem.name, space, generations
     more = problem.notes, noise, "--data ..."
     return write_found(*given, results, seeds, errors, diverged, *more)

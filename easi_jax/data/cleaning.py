@@ -16,6 +16,8 @@ from easi_jax.model.found_effects import EffectEntry
 
 _STEPS_AGREE = 1e-3
 _AGREES = 0.1
+_CHANCE = 3.0  # times the square that noise makes of three gains: 5 % make more
+_SHORTEST = 8  # rows, of which velocities can be judged
 _NOISIER = 1.3  # times the noise that was estimated, that it may be
 _ODD = 20.0  # times the noise
 _ODD_ALONE = 3.0  # times the largest of the others
@@ -177,6 +179,7 @@ def to_common_step(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
                 before=sent[:0],
                 sent=None,
                 sensors=even.sensors,
+                stamps=run.time if run.stamps is None else run.stamps,
             )
         )
         notes.append(
@@ -246,49 +249,62 @@ def trusted_velocities(runs: Sequence[Run]) -> np.ndarray:
     They agree with the fitted velocity within a tenth of its RMS or three times its
     noise; or, for what swings as fast as rows follow each other escapes the fit, their
     means from row to row are off the steps of the positions by no more than that tenth
-    beyond what noise makes. And of the latter no more than a tenth goes with velocity
-    and acceleration, as it does of what is scaled, late or filtered.
+    beyond what noise makes. And of the latter no more than a tenth of the motion goes
+    with velocity and acceleration, as it does of what is scaled, late, filtered or
+    nothing at all; in no run more than two tenths.
     """
-    first, step = runs[0], runs[0].dt
-    if not all(run.qvel_measured for run in runs):
-        return np.zeros(first.qvel.shape[1], bool)
-    nv = first.qvel.shape[1]
+    step, nv = runs[0].dt, runs[0].qvel.shape[1]
+    runs = [run for run in runs if len(run) > _SHORTEST]
+    if not (runs and all(run.qvel_measured for run in runs)):
+        return np.zeros(nv, bool)
     fitted = [fitted_velocity(r.qpos, r.dt, r.configuration) for r in runs]
     usual = _rms(np.concatenate(fitted))
     derived = [estimate_noise(replace(run, qvel_measured=False)) for run in runs]
     slack = 3 * np.median(derived, 0)[nv:]
     off = _rms(np.concatenate([r.qvel - x for r, x in zip(runs, fitted, strict=True)]))
     agrees = off <= np.maximum(_AGREES * usual, slack)
-    moved, between = [], []
-    for run in runs:
-        steps = run.configuration.difference(run.qpos[:-1], run.qpos[1:])
-        moved.append(steps / run.dt)
-        between.append(0.5 * (run.qvel[:-1] + run.qvel[1:]))
+    moved = [_mean_velocity(run, 1) for run in runs]
+    between = [0.5 * (run.qvel[:-1] + run.qvel[1:]) for run in runs]
     apart = [a - b for a, b in zip(between, moved, strict=True)]
     noise = np.median([estimate_noise(run) for run in runs], 0)
     made = np.hypot(math.sqrt(2.0) * noise[:nv] / step, noise[nv:] / math.sqrt(2.0))
-    least = _AGREES * _rms(np.concatenate(moved))
+    square = _rms(np.concatenate(moved)) ** 2 - 2.0 * (noise[:nv] / step) ** 2
+    least = _AGREES * np.sqrt(np.maximum(square, 0.0))
     agrees |= _rms(np.concatenate(apart)) <= np.hypot(least, _NOISIER * made)
-    agrees &= _going_with_motion(runs, apart) <= least
+    agrees &= _going_with_motion(runs, apart, _CHANCE) <= least
+    for run, off in zip(runs, apart, strict=True):
+        agrees &= _going_with_motion([run], [off], 2 * _CHANCE) <= 2 * least
     return agrees & ~np.any([run.hidden for run in runs], 0)
 
 
-def _going_with_motion(runs: Sequence[Run], apart: Sequence[np.ndarray]) -> np.ndarray:
+def _going_with_motion(
+    runs: Sequence[Run], apart: Sequence[np.ndarray], chance: float
+) -> np.ndarray:
     """RMS ``(nv,)`` of what in ``apart (T - 1, nv)`` goes with velocity and
-    acceleration, by the measured velocities of the rows on either side, whose noise has
-    no part in it."""
-    long = [k for k, run in enumerate(runs) if len(run) > 3]
-    out = np.zeros(runs[0].qvel.shape[1])
-    if not long:
-        return out
-    left = np.concatenate([apart[k][1:-1] for k in long])
-    around = [(runs[k].qvel[:-3], runs[k].qvel[3:]) for k in long]
-    before, after = (np.concatenate(x) for x in zip(*around, strict=True))
+    acceleration, beyond ``chance`` times what it would of noise.
+
+    By the measured velocities of the rows on either side, and by the positions there:
+    noise of these rows has no part in what is apart.
+    """
+    left = np.concatenate([x[1:-1] for x in apart])
+    before = np.concatenate([run.qvel[:-3] for run in runs])
+    after = np.concatenate([run.qvel[3:] for run in runs])
+    across = np.concatenate([_mean_velocity(run, 3) for run in runs])
+    out = np.zeros(left.shape[1])
     for d in range(len(out)):
         goes = np.stack([before[:, d] + after[:, d], after[:, d] - before[:, d]], 1)
+        goes = np.column_stack([goes, across[:, d]])
         gain = np.linalg.lstsq(goes, left[:, d], rcond=None)[0]
-        out[d] = np.sqrt(np.mean((goes @ gain) ** 2))
+        noise = goes.shape[1] * np.mean(left[:, d] ** 2) / len(left)
+        square = np.mean((goes @ gain) ** 2) - chance * noise
+        out[d] = np.sqrt(max(square, 0.0))
     return out
+
+
+def _mean_velocity(run: Run, steps: int) -> np.ndarray:
+    """Over so many steps, by the positions, ``(T - steps, nv)``."""
+    moved = run.configuration.difference(run.qpos[:-steps], run.qpos[steps:])
+    return moved / (steps * run.dt)
 
 
 def velocities(run: Run, trusted: np.ndarray) -> np.ndarray:

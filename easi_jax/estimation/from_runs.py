@@ -1,5 +1,6 @@
 """From measured runs to an estimate: the search's data, and its finish."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -12,13 +13,15 @@ import numpy as np
 
 from easi_jax.data import unmeasured
 from easi_jax.data.activations import activation_guess, activation_spread
+from easi_jax.data.noise import resolution_of, resolutions
 from easi_jax.data.recording import Run
 from easi_jax.data.scales import scales_of
 from easi_jax.data.segments import Segments, to_device
-from easi_jax.data.sensor_channels import NO_SENSORS
+from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
 from easi_jax.devices import distributed
 from easi_jax.devices.mesh import make_mesh, placed, replicated
 from easi_jax.devices.runtime import quick_compile
+from easi_jax.estimation import limits
 from easi_jax.estimation.blocks import FEWEST, enough
 from easi_jax.estimation.doubts import Doubts, all_doubts, doubts_of, told
 from easi_jax.estimation.identifiability import identifiability
@@ -170,6 +173,8 @@ class _Last:
         found: so far.
         weight: of each piece by how well it fits, ``(M,)``; ``weighed`` the pieces.
         misfit: what the model errs by, and ``noise`` of the readings.
+        begun: the fit before any last steps, ``(n,)``: limits begin there each time,
+            for on a plateau nothing leads back.
     """
 
     found: Estimate
@@ -177,6 +182,7 @@ class _Last:
     weighed: Segments
     misfit: jax.Array
     noise: jax.Array
+    begun: jax.Array
 
 
 class _Finish:
@@ -186,7 +192,8 @@ class _Finish:
         whole: all pieces, M of them; `pieces` those that many trials are made with.
         owner: recording of each of ``whole``, ``(M,)``.
         simulator: reads ``sensors``, N numbers, that are fitted as well.
-        told: noise as the rows tell it: where motion is rough, too much.
+        told: noise as the rows tell it: where motion is rough, too much; ``least``
+            what the resolution makes.
         hidden: misfit that leaves out velocities that were derived from positions.
         doubts: what the model may lack; None where nothing is refined.
         lacking: what it may lack as well where it errs by more than the noise.
@@ -221,6 +228,8 @@ class _Finish:
         self.pieces = few(simulator, self.whole, _FEW) if refined else self.whole
         noise = np.concatenate([problem.noise, self.sensors.noise(problem.fit)[0]])
         self.told = jnp.asarray(noise, jnp.result_type(float))
+        self.least = jnp.asarray(_resolution_noise(problem, self.sensors))
+        self.limits = np.array(limits.of(search.space), int)
         # Velocities derived from the positions say nothing that those do not.
         nv, count = simulator.mj_model.nv, len(self.sensors)
         seen = np.concatenate([np.ones(nv), problem.measured, np.ones(count)])
@@ -337,7 +346,7 @@ class _Finish:
             return replace(found, search_mean=mean, search_cov=cov), weight
         if fewer:
             weighed = self.whole
-        undoubted = _Last(found, weight, weighed, misfit, noise)
+        undoubted = _Last(found, weight, weighed, misfit, noise, found.fit)
         last = self.ended(undoubted, cov, self.doubts, "", self.lacks)
         if self.lacks(last.found):
             more = ", with more in doubt"
@@ -362,13 +371,15 @@ class _Finish:
         """The last steps on all pieces with ``doubts``; fewer where they are ``over``,
         since others follow."""
         for k in range(_ENDINGS):
-            known = self.known(last.noise)
-            given = last.found.fit, cov, last.weighed, last.misfit, known
+            known, at, begun = self.known(last.noise), last.found.fit, last.begun
+            at = at.at[self.limits].set(begun[self.limits])
+            given = at, cov, last.weighed, last.misfit, known
             found, error = distributed.local(self.ending(doubts)(*placed(given)))
             noise = self.learned(error)
             misfit, weight = self.judged(error, last.weighed, self.whole, noise)
             weighed = replace(self.whole, weight=self.whole.weight * weight)
-            last = _Last(jax.block_until_ready(found), weight, weighed, misfit, noise)
+            found = jax.block_until_ready(found)
+            last = _Last(found, weight, weighed, misfit, noise, begun)
             self.tell(f"on all of the logs{what}: pass {k + 1} of {_ENDINGS}")
             if self.lost(found) or over(found):
                 break
@@ -393,9 +404,11 @@ class _Finish:
     def learned(self, error: jax.Array) -> jax.Array:
         """Noise ``(2 nv + N,)`` as what a fit leaves shows it, where that is no more
         than rows alone tell; as it was given, if it was."""
-        if self.problem.noise_given or error.shape[1] < _READABLE:
+        interpolated = any(run.stamps is not None for run in self.problem.fit)
+        given = self.problem.noise_given or interpolated  # which smooths it
+        if given or error.shape[1] < _READABLE:
             return self.told
-        return believed(white_noise(error), self.told)
+        return believed(white_noise(error), self.told, self.least)
 
     def judged(
         self,
@@ -465,6 +478,17 @@ class _Finish:
             alone = distributed.local(end(*placed(given)))[0]
             notes += _contradiction(self.search.space, name, alone, found)
         return notes
+
+
+def _resolution_noise(problem: Problem, sensors: Sensors) -> np.ndarray:
+    """What the resolution of readings makes of noise, ``(2 nv + N,)``."""
+    runs, measured = problem.fit, problem.measured
+    # The least: values of a short run are far apart by chance.
+    position = np.min([resolutions(run) for run in runs], 0)
+    velocity = np.min([resolution_of(run.qvel) for run in runs], 0)
+    velocity = np.where(measured, velocity, 0.0)
+    step = [position, velocity, sensors.resolution(runs) if sensors else np.zeros(0)]
+    return np.concatenate(step) / math.sqrt(12.0)
 
 
 def _contradiction(

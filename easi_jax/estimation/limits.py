@@ -81,10 +81,15 @@ def unmet(hessian: jax.Array) -> jax.Array:
 
 def of(space: ParameterSpace) -> list[int]:
     """Which parameters are limits of a force, a speed or a command."""
+
+    def field(address: str) -> str:
+        parts = address.split(".")
+        return parts[1] if parts[0] == "effect" else parts[-1]
+
     return [
         i
         for i, p in enumerate(space.parameters)
-        if any(part.endswith("limit") for a in p.addresses for part in a.split("."))
+        if any(field(a).endswith("limit") for a in p.addresses)
     ]
 
 

@@ -70,9 +70,8 @@ def segments_from_runs(
         UserError: no run is longer than ``horizon`` steps.
         ValueError: a run of another control step.
     """
-    parts, trusted = [], trusted_velocities(runs)
-    if fitted:
-        trusted[:] = False
+    parts, none = [], np.zeros(simulator.mj_model.nv, bool)
+    trusted = none if fitted else trusted_velocities(runs)
     for run in runs:
         if abs(run.dt / simulator.dt - 1) > _STEPS_AGREE:
             raise ValueError(f"{run.name}: control step {run.dt}, not {simulator.dt}")

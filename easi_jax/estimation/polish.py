@@ -17,6 +17,7 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from easi_jax.estimation import limits
 from easi_jax.estimation.least_squares import (
@@ -41,6 +42,9 @@ _PULL = 0.1  # information added to a unit coordinate, for what the data do not 
 _BEGUN = 1e-6  # damping of the first step
 _DAMPING = Damping(falls=0.1, rises=10.0, wakes=1e-2)
 _SHORTER, _LONGER = 0.3, 3.0  # share of its step that a start takes, likewise
+_FIRST, _ON = -1, -2  # in place of a limit
+_MOVES = 0.25 * 0.5 ** np.arange(8)[::-1]  # initial ranges, that a limit is moved by
+_HOPING = 2  # looks in vain at a plateau
 _NEARER = 0.5  # of what a place is worse by, that each look at a plateau leaves at most
 
 
@@ -92,8 +96,10 @@ def polish(
     doubted = jnp.arange(space.size) >= space.size - doubts
     fit = _Steps(paired, weight, jnp.where(doubted, 1.0, 0.0), _LOOKS[doubts > 0])
     starts = paired.unmoved if starts is None else starts
-    # The fit itself, then each limit: as a scan, so that a look is compiled once.
-    ways = [-1, *(i for i in limits.of(space) if i < space.size - doubts)]
+    # The fit itself, and on, then each limit: as a scan, so that a look is compiled
+    # once. Exact data dig no dips.
+    ways = [i for i in limits.of(space) if i < space.size - doubts]
+    ways = [_FIRST, _ON, *ways] if ways and paired.free_starts else [_FIRST]
     begin = fit.begin(unit, starts)
     end, looks = jax.lax.scan(fit.trip, begin, jnp.array(ways))
     unit, starts, told = end.best
@@ -105,7 +111,7 @@ def polish(
     return RefineResult(
         unit=unit,
         hessian=told.hessian,
-        cost=end.cost,
+        cost=jnp.where(end.used.any(), end.cost, jnp.inf),
         delta=starts,
         raised=raised_to_range(space, unit),
         raised_hessian=jnp.where(below, end.seen, told.hessian),
@@ -152,26 +158,57 @@ class _Steps:
         )
 
     def trip(self, found: _Look, way: jax.Array) -> tuple[_Look, jax.Array]:
-        """The steps from where ``found`` begins and, with a ``way`` that is not
-        negative, those from the plateau of that limit: the likelier end of both, and
-        how many looks that took."""
-        first = way < 0
+        """The steps from where ``found`` begins, those on from there, or those from the
+        plateau of a limit: the likelier end of both, and how many looks that took.
+
+        Args:
+            way: which limit; `_FIRST` or `_ON`. It goes on so that a plateau is not
+                praised for what any more steps would have gained.
+        """
+        first = way == _FIRST
         unit, starts, told = found.best
+        met = ~limits.unmet(told.hessian)
         place = limits.beyond_edge(self.paired.space, unit, way)
-        going = first | ~limits.unmet(told.hessian)[way] & (place != unit).any()
-        there = self.begin(place, starts)
-        there = replace(
-            jax.tree.map(lambda x, y: jnp.where(first, x, y), found, there),
+        apart = met[way] & (place != unit).any()
+        on = way == _ON
+        some = met[jnp.array(limits.of(self.paired.space), int)].any()
+        place = jax.lax.cond(on & some, self.nearby, lambda _: place, found)
+        going = first | jnp.where(on, some, apart)
+        fresh = replace(
+            found,
+            k=jnp.asarray(0),
+            progressed=jnp.asarray(0),
+            unit=place,
+            starts=starts,
+            share=jnp.ones_like(found.share),
+            damping=jnp.asarray(_BEGUN),
+            best=(place, starts, told),
+            least=jnp.asarray(jnp.inf),
+            rival=jnp.where(first, jnp.inf, found.least),
             phase=jnp.where(going, _STEPPING, _FINISHED),
-            used=found.used,
-            rival=found.least,
         )
-        end = jax.lax.while_loop(lambda c: c.phase < _FINISHED, self.look, there)
-        flat = limits.unmet(end.best[2].hessian)[way]
+        end = jax.lax.while_loop(lambda c: c.phase < _FINISHED, self.look, fresh)
+        flat = (way >= 0) & limits.unmet(end.best[2].hessian)[way]
         allowed = limits.edge(unit[way], told.hessian[way, way])
-        taken = first | going & flat & (end.least < found.least + allowed)
+        allowed = jnp.where(flat, allowed, 0.0)
+        taken = first | going & (end.least < found.least + allowed)
         best = jax.tree.map(lambda x, y: jnp.where(taken, x, y), end, found)
-        return best, end.k
+        return replace(best, cost=jnp.where(first, end.cost, found.cost)), end.k
+
+    def nearby(self, found: _Look) -> jax.Array:
+        """The place of least cost among the best one and those with a limit moved a
+        little, ``(n,)``: where a limit moves past what single rows need, the cost has
+        kinks, at which steps end."""
+        unit, starts, _ = found.best
+        space = self.paired.space
+        ways = np.eye(space.size)[limits.of(space)]
+        moves = np.concatenate([_MOVES, -_MOVES])[:, None, None] * ways
+        moves = np.vstack([np.zeros(space.size), *moves])
+        units = space.clip(unit + jnp.asarray(moves, unit.dtype))
+        shifts = jnp.broadcast_to(starts, (len(units), *starts.shape))
+        weight = self.weight * found.used[:, None, None]
+        each = self.paired.costs(units, shifts, weight)
+        return units[jnp.argmin(jnp.where(found.used, each, 0.0).sum(1))]
 
     def step(
         self, at: jax.Array, told: Normal, damping: Any, loose: Any = False
@@ -213,11 +250,14 @@ class _Steps:
         progressed = jnp.where(better & progress, c.k, c.progressed)
         foretold = -0.5 * gradient @ du
         # Parameters may be right while the starts are still as they were measured.
-        still = is_settled(jnp.abs(c.least - cost), cost, _SETTLED, _STARTED)
+        rough = jnp.where(alone, _STARTED, _ROUNDING)
+        still = is_settled(jnp.abs(c.least - cost), cost, _SETTLED, rough)
         done = ~stepping | (still & (foretold < _SETTLED)) | (c.k + 1 >= self.looks)
         done |= c.k - progressed >= _STALE
         worse = jnp.maximum(c.least - c.rival, 0.0)
-        done |= ~alone & (c.k > 0) & (cost - c.rival > _NEARER * worse + limits.EDGE)
+        hopeless = cost - c.rival > _NEARER * worse + limits.EDGE
+        hopeless &= better & (c.k > 0) | (c.k - progressed >= _HOPING)
+        done |= ~alone & hopeless
         raised = raised_to_range(space, at)
         below = (raised != at).any() & stepping
         over = jnp.where(below, _RAISING, _FINISHED)

@@ -307,6 +307,8 @@ def _adjusted(paired: PairedFit, fit: RefineResult) -> RefineResult:
         fit,
         unit=new.unit,
         hessian=new.hessian,
+        # Scatter is in the score's worth already.
+        gradients=fit.gradients[:0],
         delta=new.delta,
         raised=new.raised,
         raised_hessian=new.raised_hessian,

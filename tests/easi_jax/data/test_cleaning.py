@@ -140,9 +140,9 @@ def test_noise_of_positions_does_not_make_velocities_doubtful(seed):
     pushes = np.repeat(rng.normal(size=len(t) // 4), 4)
     speed = 0.08 * np.convolve(pushes, np.exp(-np.arange(20) / 6.0) / 3.0)[: len(t)]
 
-    def runs(late: int = 0, gain: float = 1.0) -> list[Run]:
+    def runs(late: int = 0, gain: float = 1.0, count: int = 10) -> list[Run]:
         out = []
-        for _ in range(10):
+        for _ in range(count):
             fine = np.cumsum(0.5 * dt * (speed + np.r_[0.0, speed[:-1]]))
             read = gain * np.roll(speed, late) + 4e-3 * rng.normal(size=len(t))
             qpos = (fine + 5e-4 * rng.normal(size=len(t)))[20:]
@@ -154,6 +154,27 @@ def test_noise_of_positions_does_not_make_velocities_doubtful(seed):
     assert trusted_velocities(runs()).all()
     assert not trusted_velocities(runs(late=1)).any()
     assert not trusted_velocities(runs(gain=1.3)).any()
+    assert not trusted_velocities([*runs(), *runs(late=5, count=1)]).any(), "one run"
+
+
+@pytest.mark.parametrize(("dt", "noise"), [(0.01, 1e-3), (0.005, 5e-4), (0.02, 2e-3)])
+def test_velocities_that_are_zero_are_not_trusted(dt, noise):
+    """However much noise of positions makes of their steps."""
+    rng = np.random.default_rng(0)
+    t = dt * np.arange(round(10 / dt))
+    for _ in range(5):
+        qpos = 0.022 * np.sin(2 * np.pi * t) + noise * rng.normal(size=len(t))
+        run = dataclasses.replace(make_run(qpos, dt=dt), qvel_measured=True)
+        qvel = 0.14 * np.cos(2 * np.pi * t)[:, None]
+        good = qvel + 5e-3 * rng.normal(size=qvel.shape)
+        assert trusted_velocities([dataclasses.replace(run, qvel=good)]).all()
+        for bad in (0.0 * qvel, 1.5 * good, np.roll(good, round(0.05 / dt), 0)):
+            assert not trusted_velocities([dataclasses.replace(run, qvel=bad)]).any()
+
+
+def test_too_few_rows_say_nothing_of_velocities():
+    run = dataclasses.replace(make_run(np.zeros(1)), qvel_measured=True)
+    assert not trusted_velocities([run]).any()
 
 
 def test_visible_steps_grow_with_noise():

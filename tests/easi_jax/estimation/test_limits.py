@@ -54,7 +54,7 @@ def test_limits_are_known_by_their_addresses() -> None:
             Parameter(name, (name,), 1.0, (0.5, 2.0), (0.01, 100.0), unit="N")
             for name in (
                 "actuator.drive.force_limit",
-                "joint.limited.damping",
+                "joint.upper_limit.damping",
                 "effect.limit.drive",
             )
         )

@@ -78,7 +78,9 @@ def test_few_pieces_end_where_all_have_it(problem: Any, run: Any, fits: Any) -> 
         rtol=0.1,
     )
     assert found.delta.shape == known.delta.shape
-    assert looks(problem, found) == np.isfinite(found.cost).sum() < 8
+    # Each of two limits is looked at on its plateau, too.
+    assert np.isfinite(found.cost).sum() < 8
+    assert np.isfinite(found.cost).sum() + 4 <= looks(problem, found) < 24
     assert (found.raised == found.unit).all()
     assert (found.raised_hessian == found.hessian).all()
 
