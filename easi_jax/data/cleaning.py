@@ -179,7 +179,7 @@ def to_common_step(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
                 before=sent[:0],
                 sent=None,
                 sensors=even.sensors,
-                stamps=run.time if run.stamps is None else run.stamps,
+                smoothed=True,
             )
         )
         notes.append(
@@ -238,7 +238,8 @@ def true_readings(
             at = row + late[d] / run.dt
             qpos[:, q] = np.interp(at, row, run.qpos[:, q]) - bias[d]
             qvel[:, d] = np.interp(at, row, run.qvel[:, d])
-        out.append(rows_of(replace(run, qpos=qpos, qvel=qvel), 0, max(count, 2)))
+        read = replace(run, qpos=qpos, qvel=qvel, smoothed=bool(late.any()))
+        out.append(rows_of(read, 0, max(count, 2)))
     return out
 
 
@@ -254,8 +255,10 @@ def trusted_velocities(runs: Sequence[Run]) -> np.ndarray:
     nothing at all; in no run more than two tenths.
     """
     step, nv = runs[0].dt, runs[0].qvel.shape[1]
+    seen = ~np.any([run.hidden for run in runs], 0)
+    measured = all(run.qvel_measured for run in runs)
     runs = [run for run in runs if len(run) > _SHORTEST]
-    if not (runs and all(run.qvel_measured for run in runs)):
+    if not (runs and measured):
         return np.zeros(nv, bool)
     fitted = [fitted_velocity(r.qpos, r.dt, r.configuration) for r in runs]
     usual = _rms(np.concatenate(fitted))
@@ -268,13 +271,19 @@ def trusted_velocities(runs: Sequence[Run]) -> np.ndarray:
     apart = [a - b for a, b in zip(between, moved, strict=True)]
     noise = np.median([estimate_noise(run) for run in runs], 0)
     made = np.hypot(math.sqrt(2.0) * noise[:nv] / step, noise[nv:] / math.sqrt(2.0))
-    square = _rms(np.concatenate(moved)) ** 2 - 2.0 * (noise[:nv] / step) ** 2
-    least = _AGREES * np.sqrt(np.maximum(square, 0.0))
+
+    def tenth(moved: np.ndarray) -> np.ndarray:
+        """Of the motion itself."""
+        square = _rms(moved) ** 2 - 2.0 * (noise[:nv] / step) ** 2
+        return _AGREES * np.sqrt(np.maximum(square, 0.0))
+
+    least = tenth(np.concatenate(moved))
     agrees |= _rms(np.concatenate(apart)) <= np.hypot(least, _NOISIER * made)
     agrees &= _going_with_motion(runs, apart, _CHANCE) <= least
-    for run, off in zip(runs, apart, strict=True):
-        agrees &= _going_with_motion([run], [off], 2 * _CHANCE) <= 2 * least
-    return agrees & ~np.any([run.hidden for run in runs], 0)
+    for run, off, own in zip(runs, apart, moved, strict=True):
+        most = 2.0 * np.maximum(least, tenth(own))
+        agrees &= _going_with_motion([run], [off], 2 * _CHANCE) <= most
+    return agrees & seen
 
 
 def _going_with_motion(

@@ -327,6 +327,14 @@ def resolution_of(x: np.ndarray) -> np.ndarray:
     return out
 
 
+def finest(each: Sequence[np.ndarray]) -> np.ndarray:
+    """Least of the resolutions ``(n,)`` of several runs: values of a short one are far
+    apart by chance. Zero where none tells any, as where nothing moves."""
+    steps = np.array(each)
+    least = np.where(steps > 0, steps, np.inf).min(0)
+    return np.where(np.isfinite(least), least, 0.0)
+
+
 def _fit_gain(rows: int, dt: float) -> float:
     """Noise of a fitted velocity per unit of position noise [1/s]."""
     impulse = np.zeros((rows, 1))

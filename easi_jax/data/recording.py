@@ -41,6 +41,7 @@ class Run:
             whole.
         stamps: times of the rows as they were recorded [s]; None where they were even,
             and nothing was interpolated.
+        smoothed: whether rows were interpolated once more, after their noise was told.
         sent: mean over each step of the commands held in it, ``(T, nu)``; None where
             it is ``ctrl``.
     """
@@ -60,6 +61,7 @@ class Run:
     hidden: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
     before: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     part_of: str = ""
+    smoothed: bool = False
 
     def __post_init__(self) -> None:
         if not len(self.hidden):

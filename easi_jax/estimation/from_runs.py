@@ -13,7 +13,7 @@ import numpy as np
 
 from easi_jax.data import unmeasured
 from easi_jax.data.activations import activation_guess, activation_spread
-from easi_jax.data.noise import resolution_of, resolutions
+from easi_jax.data.noise import finest, resolution_of, resolutions
 from easi_jax.data.recording import Run
 from easi_jax.data.scales import scales_of
 from easi_jax.data.segments import Segments, to_device
@@ -173,8 +173,7 @@ class _Last:
         found: so far.
         weight: of each piece by how well it fits, ``(M,)``; ``weighed`` the pieces.
         misfit: what the model errs by, and ``noise`` of the readings.
-        begun: the fit before any last steps, ``(n,)``: limits begin there each time,
-            for on a plateau nothing leads back.
+        begun: the fit before any last steps, ``(n,)``.
     """
 
     found: Estimate
@@ -229,7 +228,8 @@ class _Finish:
         noise = np.concatenate([problem.noise, self.sensors.noise(problem.fit)[0]])
         self.told = jnp.asarray(noise, jnp.result_type(float))
         self.least = jnp.asarray(_resolution_noise(problem, self.sensors))
-        self.limits = np.array(limits.of(search.space), int)
+        limited = limits.of(search.space)
+        self.limited = np.isin(np.arange(search.space.size), limited)
         # Velocities derived from the positions say nothing that those do not.
         nv, count = simulator.mj_model.nv, len(self.sensors)
         seen = np.concatenate([np.ones(nv), problem.measured, np.ones(count)])
@@ -372,7 +372,9 @@ class _Finish:
         since others follow."""
         for k in range(_ENDINGS):
             known, at, begun = self.known(last.noise), last.found.fit, last.begun
-            at = at.at[self.limits].set(begun[self.limits])
+            # From a plateau nothing leads back.
+            lost = self.limited & np.asarray(limits.unmet(last.found.hessian))
+            at = jnp.where(lost, begun, at)
             given = at, cov, last.weighed, last.misfit, known
             found, error = distributed.local(self.ending(doubts)(*placed(given)))
             noise = self.learned(error)
@@ -404,9 +406,9 @@ class _Finish:
     def learned(self, error: jax.Array) -> jax.Array:
         """Noise ``(2 nv + N,)`` as what a fit leaves shows it, where that is no more
         than rows alone tell; as it was given, if it was."""
-        interpolated = any(run.stamps is not None for run in self.problem.fit)
-        given = self.problem.noise_given or interpolated  # which smooths it
-        if given or error.shape[1] < _READABLE:
+        runs = self.problem.fit
+        smooth = any(r.smoothed or r.stamps is not None for r in runs)
+        if self.problem.noise_given or smooth or error.shape[1] < _READABLE:
             return self.told
         return believed(white_noise(error), self.told, self.least)
 
@@ -483,11 +485,10 @@ class _Finish:
 def _resolution_noise(problem: Problem, sensors: Sensors) -> np.ndarray:
     """What the resolution of readings makes of noise, ``(2 nv + N,)``."""
     runs, measured = problem.fit, problem.measured
-    # The least: values of a short run are far apart by chance.
-    position = np.min([resolutions(run) for run in runs], 0)
-    velocity = np.min([resolution_of(run.qvel) for run in runs], 0)
-    velocity = np.where(measured, velocity, 0.0)
-    step = [position, velocity, sensors.resolution(runs) if sensors else np.zeros(0)]
+    position = finest([resolutions(run) for run in runs])
+    velocity = finest([resolution_of(run.qvel) for run in runs])
+    sensed = finest([resolution_of(sensors.readings(run)) for run in runs])
+    step = [position, np.where(measured, velocity, 0.0), sensed]
     return np.concatenate(step) / math.sqrt(12.0)
 
 

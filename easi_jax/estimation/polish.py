@@ -94,20 +94,22 @@ def polish(
     """
     space, segments, weight = paired.space, paired.segments, paired.weight
     doubted = jnp.arange(space.size) >= space.size - doubts
-    fit = _Steps(paired, weight, jnp.where(doubted, 1.0, 0.0), _LOOKS[doubts > 0])
+    known, most = jnp.where(doubted, 1.0, 0.0), _LOOKS[doubts > 0]
     starts = paired.unmoved if starts is None else starts
     # The fit itself, and on, then each limit: as a scan, so that a look is compiled
     # once. Exact data dig no dips.
     ways = [i for i in limits.of(space) if i < space.size - doubts]
-    ways = [_FIRST, _ON, *ways] if ways and paired.free_starts else [_FIRST]
+    limited = bool(ways) and paired.free_starts
+    ways = [_FIRST, _ON, *ways] if limited else [_FIRST]
+    fit = _Steps(paired, weight, known, most, limited)
     begin = fit.begin(unit, starts)
-    end, looks = jax.lax.scan(fit.trip, begin, jnp.array(ways))
+    end, simulated = jax.lax.scan(fit.trip, begin, jnp.array(ways))
     unit, starts, told = end.best
     below = (raised_to_range(space, unit) != unit).any()
     if doubts:
         new = moved(space, unit, fit.step(unit, told, 0.0, doubted)[1])
         unit = jnp.where(doubted, new, space.clip(new))
-    whole = paired.points * segments.count * segments.horizon
+    whole = 1.0 * segments.count * segments.horizon
     return RefineResult(
         unit=unit,
         hessian=told.hessian,
@@ -116,7 +118,7 @@ def polish(
         raised=raised_to_range(space, unit),
         raised_hessian=jnp.where(below, end.seen, told.hessian),
         excess=excess(jnp.where(end.used, told.costs, jnp.inf), weight),
-        simulated=1.0 * whole * looks.sum(),
+        simulated=whole * simulated.sum(),
         gradients=told.gradients,
     )
 
@@ -130,12 +132,14 @@ class _Steps:
         weight: of each measured number, ``(M, H, 2 nv)``.
         known: information before any data of a coordinate about 0, ``(n,)``.
         looks: at most.
+        limited: whether limits are looked at as well.
     """
 
     paired: PairedFit
     weight: jax.Array
     known: jax.Array
     looks: int
+    limited: bool = False
 
     def begin(self, unit: jax.Array, starts: jax.Array) -> _Look:
         """Before anything was looked at."""
@@ -159,7 +163,7 @@ class _Steps:
 
     def trip(self, found: _Look, way: jax.Array) -> tuple[_Look, jax.Array]:
         """The steps from where ``found`` begins, those on from there, or those from the
-        plateau of a limit: the likelier end of both, and how many looks that took.
+        plateau of a limit: the likelier end of both, and simulations of each piece.
 
         Args:
             way: which limit; `_FIRST` or `_ON`. It goes on so that a plateau is not
@@ -172,7 +176,10 @@ class _Steps:
         apart = met[way] & (place != unit).any()
         on = way == _ON
         some = met[jnp.array(limits.of(self.paired.space), int)].any()
-        place = jax.lax.cond(on & some, self.nearby, lambda _: place, found)
+        tried = jnp.asarray(0)
+        if self.limited:
+            place = jax.lax.cond(on & some, self.nearby, lambda _: place, found)
+            tried = jnp.where(on & some, len(self.moves), 0)
         going = first | jnp.where(on, some, apart)
         fresh = replace(
             found,
@@ -193,18 +200,23 @@ class _Steps:
         allowed = jnp.where(flat, allowed, 0.0)
         taken = first | going & (end.least < found.least + allowed)
         best = jax.tree.map(lambda x, y: jnp.where(taken, x, y), end, found)
-        return replace(best, cost=jnp.where(first, end.cost, found.cost)), end.k
+        best = replace(best, cost=jnp.where(first, end.cost, found.cost))
+        return best, end.k * self.paired.points + tried
+
+    @property
+    def moves(self) -> np.ndarray:
+        """Of none, then of single limits, ``(K, n)``."""
+        space = self.paired.space
+        ways = np.eye(space.size)[limits.of(space)]
+        moved = np.concatenate([_MOVES, -_MOVES])[:, None, None] * ways
+        return np.vstack([np.zeros(space.size), *moved])
 
     def nearby(self, found: _Look) -> jax.Array:
         """The place of least cost among the best one and those with a limit moved a
         little, ``(n,)``: where a limit moves past what single rows need, the cost has
         kinks, at which steps end."""
         unit, starts, _ = found.best
-        space = self.paired.space
-        ways = np.eye(space.size)[limits.of(space)]
-        moves = np.concatenate([_MOVES, -_MOVES])[:, None, None] * ways
-        moves = np.vstack([np.zeros(space.size), *moves])
-        units = space.clip(unit + jnp.asarray(moves, unit.dtype))
+        units = self.paired.space.clip(unit + jnp.asarray(self.moves, unit.dtype))
         shifts = jnp.broadcast_to(starts, (len(units), *starts.shape))
         weight = self.weight * found.used[:, None, None]
         each = self.paired.costs(units, shifts, weight)

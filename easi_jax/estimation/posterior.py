@@ -308,7 +308,7 @@ def _adjusted(paired: PairedFit, fit: RefineResult) -> RefineResult:
         unit=new.unit,
         hessian=new.hessian,
         # Scatter is in the score's worth already.
-        gradients=fit.gradients[:0],
+        gradients=jnp.zeros_like(fit.gradients),
         delta=new.delta,
         raised=new.raised,
         raised_hessian=new.raised_hessian,
