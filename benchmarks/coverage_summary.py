@@ -72,16 +72,17 @@ def _as_stated(rows: list[dict[str, Any]]) -> str:
     return markdown_table(head, lines)
 
 
-def _share(hit: np.ndarray) -> str:
+def _share(hit: np.ndarray, digits: int = 0) -> str:
     """How many of all, ``(targets,)`` bool, and its interval."""
     low, high = wilson(int(hit.sum()), len(hit))
-    return f"{hit.mean():.0%} [{low:.0%}, {high:.0%}]"
+    return f"{hit.mean():.0%} [{low:.{digits}%}, {high:.{digits}%}]"
 
 
-def _judged(share: float, low: float, high: float, goal: tuple[float, float]) -> str:
+def _judged(hit: np.ndarray, goal: tuple[float, float]) -> str:
     """Whether a goal is reached by a share, or cannot be told from it."""
-    if goal[0] <= share <= goal[1]:
+    if goal[0] <= hit.mean() <= goal[1]:
         return met(True)
+    low, high = wilson(int(hit.sum()), len(hit))
     touches = low <= goal[1] and high >= goal[0]
     return "not told from it" if touches else met(False)
 
@@ -94,10 +95,9 @@ def _right(rows: list[dict[str, Any]]) -> list[str]:
         ratio, most = np.quantile(beside_bound(rows, way), (0.5, 0.95))
         cells = []
         for q, hit in inside.items():
-            low, high = wilson(int(hit.sum()), len(hit))
-            told = f"{hit.mean():.0%} [{low:.1%}, {high:.1%}]"
+            told = _share(hit, 1)
             if way in MEANT:
-                told += f", {_judged(hit.mean(), low, high, GOALS[q])}{few}"
+                told += f", {_judged(hit, GOALS[q])}{few}"
             cells.append(told)
         told = f"{ratio:.2f}" + (f", {met(ratio <= BOUND)}" if way == WAYS[-1] else "")
         lines.append((way, *cells, told, f"{most:.3g}"))
@@ -106,7 +106,7 @@ def _right(rows: list[dict[str, Any]]) -> list[str]:
         f"`python -m benchmarks.coverage`, {len(rows)} Cartpoles with parameters drawn "
         f"from UDR's range, sensor noise, commits {commits_of(rows)}. Share of "
         "truths inside the stated regions along the directions that the data "
-        f"determine (95 % interval); goals 45 to 55 % and 87 to 93 %, missed where the "
+        "determine (95 % interval); goals 45 to 55 % and 87 to 93 %, missed where the "
         "interval excludes all of that, and not told from it where it holds a part. "
         "Error as a multiple of the Cramer-Rao bound, median; goal at most "
         f"{BOUND:g} after refinement; and what 95 % of the targets stay below. "
@@ -129,15 +129,14 @@ def _centered(rows: list[dict[str, Any]]) -> list[str]:
                 told.setdefault(i, []).append(off / std)
     if not told:
         return []
-    means = [float(np.mean(z)) for z in told.values()]
-    most = max(means, key=abs)
-    count = len(told[list(told)[means.index(most)]])
+    means = [(abs(float(np.mean(z))), len(z)) for z in told.values()]
+    most, count = max(means)
     error = count**-0.5
     return [
         f"Of {len(told)} parameters, where the data determine them, the mean error "
-        f"after refinement is {abs(most):.2f} of its stated standard deviation at most "
+        f"after refinement is {most:.2f} of its stated standard deviation at most "
         f"(by {count} targets, standard error {error:.2f}); goal {OFF:g}: "
-        f"{met(abs(most) - _TWO_SIDED * error <= OFF)}."
+        f"{met(most - _TWO_SIDED * error <= OFF)}."
     ]
 
 

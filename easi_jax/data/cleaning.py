@@ -10,7 +10,7 @@ import numpy as np
 from easi_jax.data.noise import _JITTER, _USUAL, estimate_noise
 from easi_jax.data.recording import Run
 from easi_jax.data.resampling import Rows, mean_held, resampled
-from easi_jax.data.windows import fitted_velocity
+from easi_jax.data.windows import fitted_velocity, slope_noise
 from easi_jax.model import addresses
 from easi_jax.model.found_effects import EffectEntry
 
@@ -238,7 +238,8 @@ def true_readings(
             at = row + late[d] / run.dt
             qpos[:, q] = np.interp(at, row, run.qpos[:, q]) - bias[d]
             qvel[:, d] = np.interp(at, row, run.qvel[:, d])
-        read = replace(run, qpos=qpos, qvel=qvel, smoothed=bool(late.any()))
+        smoothed = run.smoothed or bool(late.any())
+        read = replace(run, qpos=qpos, qvel=qvel, smoothed=smoothed)
         out.append(rows_of(read, 0, max(count, 2)))
     return out
 
@@ -262,14 +263,13 @@ def trusted_velocities(runs: Sequence[Run]) -> np.ndarray:
         return np.zeros(nv, bool)
     fitted = [fitted_velocity(r.qpos, r.dt, r.configuration) for r in runs]
     usual = _rms(np.concatenate(fitted))
-    derived = [estimate_noise(replace(run, qvel_measured=False)) for run in runs]
-    slack = 3 * np.median(derived, 0)[nv:]
+    noise = np.median([estimate_noise(run) for run in runs], 0)
+    slack = 3 * slope_noise(step) * noise[:nv]
     off = _rms(np.concatenate([r.qvel - x for r, x in zip(runs, fitted, strict=True)]))
     agrees = off <= np.maximum(_AGREES * usual, slack)
     moved = [_mean_velocity(run, 1) for run in runs]
     between = [0.5 * (run.qvel[:-1] + run.qvel[1:]) for run in runs]
     apart = [a - b for a, b in zip(between, moved, strict=True)]
-    noise = np.median([estimate_noise(run) for run in runs], 0)
     made = np.hypot(math.sqrt(2.0) * noise[:nv] / step, noise[nv:] / math.sqrt(2.0))
 
     def tenth(moved: np.ndarray) -> np.ndarray:

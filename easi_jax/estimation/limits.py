@@ -109,15 +109,8 @@ def edge(unit: jax.Array, information: jax.Array) -> jax.Array:
     return np.log(_SURE / (1.0 - _SURE)) + jnp.maximum(jnp.log(plateau / dip), 0.0)
 
 
-def beyond_edges(unit: jax.Array, limits: jax.Array, most: jax.Array) -> jax.Array:
+def beyond_edge(unit: jax.Array, limits: jax.Array, most: jax.Array) -> jax.Array:
     """``unit (n,)`` with ``limits (n,)`` on the plateau beyond the edge of a dip, at
     ``most (n,)``."""
     middle = jnp.minimum(most, jnp.maximum(0.5, unit + _INSIDE))
     return jnp.where(limits, middle, unit)
-
-
-def beyond_edge(space: ParameterSpace, unit: jax.Array, way: jax.Array) -> jax.Array:
-    """``unit (n,)`` with the limit ``way`` on the plateau; as it is where ``way`` is
-    negative."""
-    here = jnp.arange(space.size) == way
-    return beyond_edges(unit, here, space.unit_bounds[1])

@@ -98,10 +98,10 @@ def polish(
     starts = paired.unmoved if starts is None else starts
     # The fit itself, and on, then each limit: as a scan, so that a look is compiled
     # once. Exact data dig no dips.
-    ways = [i for i in limits.of(space) if i < space.size - doubts]
-    limited = bool(ways) and paired.free_starts
-    ways = [_FIRST, _ON, *ways] if limited else [_FIRST]
-    fit = _Steps(paired, weight, known, most, limited)
+    own = tuple(i for i in limits.of(space) if i < space.size - doubts)
+    own = own if paired.free_starts else ()
+    ways = [_FIRST, _ON, *own] if own else [_FIRST]
+    fit = _Steps(paired, weight, known, most, own)
     begin = fit.begin(unit, starts)
     end, simulated = jax.lax.scan(fit.trip, begin, jnp.array(ways))
     unit, starts, told = end.best
@@ -132,14 +132,14 @@ class _Steps:
         weight: of each measured number, ``(M, H, 2 nv)``.
         known: information before any data of a coordinate about 0, ``(n,)``.
         looks: at most.
-        limited: whether limits are looked at as well.
+        limits: parameters that are looked at on their plateaus as well.
     """
 
     paired: PairedFit
     weight: jax.Array
     known: jax.Array
     looks: int
-    limited: bool = False
+    limits: tuple[int, ...] = ()
 
     def begin(self, unit: jax.Array, starts: jax.Array) -> _Look:
         """Before anything was looked at."""
@@ -172,15 +172,15 @@ class _Steps:
         first = way == _FIRST
         unit, starts, told = found.best
         met = ~limits.unmet(told.hessian)
-        place = limits.beyond_edge(self.paired.space, unit, way)
-        apart = met[way] & (place != unit).any()
-        on = way == _ON
-        some = met[jnp.array(limits.of(self.paired.space), int)].any()
+        here, most = jnp.arange(unit.size) == way, self.paired.space.unit_bounds[1]
+        place = limits.beyond_edge(unit, here, most)
+        going = first | met[way] & (place != unit).any()
         tried = jnp.asarray(0)
-        if self.limited:
-            place = jax.lax.cond(on & some, self.nearby, lambda _: place, found)
-            tried = jnp.where(on & some, len(self.moves), 0)
-        going = first | jnp.where(on, some, apart)
+        if self.limits:
+            on = (way == _ON) & met[np.array(self.limits)].any()
+            place = jax.lax.cond(on, self.nearby, lambda _: place, found)
+            tried = jnp.where(on, len(self.moves), 0)
+            going |= on
         fresh = replace(
             found,
             k=jnp.asarray(0),
@@ -207,7 +207,7 @@ class _Steps:
     def moves(self) -> np.ndarray:
         """Of none, then of single limits, ``(K, n)``."""
         space = self.paired.space
-        ways = np.eye(space.size)[limits.of(space)]
+        ways = np.eye(space.size)[list(self.limits)]
         moved = np.concatenate([_MOVES, -_MOVES])[:, None, None] * ways
         return np.vstack([np.zeros(space.size), *moved])
 

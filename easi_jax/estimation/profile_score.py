@@ -28,7 +28,7 @@ from easi_jax.estimation.least_squares import (
     moved,
     raised_to_range,
 )
-from easi_jax.estimation.limits import EDGE, beyond_edges
+from easi_jax.estimation.limits import EDGE, beyond_edge
 from easi_jax.estimation.normal_equations import RESOLVED, PairedFit
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.slopes import shift_start
@@ -315,7 +315,7 @@ class _Root:
         """From where it begins; then from what was found, with that beyond its limit
         which was held."""
         edges = found.held
-        beyond = beyond_edges(found.here[0], edges, self.space.unit_bounds[1])
+        beyond = beyond_edge(found.here[0], edges, self.space.unit_bounds[1])
         begun = jnp.where(again, beyond, found.at)
         phase = jnp.where(edges.any(), _FIRST, _DONE)
         start = replace(

@@ -5,13 +5,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
-from easi_jax.data.cleaning import to_common_step
+from easi_jax.data.cleaning import to_common_step, true_readings
 from easi_jax.data.noise import finest
 from easi_jax.data.recording import Run
 from easi_jax.estimation.from_runs import _Finish
+from easi_jax.model.found_effects import EffectEntry
 from easi_jax.model.joint_space import Configuration
 
 SIGMA = np.array([1e-3, 2e-2])
@@ -61,6 +63,18 @@ def test_noise_is_as_it_was_told(why: str) -> None:
         runs = to_common_step([run, recorded(dt=0.02)])[0]
     steps = 5 if why == "few steps" else 25
     np.testing.assert_allclose(learned(runs, steps, why == "given"), TOLD, rtol=1e-6)
+
+
+def test_what_was_interpolated_once_stays_so() -> None:
+    """Also where an offset is taken out of its readings afterwards."""
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><joint name="a" type="slide"/>'
+        '<geom size=".1" mass="1"/></body></worldbody></mujoco>'
+    )
+    entry = EffectEntry("sensor_bias", "a", "joint", {"bias": 0.1}, {})
+    fine, coarse = recorded(), recorded(dt=0.02)
+    runs = true_readings(model, to_common_step([fine, coarse])[0], [entry])
+    assert [run.smoothed for run in runs] == [False, True]
 
 
 def test_resolution_is_the_least_that_any_run_tells() -> None:

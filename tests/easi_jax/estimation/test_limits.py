@@ -61,8 +61,9 @@ def test_limits_are_known_by_their_addresses() -> None:
     )
     assert of(named) == [0, 2]
     here = jnp.array([0.2, 0.9, 0.2])
-    assert beyond_edge(named, here, jnp.asarray(0)).tolist() > here.tolist()
-    assert (beyond_edge(named, here, jnp.asarray(-1)) == here).all()
+    most = named.unit_bounds[1]
+    assert beyond_edge(here, jnp.arange(3) == 0, most).tolist() > here.tolist()
+    assert (beyond_edge(here, jnp.arange(3) == -1, most) == here).all()
 
 
 def test_a_narrow_dip_has_to_be_deeper() -> None:

@@ -71,7 +71,7 @@ def test_a_limit_is_known_where_its_dip_is_deep(
 def test_a_limit_beyond_a_kink_is_looked_for_nearby(paired: Any) -> None:
     """By costs alone: the nearest to the dip of what halves of a quarter lead to."""
     fit = paired(DEEP)
-    steps = _Steps(fit, fit.weight, jnp.zeros(2), 8)
+    steps = _Steps(fit, fit.weight, jnp.zeros(2), 8, (1,))
     begun = steps.begin(jnp.array([0.6, 0.2]), fit.unmoved)
     near = jax.jit(steps.nearby)(begun)
     assert near.tolist() == pytest.approx([0.6, 0.2 + 0.125])
