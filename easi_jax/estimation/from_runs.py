@@ -19,7 +19,7 @@ from easi_jax.data.scales import scales_of
 from easi_jax.data.segments import Segments, to_device
 from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
 from easi_jax.devices import distributed
-from easi_jax.devices.mesh import make_mesh, placed, replicated
+from easi_jax.devices.mesh import placed
 from easi_jax.devices.runtime import quick_compile
 from easi_jax.estimation import limits
 from easi_jax.estimation.blocks import FEWEST, enough
@@ -46,8 +46,6 @@ from easi_jax.estimation.problem import Problem
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.search.config import SearchConfig
 from easi_jax.search.easi import Search, SearchData
-from easi_jax.simulation import open_loop
-from easi_jax.simulation.slopes import shift_start
 
 Tell = Callable[[str], None]
 
@@ -234,7 +232,6 @@ class _Finish:
         nv, count = simulator.mj_model.nv, len(self.sensors)
         seen = np.concatenate([np.ones(nv), problem.measured, np.ones(count)])
         self.hidden = jnp.asarray(np.where(seen > 0, 0.0, np.inf), self.told.dtype)
-        self.mesh = search.mesh or make_mesh()
 
     def compile(self) -> None:
         """Compiles both programs beside each other; the second where it is needed."""
@@ -287,13 +284,12 @@ class _Finish:
         known: Any,
         robust: Any,
         near: Any,
-    ) -> tuple[Estimate, jax.Array]:
-        """A fit from ``mean``, and what it leaves."""
-        found = begun(
+    ) -> Estimate:
+        """A fit from ``mean``."""
+        return begun(
             *(self.paired(pieces, misfit, known), mean, cov, self.refined),
             *(self.search.config.informed_spread, robust, near, self.restarts),
         )
-        return found, self.errors(found, pieces)
 
     def end(
         self,
@@ -303,25 +299,11 @@ class _Finish:
         whole: Any,
         misfit: Any,
         known: Any,
-    ) -> tuple[Estimate, jax.Array]:
+    ) -> Estimate:
         """The last steps, on all pieces and with ``doubts``."""
         informed = self.search.config.informed_spread
         given = self.paired(whole, misfit, known), center, cov, informed
-        found = polished(*given, doubts=doubts)
-        return found, self.errors(found, whole, doubts)
-
-    def errors(
-        self, found: Estimate, pieces: Segments, doubts: Doubts | None = None
-    ) -> jax.Array:
-        """Measured less predicted, from the fitted starts, ``(M, H, 2 nv + N)``."""
-        simulator, space, unit = self.simulator, self.search.space, found.fit
-        if doubts is not None:
-            simulator, space = doubts.simulator, doubts.space
-            unit = space.clip(jnp.concatenate([unit, found.doubts[:, 0]]))
-        model = simulator.model(space.to_si(unit))
-        # Whole on every device: one of them calls native MuJoCo, out here.
-        starts = replicated(shift_start(simulator, pieces, found.delta), self.mesh)
-        return open_loop.errors_from(simulator, model, starts, pieces)
+        return polished(*given, doubts=doubts)
 
     def passes(self, mean: Any, cov: Any) -> tuple[Estimate, jax.Array]:
         """The finish of one search, and the weights that its pieces end with."""
@@ -336,9 +318,9 @@ class _Finish:
         for k in range(passes):
             robust, near = 0 if k else _ROBUST, k > 0
             given = center, cov, weighed, misfit, self.known(noise), robust, near
-            found, error = distributed.local(self._fit(*placed(given)))
-            noise = self.learned(error)
-            misfit, weight = self.judged(error, weighed, pieces, noise)
+            found = distributed.local(self._fit(*placed(given)))
+            noise = self.learned(found.residuals)
+            misfit, weight = self.judged(found, weighed, pieces, noise)
             weighed = replace(pieces, weight=pieces.weight * weight)
             center = jax.block_until_ready(found.fit)
             self.tell(f"least-squares finish: pass {k + 1} of {passes}")
@@ -376,9 +358,9 @@ class _Finish:
             lost = self.limited & np.asarray(limits.unmet(last.found.hessian))
             at = jnp.where(lost, begun, at)
             given = at, cov, last.weighed, last.misfit, known
-            found, error = distributed.local(self.ending(doubts)(*placed(given)))
-            noise = self.learned(error)
-            misfit, weight = self.judged(error, last.weighed, self.whole, noise)
+            found = distributed.local(self.ending(doubts)(*placed(given)))
+            noise = self.learned(found.residuals)
+            misfit, weight = self.judged(found, last.weighed, self.whole, noise)
             weighed = replace(self.whole, weight=self.whole.weight * weight)
             found = jax.block_until_ready(found)
             last = _Last(found, weight, weighed, misfit, noise, begun)
@@ -414,13 +396,14 @@ class _Finish:
 
     def judged(
         self,
-        error: jax.Array,
+        found: Estimate,
         weighed: Segments,
         pieces: Segments,
         noise: jax.Array,
     ) -> tuple[jax.Array, jax.Array]:
         """What the model errs by, and new weights, from what a fit leaves."""
         assumed = effective_noise(self.simulator, pieces, noise)
+        error = found.residuals
         misfit = misfit_of(error, assumed, weighed.weight)
         misfit = jnp.maximum(misfit, self.hidden)
         return misfit, outlier_weights(error, assumed, misfit, _OUTLIER)
@@ -477,7 +460,7 @@ class _Finish:
                 *(replace(self.whole, weight=mine), found.misfit),
                 (found.noise, found.start),
             )
-            alone = distributed.local(end(*placed(given)))[0]
+            alone = distributed.local(end(*placed(given)))
             notes += _contradiction(self.search.space, name, alone, found)
         return notes
 

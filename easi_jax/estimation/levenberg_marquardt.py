@@ -74,6 +74,7 @@ class RefineResult:
         simulated: control steps simulated, ``()``; a derivative counts as one more.
         gradients: of each piece at ``unit``, ``(M, n)``; none, ``(0, n)``, where the
             fit has only begun (`easi_jax.estimation.polish` tells them).
+        residuals: predicted minus measured, seen last at ``unit``, ``(M, H, 2 nv)``.
     """
 
     unit: jax.Array
@@ -85,6 +86,7 @@ class RefineResult:
     excess: jax.Array
     simulated: jax.Array
     gradients: jax.Array
+    residuals: jax.Array
 
 
 def refine(
@@ -129,6 +131,7 @@ def refine(
         excess=weights.excess(best.pieces, fit.weight),
         simulated=1.0 * fit.points * paired.segments.count * steps.sum(),
         gradients=jnp.zeros((0, unit.size)),
+        residuals=best.residuals,
     )
 
 
@@ -190,6 +193,7 @@ class _Place:
     reach: limits.Reach
     pieces: jax.Array  # their costs
     hessian: jax.Array  # of the place before
+    residuals: jax.Array  # likewise
 
 
 @flax.struct.dataclass
@@ -269,7 +273,7 @@ class _Fit:
     def place(self, unit: jax.Array, shift: jax.Array) -> _Place:
         """Where a stage begins."""
         n, fresh = self.space.size, limits.Reach.fresh(self.space)
-        none = jnp.ones(len(shift)), jnp.zeros((n, n))
+        none = jnp.ones(len(shift)), jnp.zeros((n, n)), jnp.zeros(self.weight.shape)
         return _Place(unit, shift, jnp.asarray(1e-3), fresh, *none)
 
     def stage(self, found: _Found, item: _Stage) -> tuple[_Found, Any]:
@@ -384,6 +388,7 @@ class _Fit:
             reach=_where(moving, told, reach),
             pieces=each[best],
             hessian=eq.hessian,
+            residuals=eq.residuals,
         )
         shown = jnp.where(now.first, home, 0)
         return new, each[shown].sum() + self.prior(units[shown])

@@ -43,6 +43,7 @@ class Normal:
             simulation is not finite, which leaves no other trace here.
         start_step: ``(M, S)`` correction of each start at zero parameter step.
         start_gain: ``(M, S, n)``: correction per unit of parameter step.
+        residuals: predicted minus measured, ``(M, H, 2 nv)``.
     """
 
     hessian: jax.Array
@@ -50,6 +51,15 @@ class Normal:
     costs: jax.Array
     start_step: jax.Array
     start_gain: jax.Array
+    residuals: jax.Array
+
+    @classmethod
+    def nothing(cls, size: int, starts: jax.Array, weight: jax.Array) -> "Normal":
+        """Zeros for ``size`` parameters, starts like ``starts (M, S)``, and as many
+        measured numbers as ``weight (M, H, 2 nv)``."""
+        m, s = starts.shape
+        shapes = (size, size), (m, size), (m,), (m, s), (m, s, size), weight.shape
+        return cls(*(jnp.zeros(shape, starts.dtype) for shape in shapes))
 
     @property
     def gradient(self) -> jax.Array:
@@ -189,7 +199,7 @@ class PairedFit:
         if not self.free_starts:
             both = given.T @ given
             still = jnp.zeros(len(d)), jnp.zeros((len(d), n))
-            return both[:n, :n], both[:n, n], cost, *still
+            return both[:n, :n], both[:n, n], cost, *still, r
         # Of a start something is known, too: a shift of one deviation costs 1/2. What
         # starts explain is taken off before squares are summed, for a broad one
         # explains nearly all of it.
@@ -200,11 +210,10 @@ class PairedFit:
         left = jnp.concatenate([given - b @ follow, known - follow])
         both = left.T @ left
         step = -size[:, None] * follow
-        return both[:n, :n], both[:n, n], cost, step[:, n], step[:, :n]
+        return both[:n, :n], both[:n, n], cost, step[:, n], step[:, :n], r
 
     def _summed(self, parts: Any) -> Normal:
-        hess, grad, cost, step, gain = parts
-        return Normal(hess.sum(0), grad, cost, step, gain)
+        return Normal(parts[0].sum(0), *parts[1:])
 
     def _cost(self, r: jax.Array, d: jax.Array, w: jax.Array) -> jax.Array:
         square = jnp.where(w > 0, w * (r / self.noise) ** 2, 0.0).sum()

@@ -120,6 +120,7 @@ def polish(
         excess=excess(jnp.where(end.used, told.costs, jnp.inf), weight),
         simulated=whole * simulated.sum(),
         gradients=told.gradients,
+        residuals=told.residuals,
     )
 
 
@@ -143,8 +144,7 @@ class _Steps:
 
     def begin(self, unit: jax.Array, starts: jax.Array) -> _Look:
         """Before anything was looked at."""
-        like = jax.eval_shape(self.paired.normal, unit, starts, self.weight)
-        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+        nothing = Normal.nothing(unit.size, starts, self.weight)
         return _Look(
             k=jnp.asarray(0),
             progressed=jnp.asarray(0),

@@ -52,6 +52,8 @@ class Estimate:
         simulated: control steps simulated since the search, ``()``; a derivative
             counts as one more.
         pieces: M segments that all this is about, with their weights.
+        residuals: predicted minus measured, ``(M, H, 2 nv)``, where the fit looked
+            last: before its score was adjusted or doubts went beyond their bounds.
         misfit: what the model errs by in every step, ``(2 nv,)``, beyond the noise.
         start: what was known of starts, standard deviations ``(S,)``.
         doubts: of effects that the model may lack, means and standard deviations in
@@ -70,6 +72,7 @@ class Estimate:
     excess: jax.Array
     simulated: jax.Array
     pieces: Segments
+    residuals: jax.Array
     misfit: jax.Array
     start: jax.Array
     doubts: jax.Array
@@ -206,6 +209,7 @@ def _of_search(
         excess=left,
         simulated=simulated,
         gradients=jnp.zeros((0, mean.size)),
+        residuals=eq.residuals,
     )
     stated = (center, spread) if informed else (mean, cov)
     return _stated(paired, ended, mean, cov, *stated)
@@ -253,6 +257,7 @@ def _stated(
         excess=fit.excess,
         simulated=fit.simulated,
         pieces=paired.segments,
+        residuals=fit.residuals,
         misfit=jnp.zeros_like(noise) if misfit is None else misfit,
         start=paired.spread,
         doubts=jnp.zeros((0, 2)),

@@ -25,7 +25,9 @@ def predict(
     """
     # Nothing but a controller reads it.
     model = simulator.without_sense(model)
-    return _predicted(simulator, model, segments, steps, False)[:2]
+    return jax.vmap(lambda s: _predicted(simulator, model, s, steps, False)[:2])(
+        segments
+    )
 
 
 def predict_sensed(
@@ -36,54 +38,52 @@ def predict_sensed(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """`predict`, and what is sensed in the first and the last physics step of each
     control step, ``(M, H, 2, N)``; zero where nothing is simulated."""
-    return _predicted(simulator, model, segments, steps, True)
+    return jax.vmap(lambda s: _predicted(simulator, model, s, steps, True))(segments)
 
 
 def _predicted(
     simulator: Simulator,
     model: Any,
-    segments: Segments,
+    s: Segments,
     steps: int | jax.Array | None,
     senses: bool,
 ) -> tuple[jax.Array, jax.Array, Any]:
-    def one(s: Segments) -> Any:
-        ctrl, act, past = s.ctrl, s.act, s.past
+    """Of one segment ``s``, without an axis for it."""
+    ctrl, act, past = s.ctrl, s.act, s.past
 
-        def step(state: Any, u: jax.Array) -> Any:
-            if senses:
-                state, sensed = simulator.sensed_step(model, state, u)
-            else:
-                state, sensed = simulator.step(model, state, u), ()
-            return state, (state.qpos, state.qvel, sensed)
+    def step(state: Any, u: jax.Array) -> Any:
+        if senses:
+            state, sensed = simulator.sensed_step(model, state, u)
+        else:
+            state, sensed = simulator.step(model, state, u), ()
+        return state, (state.qpos, state.qvel, sensed)
 
-        known = None if isinstance(act, tuple) else act
-        first = simulator.start(s.qpos, s.qvel, act=known)
-        if not isinstance(first.time, tuple) and not isinstance(s.time, tuple):
-            first = dataclasses.replace(first, time=s.time, hidden=s.hidden)
-        if not senses:
-            first = dataclasses.replace(first, sensed=())
-        if not isinstance(past, tuple):
-            first = simulator.after(model, first, past)
-        at_once = simulator.replay(model, first, ctrl, steps)
-        if at_once is not None:
-            return at_once
-        if steps is None:
-            return jax.lax.scan(step, first, ctrl)[1]
-        nothing = jnp.zeros((2, *first.sensed.shape)) if senses else ()
-        begun = jax.tree.map(
-            lambda x: jnp.broadcast_to(x, (ctrl.shape[0], *x.shape)),
-            (first.qpos, first.qvel, nothing),
-        )
+    known = None if isinstance(act, tuple) else act
+    first = simulator.start(s.qpos, s.qvel, act=known)
+    if not isinstance(first.time, tuple) and not isinstance(s.time, tuple):
+        first = dataclasses.replace(first, time=s.time, hidden=s.hidden)
+    if not senses:
+        first = dataclasses.replace(first, sensed=())
+    if not isinstance(past, tuple):
+        first = simulator.after(model, first, past)
+    at_once = simulator.replay(model, first, ctrl, steps)
+    if at_once is not None:
+        return at_once
+    if steps is None:
+        return jax.lax.scan(step, first, ctrl)[1]
+    nothing = jnp.zeros((2, *first.sensed.shape)) if senses else ()
+    begun = jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (ctrl.shape[0], *x.shape)),
+        (first.qpos, first.qvel, nothing),
+    )
 
-        def at(i: jax.Array, carry: Any) -> Any:
-            state, seen = step(carry[0], ctrl[i])
-            put = jax.tree.map(lambda row, x: row.at[i].set(x), carry[1], seen)
-            return state, put
+    def at(i: jax.Array, carry: Any) -> Any:
+        state, seen = step(carry[0], ctrl[i])
+        put = jax.tree.map(lambda row, x: row.at[i].set(x), carry[1], seen)
+        return state, put
 
-        end = jnp.asarray(steps)
-        return jax.lax.fori_loop(jnp.zeros_like(end), end, at, (first, begun))[1]
-
-    return jax.vmap(one)(segments)
+    end = jnp.asarray(steps)
+    return jax.lax.fori_loop(jnp.zeros_like(end), end, at, (first, begun))[1]
 
 
 def prediction_residuals(
@@ -92,8 +92,12 @@ def prediction_residuals(
     states: tuple[jax.Array, jax.Array],
 ) -> jax.Array:
     """States minus the reference prediction, ``(M, H, 2 nv)``."""
-    difference = jax.vmap(jax.vmap(simulator.difference))
-    return difference(reference[0], reference[1], states[0], states[1])
+    return jax.vmap(lambda a, b: _between(simulator, a, b))(reference, states)
+
+
+def _between(simulator: Simulator, reference: Any, states: Any) -> jax.Array:
+    """Of one segment, ``(H, 2 nv)``."""
+    return jax.vmap(simulator.difference)(*reference, *states)
 
 
 def errors(simulator: Simulator, model: Any, segments: Segments) -> jax.Array:
@@ -110,21 +114,31 @@ def errors_from(
     steps: int | jax.Array | None = None,
 ) -> jax.Array:
     """`errors` of what is predicted from other starts; ``steps`` as in `predict`."""
+
+    def one(start: Segments, seen: Segments) -> jax.Array:
+        return error_from(simulator, model, start, seen, steps)
+
+    return jax.vmap(one)(starts, measured)
+
+
+def error_from(
+    simulator: Simulator,
+    model: Any,
+    start: Segments,
+    measured: Segments,
+    steps: int | jax.Array | None = None,
+) -> jax.Array:
+    """`errors_from` of one segment, without an axis for it."""
     target = (measured.next_qpos, measured.next_qvel)
     if not _senses(measured):
-        return prediction_residuals(
-            simulator, predict(simulator, model, starts, steps), target
-        )
-    *states, each = predict_sensed(simulator, model, starts, steps)
+        model = simulator.without_sense(model)
+        states = _predicted(simulator, model, start, steps, False)[:2]
+        return _between(simulator, states, target)
+    *states, each = _predicted(simulator, model, start, steps, True)
     reading: Any = simulator.base.sense
     sensed = reading.alike(reading.chosen(each), measured.sensed)
-    return jnp.concatenate(
-        [
-            prediction_residuals(simulator, (states[0], states[1]), target),
-            measured.sensed - sensed,
-        ],
-        -1,
-    )
+    error = _between(simulator, states, target)
+    return jnp.concatenate([error, measured.sensed - sensed], -1)
 
 
 def _senses(segments: Segments) -> bool:

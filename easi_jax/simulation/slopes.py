@@ -29,10 +29,10 @@ _MOVE = 1e-5
 
 
 def shift_start(simulator: Simulator, seg: Segments, delta: jax.Array) -> Segments:
-    """Segments with starts moved by tangent vectors ``(M, 2 nv)``, or by these and
-    changes of their activations, ``(M, 2 nv + na)``."""
+    """Segments, or one, with starts moved by tangent vectors ``(..., 2 nv)``, or by
+    these and changes of their activations, ``(..., 2 nv + na)``."""
     nv = simulator.mj_model.nv
-    along, speed, act = jnp.split(delta, (nv, 2 * nv), axis=1)
+    along, speed, act = jnp.split(delta, (nv, 2 * nv), axis=-1)
     return replace(
         seg,
         qpos=simulator.move(seg.qpos, along),
@@ -92,9 +92,10 @@ def _linearized(
         return _residuals(simulator, space, unit + x[:n], moved, piece, steps)
 
     if simulator.engine == "mjx":
+        # One simulation for residuals and slopes.
         zero = jnp.zeros(n + along_start)
-        pushed = jax.vmap(lambda v: jax.jvp(at, (zero,), (v,))[1])(jnp.eye(len(zero)))
-        return at(zero), jnp.moveaxis(pushed, 0, -1)
+        pushed = jax.vmap(lambda v: jax.jvp(at, (zero,), (v,)), out_axes=(None, -1))
+        return pushed(jnp.eye(len(zero)))
     parts, turn = parts_and_turns(simulator, piece, along_start)
     most = int(turn.max(initial=-1)) + 1
     moves = np.eye(n + most, n + along_start)
@@ -136,10 +137,9 @@ def _residuals(
     piece: Segments,
     steps: int | jax.Array | None,
 ) -> jax.Array:
-    one = jax.tree.map(lambda x: x[None], piece)
-    moved = shift_start(simulator, one, shift[None])
+    moved = shift_start(simulator, piece, shift)
     model = simulator.model(space.to_si(unit))
-    return -open_loop.errors_from(simulator, model, moved, one, steps)[0]
+    return -open_loop.error_from(simulator, model, moved, piece, steps)
 
 
 def _precisely(simulator: Simulator, run: Callable[..., Any], *args: Any) -> Any:
