@@ -67,6 +67,12 @@ class Score:
     expected: jax.Array
     delta: jax.Array
 
+    @classmethod
+    def nothing(cls, size: int, starts: jax.Array) -> "Score":
+        """Zeros for ``size`` parameters and starts like ``starts (M, 2 nv)``."""
+        shapes = (size, size), (size,), (size,), (size, size), (), ()
+        return cls(*(jnp.zeros(shape) for shape in shapes), jnp.zeros_like(starts))
+
     @property
     def surplus(self) -> jax.Array:
         """Cost above its average, ``()``."""
@@ -135,7 +141,6 @@ class ProfileFit(PairedFit):
 
         def one(item: Any) -> Any:
             s, w, e = item
-            at = jax.tree.map(lambda x: x[None], s)
 
             def fitted(s: Segments) -> Any:
                 def turn(d: jax.Array, _: Any) -> Any:
@@ -154,8 +159,8 @@ class ProfileFit(PairedFit):
                 k, e = item
                 d, r, jac = real
                 first, later = e[0] * spread[0], e[1:] * spread[1]
-                new = shift_start(self.simulator, at, (d + first)[None])
-                new = self._measured(jax.tree.map(lambda x: x[0], new), r + later)
+                new = shift_start(self.simulator, s, d + first)
+                new = self._measured(new, r + later)
                 new = jax.tree.map(lambda x, y: jnp.where(k, x, y), new, s)
                 *found, parts = fitted(new)
                 # The truth of what is made is known: its score is zero on average.
@@ -165,8 +170,8 @@ class ProfileFit(PairedFit):
                 real = jax.tree.map(lambda x, y: jnp.where(k, x, y), real, tuple(found))
                 return real, (*parts[:3], over, known)
 
-            none = jax.eval_shape(lambda: fitted(s)[:3])
-            none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), none)
+            none = most, w, jnp.broadcast_to(w[..., None], (*w.shape, ways))
+            none = jax.tree.map(jnp.zeros_like, none)
             drawn = jnp.arange(1 + len(e)) > 0
             e = jnp.concatenate([0.0 * e[:1], e])
             real, (hess, *rest) = jax.lax.scan(draw, none, (drawn, e))
@@ -176,7 +181,7 @@ class ProfileFit(PairedFit):
             scatter = _scatter(over + known) + _scatter(over) / len(over)
             return hess[0], grad[0], bias, scatter, cost[0], expected, real[0]
 
-        most = _FARTHEST * self.noise
+        most, ways = _FARTHEST * self.noise, self._directions
         hess, grad, bias, scatter, cost, expected, delta = self._each(
             one, 1 + self._directions, weight, draws
         )
@@ -277,8 +282,7 @@ class _Root:
 
     def begin(self, unit: jax.Array, spread: jax.Array) -> _Carry:
         """At ``unit (n,)``, before anything was looked at."""
-        shapes = jax.eval_shape(self.score, unit, spread)
-        none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        none = Score.nothing(unit.size, self.fit.unmoved)
         return _Carry(
             phase=jnp.asarray(_NOISE),
             k=jnp.asarray(0),
