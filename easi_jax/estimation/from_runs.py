@@ -286,10 +286,15 @@ class _Finish:
         near: Any,
     ) -> Estimate:
         """A fit from ``mean``."""
-        return begun(
-            *(self.paired(pieces, misfit, known), mean, cov, self.refined),
+        paired = self.paired(pieces, misfit, known)
+        found = begun(
+            *(paired, mean, cov, self.refined),
             *(self.search.config.informed_spread, robust, near, self.restarts),
         )
+        if self.refined:
+            return found
+        # Its starts are corrected once, which nothing has looked at.
+        return replace(found, residuals=paired.residuals(found.fit, found.delta))
 
     def end(
         self,

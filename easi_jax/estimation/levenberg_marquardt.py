@@ -74,7 +74,8 @@ class RefineResult:
         simulated: control steps simulated, ``()``; a derivative counts as one more.
         gradients: of each piece at ``unit``, ``(M, n)``; none, ``(0, n)``, where the
             fit has only begun (`easi_jax.estimation.polish` tells them).
-        residuals: predicted minus measured, seen last at ``unit``, ``(M, H, 2 nv)``.
+        residuals: predicted minus measured at ``unit``, ``(M, H, 2 nv + N)``, from the
+            starts that the last corrections in ``delta`` were made of.
     """
 
     unit: jax.Array

@@ -43,7 +43,7 @@ class Normal:
             simulation is not finite, which leaves no other trace here.
         start_step: ``(M, S)`` correction of each start at zero parameter step.
         start_gain: ``(M, S, n)``: correction per unit of parameter step.
-        residuals: predicted minus measured, ``(M, H, 2 nv)``.
+        residuals: predicted minus measured, ``(M, H, 2 nv + N)``.
     """
 
     hessian: jax.Array
@@ -242,6 +242,11 @@ class PairedFit:
 
         shifts = jnp.swapaxes(delta, 0, 1)
         return self._each(one, unit.shape[0], shifts, weight).T
+
+    def residuals(self, unit: jax.Array, delta: jax.Array) -> jax.Array:
+        """Predicted minus measured ``(M, H, 2 nv + N)``, at ``unit (n,)`` and ``delta
+        (M, S)``."""
+        return self._each(lambda item: self._residual(unit, item[1], item[0]), 1, delta)
 
     @property
     def points(self) -> int:

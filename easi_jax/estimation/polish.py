@@ -8,7 +8,8 @@ Of a limit that nothing meets the data say only that it is no lower. Noise digs 
 into the edge of such a plateau: a value there may fit a little better, and its
 curvature looks like knowledge. So every limit that is met is put onto the plateau as
 well, with all else fitted anew, and stays there unless the dip is surely better
-(`easi_jax.estimation.limits`).
+(`easi_jax.estimation.limits`). Of limits that the data know well a look at the cost
+there says beforehand that nothing can make up for it.
 """
 
 from dataclasses import dataclass, replace
@@ -45,6 +46,9 @@ _SHORTER, _LONGER = 0.3, 3.0  # share of its step that a start takes, likewise
 _FIRST, _ON = -1, -2  # in place of a limit
 _MOVES = 0.25 * 0.5 ** np.arange(8)[::-1]  # initial ranges, that a limit is moved by
 _HOPING = 2  # looks in vain at a plateau
+# Of the cost, that a plateau is worse by with all else held, over the share of it that
+# all else cannot take up: ten times what an edge has to be better by, and no hope.
+_HOPEFUL = 30.0
 _NEARER = 0.5  # of what a place is worse by, that each look at a plateau leaves at most
 
 
@@ -64,9 +68,9 @@ class _Look:
     least: jax.Array  # cost of the best place
     seen: jax.Array  # information at the place looked at last
     cost: jax.Array
-    rival: (
-        jax.Array
-    )  # cost of a place that it is compared with; inf where there is none
+    # Cost of a place that it is compared with; inf where there is none.
+    rival: jax.Array
+    rise: jax.Array  # of the cost on the plateau of each limit, with all else held
 
 
 def polish(
@@ -159,6 +163,7 @@ class _Steps:
             seen=nothing.hessian,
             cost=jnp.full(self.looks, jnp.inf),
             rival=jnp.asarray(jnp.inf),
+            rise=jnp.zeros(unit.size),
         )
 
     def trip(self, found: _Look, way: jax.Array) -> tuple[_Look, jax.Array]:
@@ -174,12 +179,16 @@ class _Steps:
         met = ~limits.unmet(told.hessian)
         here, most = jnp.arange(unit.size) == way, self.paired.space.unit_bounds[1]
         place = limits.beyond_edge(unit, here, most)
-        going = first | met[way] & (place != unit).any()
+        hopeful = self.hopeful(told, found.rise)
+        going = first | (met & hopeful)[way] & (place != unit).any()
         tried = jnp.asarray(0)
         if self.limits:
             on = (way == _ON) & met[np.array(self.limits)].any()
-            place = jax.lax.cond(on, self.nearby, lambda _: place, found)
-            tried = jnp.where(on, len(self.moves), 0)
+            place, rise = jax.lax.cond(
+                on, self.nearby, lambda found: (place, found.rise), found
+            )
+            found = replace(found, rise=rise)
+            tried = jnp.where(on, len(self.moves) + len(self.limits), 0)
             going |= on
         fresh = replace(
             found,
@@ -211,16 +220,28 @@ class _Steps:
         moved = np.concatenate([_MOVES, -_MOVES])[:, None, None] * ways
         return np.vstack([np.zeros(space.size), *moved])
 
-    def nearby(self, found: _Look) -> jax.Array:
+    def hopeful(self, told: Normal, rise: jax.Array) -> jax.Array:
+        """Limits whose plateaus may be as likely as the best place, ``(n,)`` bool."""
+        hessian = told.hessian + jnp.diag(jnp.maximum(self.known, _PULL))
+        alone = jnp.diag(hessian) * jnp.diag(jnp.linalg.inv(hessian))
+        return ~(rise > _HOPEFUL * jnp.maximum(alone, 1.0))
+
+    def nearby(self, found: _Look) -> tuple[jax.Array, jax.Array]:
         """The place of least cost among the best one and those with a limit moved a
         little, ``(n,)``: where a limit moves past what single rows need, the cost has
-        kinks, at which steps end."""
+        kinks, at which steps end. And `_Look.rise`."""
         unit, starts, _ = found.best
-        units = self.paired.space.clip(unit + jnp.asarray(self.moves, unit.dtype))
+        space, count = self.paired.space, len(self.moves)
+        own = np.eye(space.size, dtype=bool)[list(self.limits)]
+        flat = limits.beyond_edge(unit, jnp.asarray(own), space.unit_bounds[1])
+        units = space.clip(unit + jnp.asarray(self.moves, unit.dtype))
+        units = jnp.concatenate([units, flat])
         shifts = jnp.broadcast_to(starts, (len(units), *starts.shape))
         weight = self.weight * found.used[:, None, None]
         each = self.paired.costs(units, shifts, weight)
-        return units[jnp.argmin(jnp.where(found.used, each, 0.0).sum(1))]
+        cost = jnp.where(found.used, each, 0.0).sum(1)
+        rise = found.rise.at[np.array(self.limits)].set(cost[count:] - cost[0])
+        return units[jnp.argmin(cost[:count])], rise
 
     def step(
         self, at: jax.Array, told: Normal, damping: Any, loose: Any = False
@@ -288,4 +309,5 @@ class _Steps:
             seen=eq.hessian,
             cost=jnp.where(here & stepping, cost, c.cost),
             rival=c.rival,
+            rise=c.rise,
         )

@@ -52,8 +52,9 @@ class Estimate:
         simulated: control steps simulated since the search, ``()``; a derivative
             counts as one more.
         pieces: M segments that all this is about, with their weights.
-        residuals: predicted minus measured, ``(M, H, 2 nv)``, where the fit looked
-            last: before its score was adjusted or doubts went beyond their bounds.
+        residuals: predicted minus measured, ``(M, H, 2 nv + N)``, at the best place
+            that was looked at: before its score was adjusted, or doubts went beyond
+            their bounds, or what nothing refines had its starts corrected.
         misfit: what the model errs by in every step, ``(2 nv,)``, beyond the noise.
         start: what was known of starts, standard deviations ``(S,)``.
         doubts: of effects that the model may lack, means and standard deviations in

@@ -29,10 +29,13 @@ def misfit_of(error: jax.Array, noise: jax.Array, weight: jax.Array) -> jax.Arra
     that count as one, ``H var(mean of a segment) / var(step)``.
 
     Args:
-        error: ``(M, H, 2 nv)``.
+        error: ``(M, H, 2 nv)``; a segment that is not finite counts nothing.
         weight: of each segment, ``(M,)``.
     """
-    share = weight / weight.sum()
+    fine = _finite(error)
+    error = jnp.where(fine[:, None, None], error, 0.0)
+    weight = jnp.where(fine, weight, 0.0)
+    share = weight / jnp.maximum(weight.sum(), 1e-30)
     square = jnp.einsum("m,mhc->c", share, error**2) / error.shape[1]
     together = error.shape[1] * (share @ error.mean(1) ** 2)
     alike = jnp.clip(together / jnp.maximum(square, 1e-30), 1.0, error.shape[1])
@@ -75,7 +78,15 @@ def outlier_weights(
 ) -> jax.Array:
     """Weight of each segment ``(M,)``: 1, or less beyond ``limit`` median errors.
 
-    Huber's weight on the RMS over a segment of the error in units of its expectation.
+    Huber's weight on the RMS over a segment of the error in units of its expectation;
+    0 of what is not finite.
     """
     expected = noise**2 + misfit**2
-    return huber(jnp.sqrt((error**2 / expected).mean((1, 2))), limit)
+    size = jnp.sqrt((error**2 / expected).mean((1, 2)))
+    fine = _finite(error)
+    return jnp.where(fine, huber(jnp.where(fine, size, jnp.nan), limit), 0.0)
+
+
+def _finite(error: jax.Array) -> jax.Array:
+    """Which segments of ``error (M, H, n)`` are, ``(M,)`` bool."""
+    return jnp.isfinite(error).all((1, 2))

@@ -48,9 +48,9 @@ def times_noise(excess: jax.Array, weight: jax.Array) -> jax.Array:
 
 def huber(size: A, limit: float) -> A:
     """Huber's weight of each error by its ``size (M,)``: less than 1 beyond ``limit``
-    median sizes."""
+    median sizes; NaN of one that is."""
     xp = array_module(size)
-    return xp.minimum(1.0, limit * xp.median(size) / xp.maximum(size, 1e-30))
+    return xp.minimum(1.0, limit * xp.nanmedian(size) / xp.maximum(size, 1e-30))
 
 
 def robust(costs: jax.Array, used: jax.Array) -> jax.Array:

@@ -347,6 +347,8 @@ def test_misfit_counts_only_what_noise_does_not_explain():
     steady = jnp.broadcast_to(3 * white[:, :1], white.shape)  # the same in each step
     expected = np.sqrt((9 - 1) * 30)
     np.testing.assert_allclose(misfit_of(steady, noise, ones), expected, rtol=0.15)
+    broken = steady.at[:20, 4].set(jnp.nan)
+    np.testing.assert_allclose(misfit_of(broken, noise, ones), expected, rtol=0.15)
 
 
 def test_noise_is_what_errors_leave_white():
@@ -369,6 +371,9 @@ def test_outliers_weigh_less():
     weight = outlier_weights(error, jnp.ones(2), jnp.zeros(2), 2.5)
     np.testing.assert_allclose(weight[4], 2.5 / 20, rtol=1e-5)
     np.testing.assert_allclose(np.delete(np.asarray(weight), 4), 1.0)
+    broken = error.at[:6, 3].set(jnp.inf)
+    weight = outlier_weights(broken, jnp.ones(2), jnp.zeros(2), 2.5)
+    np.testing.assert_allclose(weight, [0.0] * 6 + [1.0] * 3)
 
 
 def test_an_end_row_that_the_others_do_not_follow_from_is_left_out() -> None:

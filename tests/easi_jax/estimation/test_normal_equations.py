@@ -17,6 +17,8 @@ from easi_jax.estimation.identifiability import (
 from easi_jax.estimation.normal_equations import Normal, PairedFit
 from easi_jax.model.parameters import Parameter, ParameterSpace
 from easi_jax.simulation import open_loop
+from easi_jax.simulation.simulator import Simulator
+from easi_jax.simulation.slopes import shift_start
 from envs.cartpole import Cartpole
 
 NOISE = jnp.array([5e-4, 2e-3, 1e-2, 2e-2])
@@ -59,8 +61,11 @@ def test_steps_that_weigh_nothing_need_no_simulation(
     def normal(steps: jax.Array) -> Normal:
         return replace(fit, steps=steps).normal(unit, shift, weight)
 
+    begun, all_steps = (
+        replace(n, residuals=n.residuals[:, :2]) for n in (normal(2), normal(6))
+    )
     for few, whole in zip(
-        jax.tree.leaves(normal(2)), jax.tree.leaves(normal(6)), strict=True
+        jax.tree.leaves(begun), jax.tree.leaves(all_steps), strict=True
     ):
         np.testing.assert_allclose(few, whole, rtol=1e-4, atol=1e-6 * abs(whole).max())
     model = simulator.model(space.to_si(unit))
@@ -70,6 +75,29 @@ def test_steps_that_weigh_nothing_need_no_simulation(
         np.testing.assert_allclose(found[:, :2], all_[:, :2], rtol=1e-5, atol=1e-6)
         np.testing.assert_array_equal(found[:, 2:], start[:, None].repeat(4, 1))
         assert np.abs(all_[:, 2:] - start[:, None]).max() > 1e-2
+
+
+def test_residuals_are_those_of_the_moved_starts(
+    cartpole: Cartpole, trajectories: Segments
+) -> None:
+    """Of one look and by themselves, as a plain simulation has them."""
+    seg, space = windows(trajectories, 6, 6).spread(8), cartpole.space
+    simulator = Simulator(cartpole.mj_model, space, cartpole.dt, engine="mujoco")
+    fit, unit = PairedFit(simulator, space, seg, NOISE), jnp.full(space.size, 0.6)
+    shift = NOISE * jax.random.normal(jax.random.key(0), (8, 4))
+
+    @jax.jit
+    def every() -> tuple[jax.Array, ...]:
+        moved = shift_start(simulator, seg, shift)
+        model = simulator.model(space.to_si(unit))
+        error = open_loop.errors_from(simulator, model, moved, seg)
+        look = fit.normal(unit, shift, fit.weight)
+        return look.residuals, fit.residuals(unit, shift), -error
+
+    looked, alone, expected = every()
+    assert np.abs(expected).max() > 1e-2
+    np.testing.assert_allclose(looked, expected, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(alone, expected, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Limits in dips that noise may have dug: with numbers in place of a simulation."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -73,7 +74,7 @@ def test_a_limit_beyond_a_kink_is_looked_for_nearby(paired: Any) -> None:
     fit = paired(DEEP)
     steps = _Steps(fit, fit.weight, jnp.zeros(2), 8, (1,))
     begun = steps.begin(jnp.array([0.6, 0.2]), fit.unmoved)
-    near = jax.jit(steps.nearby)(begun)
+    near, _ = jax.jit(steps.nearby)(begun)
     assert near.tolist() == pytest.approx([0.6, 0.2 + 0.125])
 
 
@@ -86,3 +87,18 @@ def test_a_better_place_where_it_is_met_is_taken(paired: Any) -> None:
 def test_what_nothing_meets_stays_where_it_is(paired: Any) -> None:
     found = ended(paired(DEEP), 0.5)
     assert float(found.unit[1]) == 0.5 and float(found.hessian[1, 1]) == 0.0
+
+
+def test_a_limit_that_is_surely_met_costs_no_looks_at_its_plateau(paired: Any) -> None:
+    """The cost there, with all else held, says so beforehand."""
+    looks = [float(ended(paired(depth), 0.29).simulated) for depth in (20.0, 60.0)]
+    assert looks[1] < looks[0]
+    fit = paired(DEEP)
+    steps = _Steps(fit, fit.weight, jnp.zeros(2), 8, (1,))
+    begun = steps.begin(jnp.array([0.6, EDGE]), fit.unmoved)
+    _, rise = jax.jit(steps.nearby)(begun)
+    assert rise.tolist() == pytest.approx([0.0, 0.0], abs=1e-3)  # at its edge
+    low = replace(begun, best=(begun.unit.at[1].set(EDGE - STD), *begun.best[1:]))
+    _, rise = jax.jit(steps.nearby)(low)
+    off = (2.0 * DEEP / (3 * PIECES)) ** 0.5 - 1.0
+    assert float(rise[1]) == pytest.approx(DEEP - 0.5 * 3 * PIECES * off**2, rel=0.01)

@@ -84,7 +84,7 @@ class Bench:
             excess=jnp.zeros(()),
             simulated=jnp.zeros(()),
             pieces=pieces,
-            residuals=jnp.zeros((1, 1, 4)),
+            residuals=jnp.zeros((1, 3, 4)),
             misfit=jnp.zeros(4),
             start=noise,
             doubts=jnp.zeros((0, 2)),
