@@ -45,6 +45,7 @@ _DAMPING = Damping(falls=0.1, rises=10.0, wakes=1e-2)
 _SHORTER, _LONGER = 0.3, 3.0  # share of its step that a start takes, likewise
 _FIRST, _ON = -1, -2  # in place of a limit
 _MOVES = 0.25 * 0.5 ** np.arange(8)[::-1]  # initial ranges, that a limit is moved by
+_AT_REST = 0.1  # of the cost: what steps after a fit has settled gain at most
 _HOPING = 2  # looks in vain at a plateau
 # Of the cost, that a plateau is worse by with all else held, over the share of it that
 # all else cannot take up: ten times what an edge has to be better by, and no hope.
@@ -70,6 +71,7 @@ class _Look:
     cost: jax.Array
     # Cost of a place that it is compared with; inf where there is none.
     rival: jax.Array
+    settled: jax.Array  # whether steps would gain next to nothing more
     rise: jax.Array  # of the cost on the plateau of each limit, with all else held
 
 
@@ -163,6 +165,7 @@ class _Steps:
             seen=nothing.hessian,
             cost=jnp.full(self.looks, jnp.inf),
             rival=jnp.asarray(jnp.inf),
+            settled=jnp.asarray(False),
             rise=jnp.zeros(unit.size),
         )
 
@@ -171,8 +174,8 @@ class _Steps:
         plateau of a limit: the likelier end of both, and simulations of each piece.
 
         Args:
-            way: which limit; `_FIRST` or `_ON`. It goes on so that a plateau is not
-                praised for what any more steps would have gained.
+            way: which limit; `_FIRST` or `_ON`. Where it had not settled it goes on, so
+                that a plateau is not praised for what any more steps would have gained.
         """
         first = way == _FIRST
         unit, starts, told = found.best
@@ -189,7 +192,7 @@ class _Steps:
             )
             found = replace(found, rise=rise)
             tried = jnp.where(on, len(self.moves) + len(self.limits), 0)
-            going |= on
+            going |= on & (~found.settled | (place != unit).any())
         fresh = replace(
             found,
             k=jnp.asarray(0),
@@ -240,8 +243,9 @@ class _Steps:
         weight = self.weight * found.used[:, None, None]
         each = self.paired.costs(units, shifts, weight)
         cost = jnp.where(found.used, each, 0.0).sum(1)
+        least = jnp.where(jnp.arange(count) > 0, _AT_REST, 0.0)
         rise = found.rise.at[np.array(self.limits)].set(cost[count:] - cost[0])
-        return units[jnp.argmin(cost[:count])], rise
+        return units[jnp.argmin(cost[:count] + least)], rise
 
     def step(
         self, at: jax.Array, told: Normal, damping: Any, loose: Any = False
@@ -285,7 +289,8 @@ class _Steps:
         # Parameters may be right while the starts are still as they were measured.
         rough = jnp.where(alone, _STARTED, _ROUNDING)
         still = is_settled(jnp.abs(c.least - cost), cost, _SETTLED, rough)
-        done = ~stepping | (still & (foretold < _SETTLED)) | (c.k + 1 >= self.looks)
+        settled = still & (foretold < _SETTLED)
+        done = ~stepping | settled | (c.k + 1 >= self.looks)
         done |= c.k - progressed >= _STALE
         worse = jnp.maximum(c.least - c.rival, 0.0)
         hopeless = cost - c.rival > _NEARER * worse + limits.EDGE
@@ -309,5 +314,6 @@ class _Steps:
             seen=eq.hessian,
             cost=jnp.where(here & stepping, cost, c.cost),
             rival=c.rival,
+            settled=jnp.where(stepping, settled & (rough * cost < _AT_REST), c.settled),
             rise=c.rise,
         )
