@@ -191,7 +191,7 @@ def without(fit: RefineResult, count: int) -> tuple[RefineResult, jax.Array]:
     scaled = whole * size[:, None] * size + 1e-6 * jnp.eye(n + count)
     variance = jnp.diag(jnp.linalg.inv(scaled)) * size**2
     told = jnp.stack([fit.unit[n:], jnp.sqrt(variance[n:])], 1)
-    slopes = fit.gradients
+    slopes, gain = fit.gradients, fit.gain
     reduced = replace(
         fit,
         unit=fit.unit[:n],
@@ -199,6 +199,7 @@ def without(fit: RefineResult, count: int) -> tuple[RefineResult, jax.Array]:
         raised=fit.raised[:n],
         raised_hessian=less(fit.raised_hessian),
         gradients=slopes[:, :n] - slopes[:, n:] @ held(fit.hessian),
+        gain=gain[..., :n] - gain[..., n:] @ held(fit.hessian),
     )
     return reduced, told
 

@@ -76,6 +76,8 @@ class RefineResult:
             fit has only begun (`easi_jax.estimation.polish` tells them).
         residuals: predicted minus measured at ``unit``, ``(M, H, 2 nv + N)``, from the
             starts that the last corrections in ``delta`` were made of.
+        gain: corrections of the starts per unit of parameter step, ``(M, S, n)``; none,
+            ``(0, S, n)``, where the fit has only begun.
     """
 
     unit: jax.Array
@@ -88,6 +90,7 @@ class RefineResult:
     simulated: jax.Array
     gradients: jax.Array
     residuals: jax.Array
+    gain: jax.Array
 
 
 def refine(
@@ -133,6 +136,7 @@ def refine(
         simulated=1.0 * fit.points * paired.segments.count * steps.sum(),
         gradients=jnp.zeros((0, unit.size)),
         residuals=best.residuals,
+        gain=jnp.zeros((0, best.shift.shape[1], unit.size)),
     )
 
 

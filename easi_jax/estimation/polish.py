@@ -127,6 +127,7 @@ def polish(
         simulated=whole * simulated.sum(),
         gradients=told.gradients,
         residuals=told.residuals,
+        gain=told.start_gain,
     )
 
 

@@ -1,7 +1,7 @@
 """From the end of a search to an honest distribution over parameters."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import flax.struct
 import jax
@@ -10,6 +10,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from easi_jax.data.segments import Segments
+from easi_jax.estimation import limits
 from easi_jax.estimation.blocks import scattered
 from easi_jax.estimation.doubts import Doubts, without
 from easi_jax.estimation.levenberg_marquardt import RefineResult, refine
@@ -26,6 +27,8 @@ RESTARTS = 2  # of the finish on noisy data, where it has more than one minimum
 _SHARP = 1.0 / 3.0  # of a value: its standard deviation where logarithms will do
 _FAR = 3.0  # standard deviations
 _KNOWN = 0.5  # of the initial range's top: a standard deviation that says something
+_SURELY = 3.0  # of the cost, that a place is worse by: 20 to 1
+_WAY = 0.0, 0.125, 0.25, 0.5, 1.0  # from a fit to its mean with the initial range
 _HIDDEN = 0.1  # of what a model errs by, that a parameter takes up unseen
 UNSTATED = 2.0  # times the noise, that a model errs by with all doubts
 # Of a uniform initial range, unit coordinates.
@@ -98,7 +101,8 @@ def estimate(
     open, ``(F + prior)^-1`` with F the Fisher information of the pieces and the initial
     range as prior. The mean is that of both, too: a direction that the data do not show
     keeps the initial spread about the middle of the initial range, wherever the search
-    has drifted to. Where the fit leaves more than the noise
+    has drifted to; but not where that leads out of a bent valley (`_Whole.likelier`).
+    Where the fit leaves more than the noise
     explains, the model lacks something, and the information counts for less
     (`_trusted`). Without ``informed`` it is the search's own covariance alone.
     What may be as good as zero is stated as `_near_zero` says.
@@ -174,13 +178,14 @@ def polished(
     if doubts is not None:
         wider = replace(paired, simulator=doubts.simulator, space=doubts.space)
         begin = jnp.concatenate([center, jnp.zeros(doubts.count)])
-        fit, told = without(polish(wider, begin, doubts.count, starts), doubts.count)
-        found = _of_fit(paired, fit, center, cov, informed)
+        all_ = polish(wider, begin, doubts.count, starts)
+        fit, told = without(all_, doubts.count)
+        found = _of_fit(paired, fit, center, cov, informed, _Whole(wider, all_))
         return replace(found, doubts=told, doubted=doubts.parameters)
     fit = polish(paired, center, starts=starts)
     if adjusted:
         fit = _adjusted(paired, fit)
-    return _of_fit(paired, fit, center, cov, informed)
+    return _of_fit(paired, fit, center, cov, informed, _Whole(paired, fit))
 
 
 def _floored(paired: PairedFit) -> PairedFit:
@@ -211,6 +216,7 @@ def _of_search(
         simulated=simulated,
         gradients=jnp.zeros((0, mean.size)),
         residuals=eq.residuals,
+        gain=eq.start_gain,
     )
     stated = (center, spread) if informed else (mean, cov)
     return _stated(paired, ended, mean, cov, *stated)
@@ -222,18 +228,63 @@ def _of_fit(
     mean: jax.Array,
     cov: jax.Array,
     informed: bool,
+    whole: "_Whole | None" = None,
 ) -> Estimate:
-    """What is stated of a fit, after a search that ended at ``mean``, ``cov``."""
+    """What is stated of a fit, after a search that ended at ``mean``, ``cov``.
+
+    Args:
+        whole: the fit with all that was fitted, where it has come to its end.
+    """
 
     def said(information: jax.Array) -> tuple[jax.Array, jax.Array]:
         known = _posterior(information)
         return _near_zero(paired.space, fit.unit, fit.raised, *known)
 
     # What predicts best, whatever it stands in for.
-    center = said(fit.raised_hessian)[0]
+    center = paired.space.clip(said(fit.raised_hessian)[0])
+    if whole is not None:
+        center = whole.likelier(center, fit.raised)
     left = scattered(fit.raised_hessian, fit.hessian, fit.gradients)
     spread = said(left * _trusted(fit.excess))[1]
     return _stated(paired, fit, mean, cov, center, spread if informed else cov)
+
+
+@dataclass(frozen=True)
+class _Whole:
+    """A fit with all that was fitted: parameters, then effects in doubt.
+
+    Attributes:
+        paired: the pieces, and what simulates them.
+        fit: where it ended.
+    """
+
+    paired: PairedFit
+    fit: RefineResult
+
+    def likelier(self, center: jax.Array, fitted: jax.Array) -> jax.Array:
+        """The mean of fit and initial range ``center (n,)``, or as far on the way there
+        from the fit ``fitted (n,)`` as is not surely less likely by data and prior.
+
+        Data that know products of parameters know a bent valley, in which a straight
+        line towards the middle of the range soon predicts far worse. Starts and effects
+        in doubt follow as the fit's slopes say. What the data say nothing of by itself
+        costs nothing, and goes all of the way.
+        """
+        paired, fit, n = self.paired, self.fit, center.size
+        fitted = jnp.where(limits.unmet(fit.hessian)[:n], center, fitted)
+        own = fit.hessian[n:, n:] + jnp.eye(len(fit.unit) - n)
+        units = fitted + jnp.asarray(_WAY)[:, None] * (center - fitted)
+        gone = units - fit.unit[:n]
+        others = -jnp.linalg.solve(own, fit.hessian[n:, :n] @ gone.T).T
+        step = jnp.concatenate([gone, others], 1)
+        starts = fit.delta + jnp.einsum("msn,kn->kms", fit.gain, step)
+        each = paired.costs(fit.unit + step, starts, paired.weight)
+        cost = jnp.where(jnp.isfinite(each[0]), each, 0.0).sum(1)
+        cost += 0.5 * jnp.sum((units - _MIDDLE) ** 2, 1) / _INITIAL_VARIANCE
+        likely = cost < cost[0] + _SURELY
+        # As far as all before are likely, too; all of the way as it was given.
+        last = jnp.argmin(jnp.append(likely[1:], False))
+        return jnp.where(last == len(_WAY) - 1, center, units[last])
 
 
 def _stated(

@@ -106,7 +106,7 @@ def test_what_is_said_of_parameters_whatever_the_effects_are() -> None:
     unit = jnp.arange(5.0)
     slopes = jnp.asarray(root, jnp.float32)
     numbers = unit, info, zero, zero, unit, 2 * info, zero, zero
-    fit = RefineResult(*numbers, slopes, zero)
+    fit = RefineResult(*numbers, slopes, zero, jnp.zeros((1, 2, 5)))
     reduced, effects = without(fit, 2)
     own = np.asarray(info)[3:, 3:] + np.eye(2)
     less = root[:, :3] - root[:, 3:] @ np.linalg.solve(own, np.asarray(info)[3:, :3])

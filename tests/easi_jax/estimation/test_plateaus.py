@@ -10,6 +10,8 @@ import pytest
 from easi_jax.data.segments import Segments
 from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.polish import _Steps, polish
+from easi_jax.estimation.posterior import polished
+from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import slopes
 from easi_jax.simulation.simulator import Simulator
 from envs.cartpole import Cartpole
@@ -102,3 +104,39 @@ def test_a_limit_that_is_surely_met_costs_no_looks_at_its_plateau(paired: Any) -
     _, rise = jax.jit(steps.nearby)(low)
     off = (2.0 * DEEP / (3 * PIECES)) ** 0.5 - 1.0
     assert float(rise[1]) == pytest.approx(DEEP - 0.5 * 3 * PIECES * off**2, rel=0.01)
+
+
+@pytest.mark.parametrize("bend", [0.0, 20.0])
+def test_the_mean_stays_in_a_bent_valley(
+    monkeypatch: pytest.MonkeyPatch, cartpole: Cartpole, bend: float
+) -> None:
+    """Where data know a sum of two parameters, the mean goes along it to the middle of
+    the range; where they know a bent line, only as far as that predicts."""
+    space = cartpole.space.select(["cart_kp", "cart_kv", "cart_force_limit"])
+    simulator = Simulator(cartpole.mj_model, space, cartpole.dt)
+
+    def bare(simulator: Simulator, space: ParameterSpace, unit: Any, *rest: Any) -> Any:
+        gain, damping, _ = unit - jnp.array([0.8, 0.2, 0.0])
+        known = gain + damping + bend * (gain - damping) ** 2
+        return jnp.full((3, 4), known)
+
+    monkeypatch.setattr(slopes, "_residuals", bare)
+    pieces = Segments(
+        qpos=jnp.zeros((PIECES, 2)),
+        qvel=jnp.zeros((PIECES, 2)),
+        ctrl=jnp.zeros((PIECES, 3, 1)),
+        next_qpos=jnp.zeros((PIECES, 3, 2)),
+        next_qvel=jnp.zeros((PIECES, 3, 2)),
+        weight=jnp.ones(PIECES),
+    )
+    fit = PairedFit(simulator, space, pieces, jnp.full(4, STD))
+    fitted = jnp.array([0.8, 0.2, 0.9])
+    found = jax.jit(lambda u: polished(fit, u, 0.01 * jnp.eye(3)))(fitted)
+    mean = found.distribution.mean
+    assert float(mean[2]) == pytest.approx(0.5, abs=0.01)  # nobody knows the limit
+    if bend:
+        off = mean[0] + mean[1] - 1.0 + bend * (mean[0] - mean[1] - 0.6) ** 2
+        assert float(off) ** 2 * 3 * 4 * PIECES / 2 < 4.0 * STD**2
+        assert mean[:2].tolist() == pytest.approx([0.8, 0.2], abs=0.05)
+    else:
+        assert mean[:2].tolist() == pytest.approx([0.5, 0.5], abs=0.01)
