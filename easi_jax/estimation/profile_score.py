@@ -70,8 +70,8 @@ class Score:
     @classmethod
     def nothing(cls, size: int, starts: jax.Array) -> "Score":
         """Zeros for ``size`` parameters and starts like ``starts (M, 2 nv)``."""
-        shapes = (size, size), (size,), (size,), (size, size), (), ()
-        return cls(*(jnp.zeros(shape) for shape in shapes), jnp.zeros_like(starts))
+        shapes = (size, size), (size,), (size,), (size, size), (), (), starts.shape
+        return cls(*(jnp.zeros(shape, starts.dtype) for shape in shapes))
 
     @property
     def surplus(self) -> jax.Array:
