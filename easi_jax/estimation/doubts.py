@@ -173,33 +173,36 @@ def _sets(address: str, name: str, fields: Sequence[str]) -> bool:
     return name in parts and not set(fields).isdisjoint(parts)
 
 
+def followed(hessian: jax.Array, n: int) -> jax.Array:
+    """How effects of a prior of 1 follow the first ``n`` of what ``hessian`` is about,
+    the parameters, ``(k, n)``."""
+    own = hessian[n:, n:] + jnp.eye(len(hessian) - n)
+    return -jnp.linalg.solve(own, hessian[n:, :n])
+
+
 def without(fit: RefineResult, count: int) -> tuple[RefineResult, jax.Array]:
     """A fit with ``count`` effects of a prior of 1, reduced to the parameters: what it
     says of them whatever the effects are; and means and standard deviations of these,
     ``(k, 2)``."""
     n = len(fit.unit) - count
 
-    def held(hessian: jax.Array) -> jax.Array:
-        own = hessian[n:, n:] + jnp.eye(count)
-        return jnp.linalg.solve(own, hessian[n:, :n])
-
     def less(hessian: jax.Array) -> jax.Array:
-        return hessian[:n, :n] - hessian[:n, n:] @ held(hessian)
+        return hessian[:n, :n] + hessian[:n, n:] @ followed(hessian, n)
 
     whole = fit.hessian + jnp.diag(jnp.where(jnp.arange(n + count) < n, 0.0, 1.0))
     size = 1.0 / jnp.sqrt(jnp.maximum(jnp.diag(whole), 1e-12))
     scaled = whole * size[:, None] * size + 1e-6 * jnp.eye(n + count)
     variance = jnp.diag(jnp.linalg.inv(scaled)) * size**2
     told = jnp.stack([fit.unit[n:], jnp.sqrt(variance[n:])], 1)
-    slopes, gain = fit.gradients, fit.gain
+    slopes, gain, follow = fit.gradients, fit.gain, followed(fit.hessian, n)
     reduced = replace(
         fit,
         unit=fit.unit[:n],
         hessian=less(fit.hessian),
         raised=fit.raised[:n],
         raised_hessian=less(fit.raised_hessian),
-        gradients=slopes[:, :n] - slopes[:, n:] @ held(fit.hessian),
-        gain=gain[..., :n] - gain[..., n:] @ held(fit.hessian),
+        gradients=slopes[:, :n] + slopes[:, n:] @ follow,
+        gain=gain[..., :n] + gain[..., n:] @ follow,
     )
     return reduced, told
 

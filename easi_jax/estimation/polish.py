@@ -180,13 +180,13 @@ class _Steps:
         """
         first = way == _FIRST
         unit, starts, told = found.best
-        met = ~limits.unmet(told.hessian)
-        here, most = jnp.arange(unit.size) == way, self.paired.space.unit_bounds[1]
-        place = limits.beyond_edge(unit, here, most)
-        hopeful = self.hopeful(told, found.rise)
-        going = first | (met & hopeful)[way] & (place != unit).any()
-        tried = jnp.asarray(0)
+        place, going, tried = unit, first, jnp.asarray(0)
         if self.limits:
+            met = ~limits.unmet(told.hessian)
+            here, most = jnp.arange(unit.size) == way, self.paired.space.unit_bounds[1]
+            place = limits.beyond_edge(unit, here, most)
+            hopeful = met & self.hopeful(told, found.rise)
+            going |= hopeful[way] & (place != unit).any()
             on = (way == _ON) & met[np.array(self.limits)].any()
             place, rise = jax.lax.cond(
                 on, self.nearby, lambda found: (place, found.rise), found

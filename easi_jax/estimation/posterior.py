@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 from easi_jax.data.segments import Segments
 from easi_jax.estimation import limits
 from easi_jax.estimation.blocks import scattered
-from easi_jax.estimation.doubts import Doubts, without
+from easi_jax.estimation.doubts import Doubts, followed, without
 from easi_jax.estimation.levenberg_marquardt import RefineResult, refine
 from easi_jax.estimation.normal_equations import RESOLVED, PairedFit
 from easi_jax.estimation.pieces import effective_noise, finish_pieces, finish_rest
@@ -102,10 +102,9 @@ def estimate(
     range as prior. The mean is that of both, too: a direction that the data do not show
     keeps the initial spread about the middle of the initial range, wherever the search
     has drifted to; but not where that leads out of a bent valley (`_Whole.likelier`).
-    Where the fit leaves more than the noise
-    explains, the model lacks something, and the information counts for less
-    (`_trusted`). Without ``informed`` it is the search's own covariance alone.
-    What may be as good as zero is stated as `_near_zero` says.
+    Where the fit leaves more than the noise explains, the model lacks something, and
+    the information counts for less (`_trusted`). Without ``informed`` it is the search's
+    own covariance alone. What may be as good as zero is stated as `_near_zero` says.
 
     Args:
         paired: the pieces, their noise as it is measured.
@@ -243,7 +242,8 @@ def _of_fit(
     # What predicts best, whatever it stands in for.
     center = paired.space.clip(said(fit.raised_hessian)[0])
     if whole is not None:
-        center = whole.likelier(center, fit.raised)
+        center = whole.likelier(center, fit)
+        fit = replace(fit, simulated=fit.simulated + whole.simulated)
     left = scattered(fit.raised_hessian, fit.hessian, fit.gradients)
     spread = said(left * _trusted(fit.excess))[1]
     return _stated(paired, fit, mean, cov, center, spread if informed else cov)
@@ -261,9 +261,16 @@ class _Whole:
     paired: PairedFit
     fit: RefineResult
 
-    def likelier(self, center: jax.Array, fitted: jax.Array) -> jax.Array:
+    @property
+    def simulated(self) -> float:
+        """Control steps that `likelier` simulates."""
+        pieces = self.paired.segments
+        return 1.0 * len(_WAY) * pieces.count * pieces.horizon
+
+    def likelier(self, center: jax.Array, own: RefineResult) -> jax.Array:
         """The mean of fit and initial range ``center (n,)``, or as far on the way there
-        from the fit ``fitted (n,)`` as is not surely less likely by data and prior.
+        from the fit, of which ``own`` is the parameters' part, as is not surely less
+        likely by data and prior.
 
         Data that know products of parameters know a bent valley, in which a straight
         line towards the middle of the range soon predicts far worse. Starts and effects
@@ -271,13 +278,11 @@ class _Whole:
         costs nothing, and goes all of the way.
         """
         paired, fit, n = self.paired, self.fit, center.size
-        fitted = jnp.where(limits.unmet(fit.hessian)[:n], center, fitted)
-        own = fit.hessian[n:, n:] + jnp.eye(len(fit.unit) - n)
+        fitted = jnp.where(limits.unmet(fit.hessian)[:n], center, own.raised)
         units = fitted + jnp.asarray(_WAY)[:, None] * (center - fitted)
-        gone = units - fit.unit[:n]
-        others = -jnp.linalg.solve(own, fit.hessian[n:, :n] @ gone.T).T
-        step = jnp.concatenate([gone, others], 1)
-        starts = fit.delta + jnp.einsum("msn,kn->kms", fit.gain, step)
+        gone = units - own.unit
+        step = jnp.concatenate([gone, gone @ followed(fit.hessian, n).T], 1)
+        starts = own.delta + jnp.einsum("msn,kn->kms", own.gain, gone)
         each = paired.costs(fit.unit + step, starts, paired.weight)
         cost = jnp.where(jnp.isfinite(each[0]), each, 0.0).sum(1)
         cost += 0.5 * jnp.sum((units - _MIDDLE) ** 2, 1) / _INITIAL_VARIANCE
