@@ -103,8 +103,9 @@ def estimate(
     keeps the initial spread about the middle of the initial range, wherever the search
     has drifted to; but not where that leads out of a bent valley (`_Whole.likelier`).
     Where the fit leaves more than the noise explains, the model lacks something, and
-    the information counts for less (`_trusted`). Without ``informed`` it is the search's
-    own covariance alone. What may be as good as zero is stated as `_near_zero` says.
+    the information counts for less (`_trusted`). Without ``informed`` it is the
+    search's own covariance alone. What may be as good as zero is stated as `_near_zero`
+    says.
 
     Args:
         paired: the pieces, their noise as it is measured.
