@@ -43,6 +43,7 @@ from easi_jax.estimation.prediction_error import (
     white_noise,
 )
 from easi_jax.estimation.problem import Problem
+from easi_jax.estimation.weights import step_weights
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.search.config import SearchConfig
 from easi_jax.search.easi import Search, SearchData
@@ -53,8 +54,10 @@ _HELD_WINDOWS, _FIT_WINDOWS = 200, 96  # that errors are measured on, at most
 # Pieces of a generation at least, and physics steps that are worth their time; a piece
 # of a larger robot tells more, and each of its steps takes longer.
 _SEARCH, _WIDE_SEARCH = (16, 500_000), (4, 100_000)
-_PASSES = 3  # of the finish: the model's own error is learned from the one before
-_ENDINGS = 2  # on all pieces, with all doubts
+# At most, of the finish: the model's own error is learned from the one before. And on
+# all pieces, with all doubts.
+_PASSES, _ENDINGS = 3, 2
+_ALIKE = 0.1  # of what readings count: to less than that it is learned already
 _ROBUST = 12  # rounds of the first pass; later ones know which pieces fit badly
 _LACKING = 1.5  # times wider spreads, that are worth a note
 _FINISH = 0.5  # s, of pieces in the least-squares finish
@@ -322,13 +325,17 @@ class _Finish:
         passes = _PASSES - 1 if fewer else _PASSES
         for k in range(passes):
             robust, near = 0 if k else _ROBUST, k > 0
-            given = center, cov, weighed, misfit, self.known(noise), robust, near
+            known = self.known(noise)
+            given = center, cov, weighed, misfit, known, robust, near
             found = distributed.local(self._fit(*placed(given)))
             noise = self.learned(found.residuals)
+            before = self.counted(weighed, known, misfit)
             misfit, weight = self.judged(found, weighed, pieces, noise)
             weighed = replace(pieces, weight=pieces.weight * weight)
             center = jax.block_until_ready(found.fit)
-            self.tell(f"least-squares finish: pass {k + 1} of {passes}")
+            self.tell(f"least-squares finish: pass {k + 1} of at most {passes}")
+            if self.alike(before, self.counted(weighed, self.known(noise), misfit)):
+                break
         if not self.refined or self.lost(found):
             return replace(found, search_mean=mean, search_cov=cov), weight
         if fewer:
@@ -365,12 +372,14 @@ class _Finish:
             given = at, cov, last.weighed, last.misfit, known
             found = distributed.local(self.ending(doubts)(*placed(given)))
             noise = self.learned(found.residuals)
+            before = self.counted(last.weighed, known, last.misfit)
             misfit, weight = self.judged(found, last.weighed, self.whole, noise)
             weighed = replace(self.whole, weight=self.whole.weight * weight)
             found = jax.block_until_ready(found)
             last = _Last(found, weight, weighed, misfit, noise, begun)
-            self.tell(f"on all of the logs{what}: pass {k + 1} of {_ENDINGS}")
-            if self.lost(found) or over(found):
+            self.tell(f"on all of the logs{what}: pass {k + 1} of at most {_ENDINGS}")
+            now = self.counted(weighed, self.known(noise), misfit)
+            if self.lost(found) or over(found) or self.alike(before, now):
                 break
         return last
 
@@ -412,6 +421,18 @@ class _Finish:
         misfit = misfit_of(error, assumed, weighed.weight)
         misfit = jnp.maximum(misfit, self.hidden)
         return misfit, outlier_weights(error, assumed, misfit, _OUTLIER)
+
+    def counted(self, pieces: Segments, known: Any, misfit: jax.Array) -> np.ndarray:
+        """What each reading counts in a fit, ``(M, H, 2 nv + N)``."""
+        paired = self.paired(pieces, misfit, known)
+        noise = np.asarray(effective_noise(self.simulator, pieces, paired.noise))
+        weight = np.asarray(step_weights(pieces, jnp.asarray(noise), misfit))
+        return weight / noise**2
+
+    def alike(self, before: np.ndarray, now: np.ndarray) -> bool:
+        """Whether readings count what they did, so that a fit would be the same."""
+        moved, size = np.abs(now - before).sum((0, 1)), before.sum((0, 1))
+        return bool((moved <= _ALIKE * size).all())
 
     def notes(self, found: Estimate, weight: jax.Array) -> list[str]:
         """What fits badly, and what the model lacks."""

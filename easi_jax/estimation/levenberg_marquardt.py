@@ -3,7 +3,7 @@
 Maximum likelihood under independent measurement noise: parameters and the true start of
 every segment are fitted together by Levenberg-Marquardt (derivatives:
 `easi_jax.estimation.normal_equations`; steps: `easi_jax.estimation.least_squares`).
-Each round tries several dampings, and jumps of single parameters
+Each round tries several dampings, and jumps of limits and the like
 (`easi_jax.estimation.limits`). In the first rounds pieces that fit far worse than most
 count less (`easi_jax.estimation.weights`). A first stage fits only the beginning of
 each piece: over few milliseconds errors are nearly linear in the parameters, while over
@@ -350,7 +350,7 @@ class _Fit:
         # What met no limit: to where the first piece would. And starts that were bent,
         # so that none had to be met: as measured.
         bent = item.dropping & weights.far_worse(at.pieces, self.weight)
-        down = self.space.clip(at.unit - at.reach.raised[1, : unmet.size])
+        down = at.reach.down(self.space, at.unit)
         last = replace(
             at,
             unit=jnp.where(item.dropping & unmet, down, at.unit),

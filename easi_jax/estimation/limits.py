@@ -6,6 +6,8 @@ is put back onto the plateau, where nothing is known of it
 (`easi_jax.estimation.polish`). The common scale of all masses and forces jumps as well.
 """
 
+from collections.abc import Callable
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -19,16 +21,20 @@ _UNSEEN = 1.0  # information of a unit coordinate: nothing
 _FARTHEST = 0.8, 2.5  # jump that is tried, in initial ranges, in log ratios
 _SURE = 0.95  # probability that a limit is in a dip: less, and it may not be met at all
 _NARROW = 0.05  # initial ranges: no plateau is taken for narrower
+# Fields and effects, beside limits and all kinds of friction, that hold still or do
+# nothing below their value.
+_HOLDING = frozenset({"coulomb", "static", "slip", "width", "deadband"})
 _INSIDE = 0.4  # initial ranges beyond the edge, where a plateau is entered
 
 
 def jumps(space: ParameterSpace) -> tuple[np.ndarray, np.ndarray]:
-    """Directions of jumps, ``(n + 1 or n, n)``, and how far each may go: single
-    parameters in unit coordinates, and the common scale of all masses and forces, along
-    which motion changes least, in log ratios."""
+    """Directions of jumps, ``(k, n)``, and how far each may go, ``(k,)``: parameters
+    that may have no slope (`_thresholds`), in unit coordinates, and the common scale of
+    all masses and forces, along which motion changes least, in log ratios."""
     # A start range may be narrow, and wrong.
     wide = np.maximum(_FARTHEST[0], _FARTHEST[1] / space.log_width)
-    single = np.eye(space.size), np.where(space.log, wide, _FARTHEST[0])
+    far, which = np.where(space.log, wide, _FARTHEST[0]), _thresholds(space)
+    single = np.eye(space.size)[which], far[which]
     scaled = forces(space) * space.log
     if scaled.sum() < 2:
         return single
@@ -63,6 +69,11 @@ class Reach:
         sides = jnp.array([[1.0], [-1.0]])
         return space.clip(unit + (self.tried * sides)[..., None] * jumps(space)[0])
 
+    def down(self, space: ParameterSpace, unit: jax.Array) -> jax.Array:
+        """``unit (n,)`` with each parameter that jumps as low as it was raised by."""
+        which = np.array(_thresholds(space), int)
+        return space.clip(unit.at[which].add(-self.raised[1, : len(which)]))
+
     def after(self, data: jax.Array, here: jax.Array, taken: jax.Array) -> "Reach":
         """After a look: ``data (2, k)`` are costs of the jumps, ``here`` that without,
         ``taken (2, k)`` the jump that was made."""
@@ -81,6 +92,21 @@ def unmet(hessian: jax.Array) -> jax.Array:
 
 def of(space: ParameterSpace) -> list[int]:
     """Which parameters are limits of a force, a speed or a command."""
+    return _named(space, lambda field: field.endswith("limit"))
+
+
+def _thresholds(space: ParameterSpace) -> list[int]:
+    """Limits, and other parameters beyond whose value nothing need change: friction
+    that holds, free play, commands that are ignored."""
+
+    def holds(field: str) -> bool:
+        return "limit" in field or "friction" in field or field in _HOLDING
+
+    return _named(space, holds)
+
+
+def _named(space: ParameterSpace, wanted: Callable[[str], bool]) -> list[int]:
+    """Parameters with an address whose field, or effect, is ``wanted``."""
 
     def field(address: str) -> str:
         parts = address.split(".")
@@ -89,7 +115,7 @@ def of(space: ParameterSpace) -> list[int]:
     return [
         i
         for i, p in enumerate(space.parameters)
-        if any(field(a).endswith("limit") for a in p.addresses)
+        if any(wanted(field(a)) for a in p.addresses)
     ]
 
 

@@ -255,7 +255,7 @@ class PairedFit:
             return 1 + self._directions * (1 + self.simulator.by_differences)
         size = self._directions - self.space.size
         turn = slopes.parts_and_turns(self.simulator, self.segments, size)[1]
-        return 1 + 2 * (self.space.size + int(turn.max(initial=-1)) + 1)
+        return 1 + self.space.size + 2 * (int(turn.max(initial=-1)) + 1)
 
     @property
     def _directions(self) -> int:

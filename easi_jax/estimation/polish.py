@@ -34,7 +34,7 @@ from easi_jax.estimation.normal_equations import Normal, PairedFit
 from easi_jax.estimation.weights import excess
 
 _LOOKS = 8, 48  # at most: at the fit, then after each step; with doubts
-_STALE = 6  # looks without progress that end it
+_STALE = 4  # looks without progress that end it
 _ROUNDING = 3e-6  # of the cost, that single precision takes for progress
 _SETTLED = 0.01  # of the cost, that the next step is foretold to gain
 _STARTED = 1e-4  # of the cost: what starts gain by that says nothing of a misfit
@@ -45,7 +45,9 @@ _DAMPING = Damping(falls=0.1, rises=10.0, wakes=1e-2)
 _SHORTER, _LONGER = 0.3, 3.0  # share of its step that a start takes, likewise
 _FIRST, _ON = -1, -2  # in place of a limit
 _MOVES = 0.25 * 0.5 ** np.arange(8)[::-1]  # initial ranges, that a limit is moved by
-_AT_REST = 0.1  # of the cost: what steps after a fit has settled gain at most
+# Of the cost: what steps after a fit has settled gain at most. Where friction makes the
+# cost rough, every step gains some of that, and none leads anywhere.
+_AT_REST = 0.1
 _HOPING = 2  # looks in vain at a plateau
 # Of the cost, that a plateau is worse by with all else held, over the share of it that
 # all else cannot take up: ten times what an edge has to be better by, and no hope.
@@ -284,15 +286,16 @@ class _Steps:
         new = space.clip(moved(space, at, du))
         follow = starts + share[:, None] * told.start_step
         follow = follow + told.start_gain @ (new - at)
-        progress = ~is_settled(c.least - cost, cost, _SETTLED, _ROUNDING)
+        progress = ~is_settled(c.least - cost, cost, _AT_REST, _ROUNDING)
         progressed = jnp.where(better & progress, c.k, c.progressed)
         foretold = -0.5 * gradient @ du
         # Parameters may be right while the starts are still as they were measured.
         rough = jnp.where(alone, _STARTED, _ROUNDING)
         still = is_settled(jnp.abs(c.least - cost), cost, _SETTLED, rough)
         settled = still & (foretold < _SETTLED)
-        done = ~stepping | settled | (c.k + 1 >= self.looks)
-        done |= c.k - progressed >= _STALE
+        settled |= ~alone & better & (c.k > 0) & (foretold < _AT_REST)
+        stale = c.k - progressed >= _STALE
+        done = ~stepping | settled | stale | (c.k + 1 >= self.looks)
         worse = jnp.maximum(c.least - c.rival, 0.0)
         hopeless = cost - c.rival > _NEARER * worse + limits.EDGE
         hopeless &= better & (c.k > 0) | (c.k - progressed >= _HOPING)
@@ -315,6 +318,8 @@ class _Steps:
             seen=eq.hessian,
             cost=jnp.where(here & stepping, cost, c.cost),
             rival=c.rival,
-            settled=jnp.where(stepping, settled & (rough * cost < _AT_REST), c.settled),
+            settled=jnp.where(
+                stepping, stale | settled & (rough * cost < _AT_REST), c.settled
+            ),
             rise=c.rise,
         )

@@ -22,9 +22,9 @@ from easi_jax.simulation import open_loop
 from easi_jax.simulation.simulator import Simulator
 
 # Of an initial range, and along a start [m, rad, m/s, rad/s, activations]: what a
-# central difference leaves out is of its square, and the constraint solver's rest,
-# 1e-9, over it.
-_STEP = 1e-4
+# one-sided difference leaves out is in proportion to it, and the constraint solver's
+# rest, 1e-9, over it.
+_STEP = 2e-5
 _MOVE = 1e-5
 
 
@@ -100,21 +100,24 @@ def _linearized(
     most = int(turn.max(initial=-1)) + 1
     moves = np.eye(n + most, n + along_start)
     moves[n:, n:] = turn == np.arange(most)[:, None]
-    step = jnp.concatenate([jnp.full(n, _STEP), jnp.full(most, _MOVE)])
-    # Between bounds a parameter may have less than its step to go.
-    far = jnp.full(most, jnp.inf)
     low, high = space.unit_bounds
-    edge = jnp.concatenate([low - unit, -far]), jnp.concatenate([high - unit, far])
-    up, down = jnp.clip(step, *edge), jnp.clip(-step, *edge)
-    ways = jnp.concatenate([jnp.zeros((1, len(step))), jnp.diag(up), jnp.diag(down)])
+    # Inwards; between bounds a parameter may have less than its step to go.
+    up, down = jnp.minimum(high - unit, _STEP), jnp.maximum(low - unit, -_STEP)
+    step = jnp.concatenate([jnp.where(up >= -down, up, down), jnp.full(most, _MOVE)])
+    # Where dry friction holds, a speed leads on one side only: starts go both ways.
+    back = jnp.concatenate([jnp.zeros(n), jnp.full(most, -_MOVE)])
+    ways = jnp.concatenate(
+        [jnp.diag(step), jnp.diag(back)[n:], jnp.zeros((1, len(step)))]
+    )
     every = jax.vmap(at)(ways @ moves)
-    gone = up - down
-    over, under = jnp.split(every[1:], 2)
-    slopes = jnp.moveaxis(over - under, 0, -1) / jnp.where(gone > 0, gone, 1.0)
+    on, under, here = jnp.split(every, (n + most, n + 2 * most))
+    gone = on - jnp.concatenate([jnp.broadcast_to(here, on[:n].shape), under])
+    width = step - back
+    slopes = jnp.moveaxis(gone, 0, -1) / jnp.where(width != 0, width, 1.0)
     along, start = slopes[..., :n], slopes[..., n + turn]
     if most < along_start:
         start = jnp.where(parts[: start.shape[-2], None] == parts, start, 0.0)
-    return every[0], jnp.concatenate([along, start], -1)
+    return here[0], jnp.concatenate([along, start], -1)
 
 
 def parts_and_turns(

@@ -9,9 +9,9 @@ from easi_jax.estimation.limits import Reach, beyond_edge, edge, jumps, of, unme
 from easi_jax.model.parameters import Parameter, ParameterSpace
 
 
-def space(*units: str) -> ParameterSpace:
+def space(*units: str, field: str = "frictionloss") -> ParameterSpace:
     wide = (0.5, 2.0), (0.01, 100.0)
-    given = [(f"p{i}", (f"joint.j{i}.damping",), 1.0, *wide) for i in range(len(units))]
+    given = [(f"p{i}", (f"joint.j{i}.{field}",), 1.0, *wide) for i in range(len(units))]
     return ParameterSpace(
         tuple(Parameter(*g, unit=u) for g, u in zip(given, units, strict=True))
     )
@@ -22,6 +22,20 @@ def test_masses_and_forces_jump_together_as_well() -> None:
     ways, farthest = jumps(space("kg", "N", "m"))
     assert ways.shape == (4, 3) and farthest.shape == (4,)
     np.testing.assert_allclose(ways[3] * space("kg").log_width, [1, 1, 0])
+    # What always has a slope does not jump by itself.
+    assert len(jumps(space("kg", "m", field="damping"))[0]) == 0
+    assert len(jumps(space("kg", "N", field="armature"))[0]) == 1
+    assert len(jumps(space("m", field="speed_limit"))[0]) == 1
+
+
+def test_what_met_no_limit_goes_down_by_itself() -> None:
+    two = ParameterSpace(
+        (*space("m", field="damping").parameters, *space("m", "m").parameters[1:])
+    )
+    reach = Reach.fresh(two)
+    at = jnp.array([0.5, 0.6])
+    by = float(jumps(two)[1][0])
+    assert reach.down(two, at).tolist() == pytest.approx([0.5, 0.6 - by])
 
 
 def test_a_jump_is_bisected_to_the_edge_of_a_plateau() -> None:

@@ -91,7 +91,8 @@ def _by_hand(space: ParameterSpace, unit: np.ndarray, piece: Segments) -> Any:
 
 
 def test_slopes_are_those_of_a_pendulum_by_hand(native: Any) -> None:
-    """As exact as the single precision in which they are given."""
+    """Along the start as exact as the single precision in which they are given; along a
+    parameter, one way only, to the share of its step that a difference leaves out."""
     simulator, space = native
     piece = _piece()
     unit = np.asarray(space.to_unit(1.1 * _TRUE), np.float32)
@@ -115,7 +116,9 @@ def test_slopes_are_those_of_a_pendulum_by_hand(native: Any) -> None:
     assert r.dtype == slopes.dtype == jnp.float32
     np.testing.assert_allclose(r, known, rtol=1e-6, atol=1e-7)
     size = np.abs(exact).max((0, 1))
-    assert (np.abs(slopes - exact).max((0, 1)) / size).max() < 5e-7
+    off = np.abs(slopes - exact).max((0, 1)) / size
+    assert off[5:].max() < 5e-7  # of a start: both ways
+    assert off[:5].max() < 3e-5
     assert (np.abs(rough - exact[..., :5]).max((0, 1)) / size[:5]).max() > 5e-5
 
 
