@@ -14,7 +14,7 @@ from pathlib import Path
 from train._command import main, say
 
 EXAMPLE = Path("examples/lift_arm")
-GOAL = 120  # s
+GOAL = 60  # s
 _LIMIT = 1200  # s
 
 

@@ -34,6 +34,7 @@ from benchmarks import (
     same_twice,
     scaling_summary,
     slow_tests,
+    small_cases,
     strangers,
     walking,
     where_tests_spend,
@@ -386,6 +387,10 @@ SECTIONS = (
     ),
     Section("## A robot of one's own", "own_robot.json", "own_robot", _own_robot),
     Section("", "strangers.json", "strangers", strangers.paragraphs),
+    Section(
+        *("### Models that are right", "small_cases.json", "small_cases"),
+        small_cases.paragraphs,
+    ),
     Section(
         *("## Policies of the other robots", "policies_*.json", "policies", _policies)
     ),

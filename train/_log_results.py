@@ -76,6 +76,17 @@ def write(
     return write_found(*given, results, seeds, errors, diverged, *more)
 
 
+def not_finite(errors: "HeldOutErrors", seeds: Sequence[int]) -> list[str]:
+    """A note for each model that some held-out windows explode with."""
+    models = ("the model as given", *(f"the result of seed {s}" for s in seeds))
+    return [
+        f"{lost} of {errors.windows} held-out windows are not finite with {model}: "
+        "each counts as an error of the largest motion"
+        for model, lost in zip(models, errors.not_finite, strict=False)
+        if lost
+    ]
+
+
 def write_found(
     folder: "RunFolder",
     name: str,
@@ -118,6 +129,8 @@ def write_found(
                 "before": errors.before,
                 "after": {str(s): e for s, e in zip(seeds, errors.after, strict=True)},
                 "noise_floor": errors.floor[best],
+                "windows": errors.windows,
+                "not_finite": errors.not_finite,
             },
             diverged={str(seed): why for seed, why in diverged.items()},
             **more,
@@ -136,6 +149,7 @@ def write_found(
         command=f"python -m train.easi {options}",
         notes=[
             *(f"seed {s} has no result: {why}" for s, why in diverged.items()),
+            *not_finite(errors, seeds),
             *notes,
         ],
         config=folder.config,

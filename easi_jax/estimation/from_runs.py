@@ -217,12 +217,15 @@ class _Finish:
         # With commands before each piece, where one that comes late needs them.
         cutting = self.doubts.simulator if self.doubts else simulator
         steps = max(problem.steps, round(_FINISH / simulator.dt))
-        self.steps = min(steps, max(len(r) for r in problem.fit) - 1)
-        # Twice over, each counted half: where pieces begin matters less.
-        every = max(1, self.steps // 2)
+        steps = min(steps, max(len(r) for r in problem.fit) - 1)
+        # Twice over, each counted half: where pieces begin matters less. A piece has a
+        # row more than steps, its start's, which counts in the prior of that: with an
+        # even number of rows each one is in two pieces.
+        self.steps = max(1, steps - (steps + 1) % 2)
+        every = (self.steps + 1) // 2
         given = cutting, problem.fit, self.steps, every
         whole = to_device(segments_from_runs(*given, sensors=self.sensors))
-        self.whole = replace(whole, weight=whole.weight * every / self.steps)
+        self.whole = replace(whole, weight=0.5 * whole.weight)
         starts = [len(range(0, len(r) - self.steps, every)) for r in problem.fit]
         self.owner = np.repeat([r.recording for r in problem.fit], starts)
         self.pieces = few(simulator, self.whole, _FEW) if refined else self.whole
@@ -471,10 +474,11 @@ class _Finish:
         return notes + self.contradictions(found, weight)
 
     def contradictions(self, found: Estimate, weight: jax.Array) -> list[str]:
-        """Notes on recordings that lead elsewhere than all of them together do."""
-        names = list(dict.fromkeys(run.recording for run in self.problem.fit))
-        if not (self.refined and 2 <= len(names) <= _COMPARED):
+        """Notes on recordings that lead elsewhere than all of them together do; of many
+        those that fit worst are looked at."""
+        if not self.refined or len(set(self.owner.tolist())) < 2:
             return []
+        names = _worst(self.owner, np.asarray(weight))
         ways = {d.parameters if d else (): end for d, end in self.endings.items()}
         end, notes = ways[found.doubted], []
         for name in names:
@@ -499,6 +503,18 @@ def _resolution_noise(problem: Problem, sensors: Sensors) -> np.ndarray:
     sensed = finest([resolution_of(sensors.readings(run)) for run in runs])
     step = [position, np.where(measured, velocity, 0.0), sensed]
     return np.concatenate(step) / math.sqrt(12.0)
+
+
+def _worst(owner: np.ndarray, weight: np.ndarray) -> list[str]:
+    """Recordings, in order: of many those whose pieces fit worst.
+
+    Args:
+        owner: recording of each piece, ``(M,)``.
+        weight: of each piece by how well it fits, ``(M,)``.
+    """
+    names = list(dict.fromkeys(owner.tolist()))
+    worst = sorted(names, key=lambda n: weight[owner == n].mean())[:_COMPARED]
+    return [n for n in names if n in worst]
 
 
 def _contradiction(

@@ -82,21 +82,21 @@ class WindowErrors:
             ]
             return np.stack([jax.device_get(compiled(*both)) for both in asked])
 
-        self.still = still
+        self.still, self.count = still, windows.count
         self.starts = _starts_of(problem, simulate)
         self.rows = self.starts.noise
 
-    def of(self, theta: jax.Array) -> np.ndarray:
-        """At SI parameters ``(n,)``."""
+    def of(self, theta: jax.Array) -> tuple[np.ndarray, int]:
+        """At SI parameters ``(n,)``; and how many windows are not finite."""
         return self._rms(self._solved(np.asarray(theta))[1])
 
-    def with_floor(self, theta: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+    def with_floor(self, theta: jax.Array) -> tuple[np.ndarray, int, np.ndarray]:
         """`of`, and what a perfect model would leave."""
         x = np.asarray(theta)
         moved, found = self._solved(x)
         rng = np.random.default_rng(0)
         least = floor(self.starts, x, moved, DRAWS, self.resolution, rng)
-        return self._rms(found), np.sqrt(least[:, self.lead + 1 :].mean((0, 1)))
+        return *self._rms(found), np.sqrt(least[:, self.lead + 1 :].mean((0, 1)))
 
     def _solved(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         starts = self.starts
@@ -106,9 +106,10 @@ class WindowErrors:
         starts.noise = believed(starts.measured_noise(found), self.rows, least)
         return moved, found
 
-    def _rms(self, found: np.ndarray) -> np.ndarray:
-        after = jnp.asarray(found[:, self.lead + 1 :])
-        return np.asarray(rms_of_steps(after, self.largest))
+    def _rms(self, found: np.ndarray) -> tuple[np.ndarray, int]:
+        after = found[:, self.lead + 1 :]
+        lost = len(after) - np.isfinite(after).all((1, 2)).sum()
+        return np.asarray(rms_of_steps(jnp.asarray(after), self.largest)), int(lost)
 
 
 def _starts_of(problem: Problem, simulate: Simulate) -> Starts:
@@ -149,16 +150,16 @@ def held_out_errors(
     coordinates, of the joints that were measured; ``ready`` is of `ready_errors`."""
     nominal = jnp.asarray(space.nominal, jnp.result_type(float))
     held, own = ready
-    before = held.of(nominal)
+    before, lost = held.of(nominal)
     each = [held.with_floor(space.to_si(unit)) for unit in means]
     simulator = problem.simulator
     nv = simulator.mj_model.nv
     seen = np.flatnonzero(np.isfinite(problem.noise[:nv]))
     fit: list[float] = []
     if own is not None:
-        scale = np.maximum(own.of(nominal), 1e-12)[seen]
+        scale = np.maximum(own.of(nominal)[0], 1e-12)[seen]
         for unit in means:
-            off = own.of(space.to_si(unit))[seen] / scale
+            off = own.of(space.to_si(unit))[0][seen] / scale
             fit.append(float(np.mean(off**2)))
     names, units = simulator.state_names[:nv], tangent_units(simulator.mj_model)
     return HeldOutErrors(
@@ -167,7 +168,9 @@ def held_out_errors(
         channels=[names[i].removeprefix("qpos.") for i in seen],
         units=[units[i] for i in seen],
         before=before[seen].tolist(),
-        after=[after[seen].tolist() for after, _ in each],
-        floor=[least[seen].tolist() for _, least in each],
+        after=[after[seen].tolist() for after, _, _ in each],
+        floor=[least[seen].tolist() for _, _, least in each],
         fit=fit,
+        windows=held.count,
+        not_finite=[lost, *(n for _, n, _ in each)],
     )

@@ -126,7 +126,7 @@ class PairedFit:
         def one(item: Any) -> Any:
             s, d, w = item
             r, jac = self._pushed(unit, d, s)
-            return self._equations(r, jac, d, w)
+            return self._equations(r, jac, d, w, s.weight)
 
         native = self.simulator.engine == "mujoco"
         points = self.points if native else 1
@@ -173,8 +173,8 @@ class PairedFit:
             )
             safe = jnp.where(gone > 0, gone, 1.0)
             jac = jnp.moveaxis(r[up] - r[down], 0, -1) / safe
-            cost = jax.vmap(lambda a, b: self._cost(a, b, w))(r, d)
-            return self._equations(r[0], jac, d[0], w), cost
+            cost = jax.vmap(lambda a, b: self._cost(a, b, w, s.weight))(r, d)
+            return self._equations(r[0], jac, d[0], w, s.weight), cost
 
         shifts = jnp.swapaxes(deltas, 0, 1)
         equations, cost = self._each(one, units.shape[0], shifts, weight)
@@ -184,8 +184,11 @@ class PairedFit:
         along = jnp.full(self.space.size, _STEP)
         return jnp.concatenate([along, jnp.clip(self.spread, *_MOVE)])
 
-    def _equations(self, r: jax.Array, jac: jax.Array, d: jax.Array, w: Any) -> Any:
-        """One piece's part of `Normal`, from its residual and slopes."""
+    def _equations(
+        self, r: jax.Array, jac: jax.Array, d: jax.Array, w: Any, share: jax.Array
+    ) -> Any:
+        """One piece's part of `Normal`, from its residual and slopes; ``share`` is what
+        the piece counts."""
         n, size = self.space.size, self.spread
         root = jnp.sqrt(w) / self.noise
         # A piece of weight zero may hold anything; one that the simulation does not
@@ -195,19 +198,20 @@ class PairedFit:
         jw = jnp.where(on[..., None], jac * root[..., None], 0.0)
         jw = jw.reshape(rw.shape[0], -1)
         given = jnp.concatenate([jw[:, :n], rw[:, None]], 1)
-        cost = self._cost(r, d, w)
+        cost = self._cost(r, d, w, share)
         if not self.free_starts:
             both = given.T @ given
             still = jnp.zeros(len(d)), jnp.zeros((len(d), n))
             return both[:n, :n], both[:n, n], cost, *still, r
-        # Of a start something is known, too: a shift of one deviation costs 1/2. What
-        # starts explain is taken off before squares are summed, for a broad one
-        # explains nearly all of it.
+        # Of a start something is known, too: a shift of one deviation costs half of
+        # what the piece counts. What starts explain is taken off before squares are
+        # summed, for a broad one explains nearly all of it.
+        held = jnp.where(share > 0, jnp.sqrt(share), 1.0)
         b = jw[:, n:] * size
-        known = jnp.zeros((len(d), n + 1)).at[:, n].set(d / size)
-        held = b.T @ b + jnp.eye(len(d))
-        follow = jnp.linalg.solve(held, b.T @ given + known)
-        left = jnp.concatenate([given - b @ follow, known - follow])
+        known = jnp.zeros((len(d), n + 1)).at[:, n].set(held * d / size)
+        normal = b.T @ b + held**2 * jnp.eye(len(d))
+        follow = jnp.linalg.solve(normal, b.T @ given + held * known)
+        left = jnp.concatenate([given - b @ follow, known - held * follow])
         both = left.T @ left
         step = -size[:, None] * follow
         return both[:n, :n], both[:n, n], cost, step[:, n], step[:, :n], r
@@ -215,9 +219,11 @@ class PairedFit:
     def _summed(self, parts: Any) -> Normal:
         return Normal(parts[0].sum(0), *parts[1:])
 
-    def _cost(self, r: jax.Array, d: jax.Array, w: jax.Array) -> jax.Array:
+    def _cost(
+        self, r: jax.Array, d: jax.Array, w: jax.Array, share: jax.Array
+    ) -> jax.Array:
         square = jnp.where(w > 0, w * (r / self.noise) ** 2, 0.0).sum()
-        total = 0.5 * (square + jnp.sum((d / self.spread) ** 2))
+        total = 0.5 * (square + share * jnp.sum((d / self.spread) ** 2))
         return jnp.where(jnp.isfinite(total), total, jnp.inf)
 
     def costs(self, unit: jax.Array, delta: jax.Array, weight: jax.Array) -> jax.Array:
@@ -236,7 +242,7 @@ class PairedFit:
             s, d, w = item
 
             def cost(u: jax.Array, x: jax.Array) -> jax.Array:
-                return self._cost(self._residual(u, x, s), x, w)
+                return self._cost(self._residual(u, x, s), x, w, s.weight)
 
             return jax.vmap(cost)(unit, d)
 

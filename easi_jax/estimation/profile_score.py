@@ -145,7 +145,7 @@ class ProfileFit(PairedFit):
             def fitted(s: Segments) -> Any:
                 def turn(d: jax.Array, _: Any) -> Any:
                     r, jac = self._pushed(unit, d, s)
-                    parts = self._equations(r, jac, d, w)
+                    parts = self._equations(r, jac, d, w, s.weight)
                     ahead = jnp.clip(d + parts[3], -most, most)
                     return ahead, (d, r, jac, parts)
 
@@ -164,7 +164,7 @@ class ProfileFit(PairedFit):
                 new = jax.tree.map(lambda x, y: jnp.where(k, x, y), new, s)
                 *found, parts = fitted(new)
                 # The truth of what is made is known: its score is zero on average.
-                known = self._equations(-later, jac, -first, w)[1]
+                known = self._equations(-later, jac, -first, w, s.weight)[1]
                 fine = jnp.isfinite(parts[2]) & (parts[2] > 0)
                 over = jnp.where(fine, parts[1] - known, 0.0)
                 real = jax.tree.map(lambda x, y: jnp.where(k, x, y), real, tuple(found))

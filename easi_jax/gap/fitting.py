@@ -94,9 +94,9 @@ class Fitting:
         found.ignored.update({**ignored, **self.predictor.unpredicted})
         if not np.isfinite(found.scale).any():
             raise UserError(
-                "nothing moves by more than five times its noise within "
-                f"{after * data.dt:g} s: record larger or faster motion, or lengthen "
-                "--horizon"
+                f"none of {', '.join(found.names)} moves by more than five times its "
+                f"noise within {after * data.dt:g} s: record larger or faster motion, "
+                "or lengthen --horizon"
             )
         return found
 

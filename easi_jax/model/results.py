@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -410,6 +410,9 @@ class HeldOutErrors:
         fit: of each seed, the error on its own data, which chooses the seed shown;
             empty of a single one.
         measure: how they are measured, in words.
+        windows: that errors are measured on; 0 where there are none.
+        not_finite: windows whose prediction is not finite, by the model as given and
+            then by each seed's; each counts as an error of the largest motion.
     """
 
     what: str
@@ -421,9 +424,11 @@ class HeldOutErrors:
     floor: list[list[float]]
     fit: list[float]
     measure: str = (
-        "RMS over all steps of all windows, open loop from the measured position and "
-        "fitted velocity, windows every half horizon"
+        "RMS over all steps of all windows, open loop from the "
+        "fitted start, windows every half horizon"
     )
+    windows: int = 0
+    not_finite: list[int] = field(default_factory=list)
 
     @property
     def best(self) -> int:

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 import easi_jax
+from benchmarks.small_cases import CASES as ALL
 from tests.commands import command, read
 from tests.documented import ROOT
 from train import easi, gap
@@ -55,21 +56,28 @@ def test_a_joint_that_no_encoder_sees() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("case", "log", "verdicts"),
-    [
-        # Its drive's state is unknown at the start of a prediction, which is not
-        # estimated yet: no_gap would be right.
-        ("filter_act", "log.csv", ("no_gap", "unexplained")),
-        ("backlash_joint", "full.csv", ("no_gap",)),
-        ("backlash_joint", "log.csv", ("no_gap",)),
-    ],
-)
-def test_a_gap_ends_with_files(
-    case: str, log: str, verdicts: tuple[str, ...], tmp_path: Path
-) -> None:
-    folder, out = CASES / case, tmp_path / "gap"
+@pytest.mark.parametrize("case", ALL)
+def test_a_model_that_is_right_has_no_gap(case: str, tmp_path: Path) -> None:
+    name, logs = case.split(",")[0], ALL[case]
+    folder, out = CASES / name, tmp_path / "gap"
+    data = [folder / log for log in logs]
+    command(gap, "--model", folder / "model.xml", "--data", *data, "--out", out)
+    told = read(out / "gap.json")
+    assert told["verdict"] == "no_gap" and not told["effects"]
+
+
+@pytest.mark.slow
+def test_a_drive_with_a_state_is_identified(tmp_path: Path) -> None:
+    folder, out = CASES / "filter_act", tmp_path / "easi"
     command(
-        *(gap, "--model", folder / "model.xml", "--data", folder / log, "--out", out)
+        *(easi, "--model", folder / "model.xml", "--data", folder / "log.csv"),
+        *("--parameters", folder / "parameters.yaml", "--out", out),
     )
-    assert read(out / "gap.json")["verdict"] in verdicts
+    told = read(out / "distribution.json")
+    found = told["seeds"]["0"]
+    assert set(found["flags"]) == {"determined"}
+    values = zip(told["parameters"], found["mean"], found["std"], strict=True)
+    for parameter, mean, std in values:
+        truth = parameter["nominal"]
+        assert abs(mean - truth) < 3 * std, parameter
+        assert std < 0.1 * truth

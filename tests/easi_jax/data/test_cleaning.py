@@ -330,13 +330,18 @@ def test_error_of_the_true_model_is_the_noise_floor(simulator):
     )
     held_out, fitted = ready_errors(problem, simulator.space, several=True)
     assert fitted is not None
-    first, least = held_out.with_floor(jnp.asarray(simulator.space.nominal))
+    first, lost, least = held_out.with_floor(jnp.asarray(simulator.space.nominal))
+    assert not lost
     np.testing.assert_allclose(first, least, rtol=0.1)
-    second = fitted.of(jnp.asarray(simulator.space.nominal))
+    second, _ = fitted.of(jnp.asarray(simulator.space.nominal))
     np.testing.assert_allclose(second, least, rtol=0.15)
-    wrong, noise = held_out.with_floor(jnp.asarray([5.0]))
+    wrong, _, noise = held_out.with_floor(jnp.asarray([5.0]))
     assert wrong[0] > 2 * first[0]
     assert noise[0] < 1.5 * least[0], "errors of a model are no noise"
+    # Predictions that are not finite are counted, and as large as motion is.
+    exploded, lost = held_out.of(jnp.asarray([jnp.nan]))
+    assert lost == held_out.count > 0
+    np.testing.assert_allclose(exploded, held_out.largest, rtol=1e-5)
 
 
 def test_misfit_counts_only_what_noise_does_not_explain():

@@ -75,13 +75,8 @@ def run(config: Config) -> None:
         return step(state, n)
 
     given = dataclasses.replace(config, slow=0.0)
-    with RunFolder.open(
-        config.out,
-        given,
-        command="walk",
-        resume=config.resume,
-        overwrite=config.overwrite,
-    ) as folder:
+    how = {"resume": config.resume, "overwrite": config.overwrite}
+    with RunFolder.open(config.out, given, command="walk", **how) as folder:
         ready = started(lambda: jnp.ones(3) * 2)
         notes: list[str] = []
         state = run_stage(

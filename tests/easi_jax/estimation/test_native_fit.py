@@ -1,11 +1,13 @@
 """Least squares on the engine `mujoco`: a wrong start is left for the truth."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import pytest
 
 from easi_jax.data.segments import Segments
 from easi_jax.estimation.levenberg_marquardt import refine
@@ -46,7 +48,8 @@ def _recorded(count: int, steps: int) -> Segments:
     return Segments(q[:, 0], v[:, 0], sent, q[:, 1:], v[:, 1:], weight)
 
 
-def test_a_wrong_start_is_left_for_the_truth() -> None:
+@pytest.fixture(scope="module")
+def fitted() -> PairedFit:
     m = mujoco.MjModel.from_xml_string(XML)
     space = ParameterSpace(
         tuple(
@@ -55,13 +58,16 @@ def test_a_wrong_start_is_left_for_the_truth() -> None:
         )
     )
     simulator = Simulator(m, space, 0.02, engine="mujoco")
-    pieces = _recorded(24, 8)
+    return PairedFit(simulator, space, _recorded(24, 8), jnp.asarray(_NOISE))
+
+
+def test_a_wrong_start_is_left_for_the_truth(fitted: PairedFit) -> None:
+    space, pieces = fitted.space, fitted.segments
     wrong = space.to_unit(jnp.asarray(_TRUTH * [1.4, 0.6, 1.8, 0.5]))
 
     @jax.jit
     def run(unit: jax.Array) -> Any:
-        paired = PairedFit(simulator, space, pieces, jnp.asarray(_NOISE))
-        return refine(paired, unit, robust=0)
+        return refine(fitted, unit, robust=0)
 
     out = run(wrong)
     off = np.asarray(out.unit - space.to_unit(_TRUTH), float)
@@ -72,3 +78,20 @@ def test_a_wrong_start_is_left_for_the_truth() -> None:
     assert out.cost[3] - out.cost[-1] < 0.05
     numbers = pieces.next_qpos.size + pieces.next_qvel.size
     assert out.cost[-1] < 0.5 * numbers + 3 * np.sqrt(0.5 * numbers)
+
+
+def test_what_counts_half_says_half(fitted: PairedFit) -> None:
+    """Of the parameters and of its start, which it places where it did."""
+    unit = fitted.space.to_unit(jnp.asarray(1.1 * _TRUTH))
+    shift = fitted.unmoved + fitted.noise
+    half = replace(fitted.segments, weight=0.5 * fitted.segments.weight)
+    whole, part = (
+        fit.normal(unit, shift, fit.weight)
+        for fit in (fitted, replace(fitted, segments=half))
+    )
+    for name in ("hessian", "gradients", "costs"):
+        np.testing.assert_allclose(
+            getattr(part, name), 0.5 * getattr(whole, name), rtol=1e-3
+        )
+    np.testing.assert_allclose(part.start_step, whole.start_step, rtol=1e-3)
+    np.testing.assert_allclose(part.start_gain, whole.start_gain, rtol=1e-3, atol=1e-6)

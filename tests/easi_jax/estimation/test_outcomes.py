@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from easi_jax.errors import UserError
-from easi_jax.estimation.from_runs import _contradiction
+from easi_jax.estimation.from_runs import _contradiction, _Finish, _worst
 from easi_jax.estimation.identifiability import seed_result
 from easi_jax.estimation.posterior import diverged
 from easi_jax.model.parameters import Parameter, ParameterSpace
@@ -74,3 +74,23 @@ def test_a_run_that_leads_elsewhere_is_named() -> None:
         SPACE, "a.csv", found((0.7, 0.5), hessian=0 * SURE), everything
     )
     assert not _contradiction(SPACE, "a.csv", found((np.nan, 0.5)), everything)
+
+
+def test_of_many_runs_those_that_fit_worst_are_looked_at() -> None:
+    names = [f"run{k}.csv" for k in range(12)]
+    owner, weight = np.repeat(names, 5), np.ones(60)
+    weight[50:55] = 0.2
+    looked = _worst(owner, weight)
+    assert len(looked) == 8 and looked[-1] == "run10.csv"
+    assert _worst(owner[:10], weight[:10]) == names[:2]
+
+
+def test_a_pass_more_is_made_where_readings_count_otherwise() -> None:
+    finish: Any = object.__new__(_Finish)
+    before = np.ones((4, 5, 3)) * [1.0, 100.0, 0.0]
+    assert finish.alike(before, 1.05 * before)
+    for channel, by in ((0, 1.2), (1, 0.8)):
+        one = np.where(np.arange(3) == channel, by, 1.0)
+        assert not finish.alike(before, before * one)
+    # What sensors read counts nothing at first.
+    assert not finish.alike(before, before + np.array([0, 0, 1]))

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from easi_jax.data.cleaning import rows_of
 from easi_jax.data.measured import MeasuredRuns
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import to_device
@@ -155,6 +156,26 @@ def test_a_torque_says_how_strong_all_of_it_is(problem: Problem) -> None:
         hessian = np.asarray(jax.jit(paired.information)(unit), float)
         known.append(np.sqrt(np.ones(3) @ hessian @ np.ones(3)))
     assert known[1] > 50 * known[0]
+
+
+@pytest.mark.parametrize("rows", [101, 102])
+def test_each_row_of_a_log_counts_once(problem: Problem, rows: int) -> None:
+    """As the start of a piece or as one of its steps; less at a run's ends."""
+    (run,) = problem.fit
+    problem = replace(problem, fit=[rows_of(run, 0, rows)])
+    config = SearchConfig(source="replay", horizon=problem.piece, population=4)
+    search = Search(problem.simulator, config)
+    finish = from_runs._Finish(problem, search, True, 0, lambda _: None)
+    pieces = finish.whole
+    starts = np.asarray(pieces.qpos)[:, 0]
+    first = [int(np.abs(run.qpos[:rows, 0] - q).argmin()) for q in starts]
+    counted = np.zeros(rows)
+    for at, weight in zip(first, np.asarray(pieces.weight), strict=True):
+        counted[at : at + pieces.horizon + 1] += weight
+    half = (pieces.horizon + 1) // 2
+    inner = counted[half : first[-1] + half]
+    assert len(inner) > half and (inner == 1.0).all()
+    assert (counted[:half] == 0.5).all() and counted.max() == 1.0
 
 
 @pytest.mark.slow
