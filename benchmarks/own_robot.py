@@ -48,7 +48,6 @@ def run(config: Config) -> None:
         command_of("benchmarks.own_robot", config),
         config,
         seconds=seconds,
-        goal_s=GOAL,
         found=values,
         truth=truth,
         flags=dict(zip(names, first["flags"], strict=True)),
