@@ -213,7 +213,7 @@ class _Finish:
         simulator = problem.sensing if refined else problem.simulator
         self.simulator = simulator
         self.doubts = doubts_of(simulator, search.space) if refined else None
-        self.endings: dict[Doubts | None, Any] = {}
+        self.endings: dict[tuple[Doubts | None, int], Any] = {}
         # With commands before each piece, where one that comes late needs them.
         cutting = self.doubts.simulator if self.doubts else simulator
         steps = max(problem.steps, round(_FINISH / simulator.dt))
@@ -257,14 +257,17 @@ class _Finish:
         scales = scales_of(m, self.problem.fit)
         return all_doubts(self.simulator, self.search.space, scales)
 
-    def ending(self, doubts: Doubts | None) -> Any:
-        """The compiled last steps with ``doubts``."""
-        if doubts not in self.endings:
+    def ending(self, doubts: Doubts | None, count: int | None = None) -> Any:
+        """The compiled last steps with ``doubts``, on all pieces or ``count`` of
+        them."""
+        count = self.whole.count if count is None else count
+        if (doubts, count) not in self.endings:
             n, known = self.search.space.size, self.known(self.told)
-            like = placed((jnp.zeros(n), jnp.eye(n), self.whole, self.hidden, known))
+            pieces = self.whole.take(np.zeros(count, int))
+            like = placed((jnp.zeros(n), jnp.eye(n), pieces, self.hidden, known))
             program = jax.jit(partial(self.end, doubts)).lower(*like)
-            self.endings[doubts] = program.compile(quick_compile())
-        return self.endings[doubts]
+            self.endings[doubts, count] = program.compile(quick_compile())
+        return self.endings[doubts, count]
 
     def known(self, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The noise, and what is known of starts."""
@@ -479,17 +482,23 @@ class _Finish:
         if not self.refined or len(set(self.owner.tolist())) < 2:
             return []
         names = _worst(self.owner, np.asarray(weight))
-        ways = {d.parameters if d else (): end for d, end in self.endings.items()}
-        end, notes = ways[found.doubted], []
+        doubts = {d.parameters if d else (): d for d, _ in self.endings}[found.doubted]
+        # A larger robot's program for fewer pieces is compiled in less time than the
+        # others take; one of a smaller robot is there.
+        wide, notes = self.simulator.wide, []
+        most = int(max((self.owner == name).sum() for name in names))
+        end = self.ending(doubts, most if wide else None)
         for name in names:
-            mine = self.whole.weight * weight * (self.owner == name)
+            mine = np.asarray(self.whole.weight * weight) * (self.owner == name)
             if not np.any(mine > 0):
                 continue
+            pieces = replace(self.whole, weight=jnp.asarray(mine))
+            pieces = _alone(pieces, self.owner == name, most) if wide else pieces
             given = (
-                *(found.fit, found.search_cov),
-                *(replace(self.whole, weight=mine), found.misfit),
+                *(found.fit, found.search_cov, pieces, found.misfit),
                 (found.noise, found.start),
             )
+            self.tell(f"{name} by itself, beside the others")
             alone = distributed.local(end(*placed(given)))
             notes += _contradiction(self.search.space, name, alone, found)
         return notes
@@ -515,6 +524,13 @@ def _worst(owner: np.ndarray, weight: np.ndarray) -> list[str]:
     names = list(dict.fromkeys(owner.tolist()))
     worst = sorted(names, key=lambda n: weight[owner == n].mean())[:_COMPARED]
     return [n for n in names if n in worst]
+
+
+def _alone(pieces: Segments, own: np.ndarray, count: int) -> Segments:
+    """``count`` pieces: those that are ``own (M,)``, then others of no weight."""
+    first = np.flatnonzero(own)
+    some = pieces.take(np.append(first, np.full(count - len(first), first[0])))
+    return replace(some, weight=some.weight * (np.arange(count) < len(first)))
 
 
 def _contradiction(

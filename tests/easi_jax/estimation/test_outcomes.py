@@ -6,8 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from easi_jax.data.segments import Segments
 from easi_jax.errors import UserError
-from easi_jax.estimation.from_runs import _contradiction, _Finish, _worst
+from easi_jax.estimation.from_runs import (
+    _alone,
+    _contradiction,
+    _Finish,
+    _worst,
+)
 from easi_jax.estimation.identifiability import seed_result
 from easi_jax.estimation.posterior import diverged
 from easi_jax.model.parameters import Parameter, ParameterSpace
@@ -83,6 +89,17 @@ def test_of_many_runs_those_that_fit_worst_are_looked_at() -> None:
     looked = _worst(owner, weight)
     assert len(looked) == 8 and looked[-1] == "run10.csv"
     assert _worst(owner[:10], weight[:10]) == names[:2]
+
+
+def test_a_run_by_itself_has_its_pieces_and_no_others() -> None:
+    rows = np.arange(6.0)
+    steps = np.broadcast_to(rows[:, None, None], (6, 4, 1))
+    pieces = Segments(
+        *(rows[:, None], rows[:, None], steps, steps, steps, 0.5 * np.ones(6))
+    )
+    some = _alone(pieces, np.array([0, 0, 1, 1, 0, 0], bool), 3)
+    assert some.count == 3 and some.weight.tolist() == [0.5, 0.5, 0.0]
+    assert some.qpos[:2, 0].tolist() == [2.0, 3.0]
 
 
 def test_a_pass_more_is_made_where_readings_count_otherwise() -> None:
