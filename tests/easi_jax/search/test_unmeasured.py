@@ -114,13 +114,16 @@ def test_the_discriminator_is_not_told(
 
 def test_held_out_errors_are_of_what_was_measured(problem: Problem) -> None:
     class Errors:
-        def of(self, theta: jax.Array) -> np.ndarray:
-            return np.array([0.2, 9.0])
+        count = 7
 
-        def with_floor(self, theta: jax.Array) -> tuple[np.ndarray, np.ndarray]:
-            return np.array([0.2, 9.0]), np.array([0.05, 9.0])
+        def of(self, theta: jax.Array) -> tuple[np.ndarray, int]:
+            return np.array([0.2, 9.0]), 2
+
+        def with_floor(self, theta: jax.Array) -> tuple[np.ndarray, int, np.ndarray]:
+            return np.array([0.2, 9.0]), 1, np.array([0.05, 9.0])
 
     ready: Any = Errors(), Errors()
     found = held_out_errors(problem, problem.simulator.space, [jnp.ones(1)], ready)
     assert found.channels == ["drive"] and found.units == ["rad"]
     assert found.before == [0.2] and found.floor == [[0.05]] and found.fit == [1.0]
+    assert found.windows == 7 and found.not_finite == [2, 1]
