@@ -78,7 +78,7 @@ def _share(hit: np.ndarray, digits: int = 0) -> str:
     return f"{hit.mean():.0%} [{low:.{digits}%}, {high:.{digits}%}]"
 
 
-def _judged(hit: np.ndarray, goal: tuple[float, float]) -> str:
+def judged(hit: np.ndarray, goal: tuple[float, float]) -> str:
     """Whether a goal is reached by a share, or cannot be told from it."""
     if goal[0] <= hit.mean() <= goal[1]:
         return met(True)
@@ -97,7 +97,7 @@ def _right(rows: list[dict[str, Any]]) -> list[str]:
         for q, hit in inside.items():
             told = _share(hit, 1)
             if way in MEANT:
-                told += f", {_judged(hit, GOALS[q])}{few}"
+                told += f", {judged(hit, GOALS[q])}{few}"
             cells.append(told)
         told = f"{ratio:.2f}" + (f", {met(ratio <= BOUND)}" if way == WAYS[-1] else "")
         lines.append((way, *cells, told, f"{most:.3g}"))

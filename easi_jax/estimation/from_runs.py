@@ -263,7 +263,7 @@ class _Finish:
         count = self.whole.count if count is None else count
         if (doubts, count) not in self.endings:
             n, known = self.search.space.size, self.known(self.told)
-            pieces = self.whole.take(np.zeros(count, int))
+            pieces = self.whole.take(slice(count))
             like = placed((jnp.zeros(n), jnp.eye(n), pieces, self.hidden, known))
             program = jax.jit(partial(self.end, doubts)).lower(*like)
             self.endings[doubts, count] = program.compile(quick_compile())
@@ -329,18 +329,18 @@ class _Finish:
         # The last steps on all pieces learn it, too.
         fewer = self.refined and pieces.count < self.whole.count
         passes = _PASSES - 1 if fewer else _PASSES
+        counts = self.counted(weighed, noise, misfit)
         for k in range(passes):
             robust, near = 0 if k else _ROBUST, k > 0
-            known = self.known(noise)
-            given = center, cov, weighed, misfit, known, robust, near
+            given = center, cov, weighed, misfit, self.known(noise), robust, near
             found = distributed.local(self._fit(*placed(given)))
             noise = self.learned(found.residuals)
-            before = self.counted(weighed, known, misfit)
             misfit, weight = self.judged(found, weighed, pieces, noise)
             weighed = replace(pieces, weight=pieces.weight * weight)
             center = jax.block_until_ready(found.fit)
             self.tell(f"least-squares finish: pass {k + 1} of at most {passes}")
-            if self.alike(before, self.counted(weighed, self.known(noise), misfit)):
+            before, counts = counts, self.counted(weighed, noise, misfit)
+            if self.alike(before, counts):
                 break
         if not self.refined or self.lost(found):
             return replace(found, search_mean=mean, search_cov=cov), weight
@@ -370,6 +370,7 @@ class _Finish:
     ) -> _Last:
         """The last steps on all pieces with ``doubts``; fewer where they are ``over``,
         since others follow."""
+        counts = self.counted(last.weighed, last.noise, last.misfit)
         for k in range(_ENDINGS):
             known, at, begun = self.known(last.noise), last.found.fit, last.begun
             # From a plateau nothing leads back.
@@ -378,14 +379,13 @@ class _Finish:
             given = at, cov, last.weighed, last.misfit, known
             found = distributed.local(self.ending(doubts)(*placed(given)))
             noise = self.learned(found.residuals)
-            before = self.counted(last.weighed, known, last.misfit)
             misfit, weight = self.judged(found, last.weighed, self.whole, noise)
             weighed = replace(self.whole, weight=self.whole.weight * weight)
             found = jax.block_until_ready(found)
             last = _Last(found, weight, weighed, misfit, noise, begun)
             self.tell(f"on all of the logs{what}: pass {k + 1} of at most {_ENDINGS}")
-            now = self.counted(weighed, self.known(noise), misfit)
-            if self.lost(found) or over(found) or self.alike(before, now):
+            before, counts = counts, self.counted(weighed, noise, misfit)
+            if self.lost(found) or over(found) or self.alike(before, counts):
                 break
         return last
 
@@ -428,12 +428,12 @@ class _Finish:
         misfit = jnp.maximum(misfit, self.hidden)
         return misfit, outlier_weights(error, assumed, misfit, _OUTLIER)
 
-    def counted(self, pieces: Segments, known: Any, misfit: jax.Array) -> np.ndarray:
+    def counted(
+        self, pieces: Segments, noise: jax.Array, misfit: jax.Array
+    ) -> np.ndarray:
         """What each reading counts in a fit, ``(M, H, 2 nv + N)``."""
-        paired = self.paired(pieces, misfit, known)
-        noise = np.asarray(effective_noise(self.simulator, pieces, paired.noise))
-        weight = np.asarray(step_weights(pieces, jnp.asarray(noise), misfit))
-        return weight / noise**2
+        assumed = effective_noise(self.simulator, pieces, noise)
+        return np.asarray(step_weights(pieces, assumed, misfit) / assumed**2)
 
     def alike(self, before: np.ndarray, now: np.ndarray) -> bool:
         """Whether readings count what they did, so that a fit would be the same."""
@@ -479,9 +479,9 @@ class _Finish:
     def contradictions(self, found: Estimate, weight: jax.Array) -> list[str]:
         """Notes on recordings that lead elsewhere than all of them together do; of many
         those that fit worst are looked at."""
-        if not self.refined or len(set(self.owner.tolist())) < 2:
-            return []
         names = _worst(self.owner, np.asarray(weight))
+        if not self.refined or len(names) < 2:
+            return []
         doubts = {d.parameters if d else (): d for d, _ in self.endings}[found.doubted]
         # A larger robot's program for fewer pieces is compiled in less time than the
         # others take; one of a smaller robot is there.

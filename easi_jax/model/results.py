@@ -424,8 +424,8 @@ class HeldOutErrors:
     floor: list[list[float]]
     fit: list[float]
     measure: str = (
-        "RMS over all steps of all windows, open loop from the "
-        "fitted start, windows every half horizon"
+        "RMS over all steps of all windows, open loop from the fitted start, windows "
+        "every half horizon"
     )
     windows: int = 0
     not_finite: list[int] = field(default_factory=list)
