@@ -8,7 +8,7 @@ import numpy as np
 
 from easi_jax.data.cleaning import split_at_resets, to_common_step, without_odd_ends
 from easi_jax.data.holdout import split_held_out
-from easi_jax.data.noise import pooled_noise
+from easi_jax.data.noise import pooled_noise, without_held
 from easi_jax.data.recording import Log, Run, check_run
 from easi_jax.data.unmeasured import measured_alike
 
@@ -58,6 +58,8 @@ def measured_runs(
     notes = [*log.notes, *(held_out.notes if held_out else ()), *_states(mj_model)]
     alike, unused = measured_alike(mj_model, everything)
     notes += unused
+    alike, held = _without_held(alike)
+    notes += held
     recorded, kept_out = alike[: len(log.runs)], alike[len(log.runs) :]
     # Before interpolation, which would smooth the noise.
     noise = pooled_noise(recorded)
@@ -79,6 +81,23 @@ def measured_runs(
     else:
         name = ", ".join(run.name for run in held)
     return MeasuredRuns(tuple(recorded), noise, fit, held, name, notes)
+
+
+def _without_held(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """Runs whose slow sensors have readings where these are new, and a note."""
+    out = [without_held(run) for run in runs]
+    names = {
+        name
+        for run, before in zip(out, runs, strict=True)
+        for name in run.sensors
+        if run.sensors[name] is not before.sensors[name]
+    }
+    if not names:
+        return out, []
+    return out, [
+        f"sensors that are slower than the rows and held between their readings: "
+        f"{', '.join(sorted(names))}; only rows with a new reading count"
+    ]
 
 
 def _states(m: mujoco.MjModel) -> list[str]:

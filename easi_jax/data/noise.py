@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,8 @@ _SLACK = 0.5  # of the same: scatter from which nothing can be told
 _MOVING = 10.0  # times the noise, that a joint moves over a difference in half the rows
 _AGREES = 1.2  # of variances of a velocity by itself and beside its positions
 _HELD_STEPS = 3.0  # times the resolution, that a sensor which is held moves by
+_UNEVEN = 0.5  # of the usual interval between a slow sensor's readings, that one is off
+_REGULAR = 0.9  # share of intervals that are even, of a sensor that is held
 _BINOMIAL = [math.comb(2 * k, k) for k in _ORDERS]  # variance of white noise there
 _TRIM, _TRIMMINGS = 3.0, 8  # standard deviations, rounds
 # Variance of what is Gaussian of variance 1 and no farther out.
@@ -116,20 +119,21 @@ def sensor_noise(runs: Sequence[Run]) -> dict[str, Noise]:
     for run in runs:
         for name, given in run.sensors.items():
             given, kept = np.asarray(given, float), _kept_noise(run)
-            readings = _fresh(given)
+            readings, rows = _fresh(given)
             if len(readings) > min(_ORDERS):
                 step = resolution_of(readings)
-                if len(readings) == len(given):
-                    readings = _without_commands(readings, run)
+                readings = _without_commands(readings, run, rows)
                 own = _estimate(readings, 0, step, kept)
                 found.setdefault(name, []).append(Noise(*own))
     return {name: _pooled(each) for name, each in found.items()}
 
 
-def _without_commands(readings: np.ndarray, run: Run) -> np.ndarray:
-    """``readings (T, dim)`` less what is proportional to the commands of their row and
-    of the one before, where commands make most of their jumps."""
-    sent = np.concatenate([run.ctrl, np.vstack([run.ctrl[:1], run.ctrl[:-1]])], 1)
+def _without_commands(readings: np.ndarray, run: Run, rows: np.ndarray) -> np.ndarray:
+    """``readings (K, dim)`` in some ``rows (K,)`` less what is proportional to the
+    commands of their row and of the one before, where commands make most of their
+    jumps."""
+    sent = [run.ctrl[rows], run.ctrl[np.maximum(rows - 1, 0)]]
+    sent = np.concatenate(sent, 1)
     if len(readings) < _ROWS_PER_COMMAND * max(1, sent.shape[1]):
         return readings
     jumps, cause = (np.diff(x, _JUMPS, axis=0) for x in (readings, sent))
@@ -147,25 +151,61 @@ def _pooled(each: Sequence[Noise]) -> Noise:
     return Noise(np.nanmedian(some, 0), told)
 
 
-def _fresh(readings: np.ndarray) -> np.ndarray:
-    """Rows of ``readings (T, dim)`` that are finite, one of each that is held; one
-    sign of quaternions."""
-    x = readings[np.isfinite(readings).all(1)]
+def _fresh(readings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Those of ``readings (T, dim)`` that are finite, one of each that is held, with
+    one sign of quaternions; and their rows."""
+    rows = np.flatnonzero(np.isfinite(readings).all(1))
+    x = readings[rows]
     if len(x) < 2:
-        return x
+        return x, rows
     if x.shape[1] == 4 and np.allclose(np.linalg.norm(x, axis=1), 1.0, atol=1e-3):
         turned = np.sum(x[1:] * x[:-1], axis=1) < 0
         x = (
             x
             * np.cumprod(np.concatenate([[1.0], np.where(turned, -1.0, 1.0)]))[:, None]
         )
-    new = np.concatenate([[True], (np.diff(x, axis=0) != 0).any(1)])
+    new = changed(x)
+    return (x[new], rows[new]) if _leaps(x, new) else (x, rows)
+
+
+def without_held(run: Run) -> Run:
+    """A run without the rows in which a sensor that is slower than the rows is held:
+    no readings there, NaN.
+
+    Such a sensor changes at regular intervals, by more than its resolution. One that
+    rests now and then (a touch sensor in the air) reads in every row.
+    """
+    sensors = dict(run.sensors)
+    for name, given in run.sensors.items():
+        x = np.asarray(given, float)
+        there = np.isfinite(x).all(1)
+        new = changed(x[there])
+        if not _leaps(x[there], new):
+            continue
+        apart = np.diff(np.flatnonzero(new))
+        usual = np.median(apart)
+        even = np.mean(np.abs(apart - usual) <= _UNEVEN * usual)
+        if usual < 2 or even < _REGULAR:
+            continue
+        held = np.flatnonzero(there)[~new]
+        sensors[name] = x.copy()
+        sensors[name][held] = np.nan
+    return replace(run, sensors=sensors)
+
+
+def changed(x: np.ndarray) -> np.ndarray:
+    """Rows of ``x (T, dim)`` that are not like the one before, ``(T,)`` bool."""
+    first = np.ones(min(len(x), 1), bool)
+    return np.concatenate([first, (np.diff(x, axis=0) != 0).any(1)])
+
+
+def _leaps(x: np.ndarray, new: np.ndarray) -> bool:
+    """Whether ``x (T, dim)`` changes in few rows, ``new (T,)``, and leaps there: coarse
+    readings repeat, too, but go on by single steps of their resolution."""
     step = np.abs(np.diff(x[new], axis=0))
     if 2 * new.sum() > len(x) or not len(step):
-        return x
-    # Coarse readings repeat, too, but go on by single steps of their resolution.
-    held = np.median(step.max(1)) > _HELD_STEPS * resolution_of(x).max()
-    return x[new] if held else x
+        return False
+    return bool(np.median(step.max(1)) > _HELD_STEPS * resolution_of(x).max())
 
 
 def _estimate(
@@ -314,9 +354,13 @@ def resolutions(run: Run) -> np.ndarray:
 
 
 def resolution_of(x: np.ndarray) -> np.ndarray:
-    """Smallest step between two readings of each column of ``x (T, n)``."""
+    """Smallest step between two readings of each column of ``x (T, n)``; what is not
+    finite is none."""
     out = np.zeros(x.shape[1])
-    for i, column in enumerate(x.T):
+    for i, given in enumerate(x.T):
+        column = given[np.isfinite(given)]
+        if not len(column):
+            continue
         gaps = np.asarray(np.diff(np.unique(column)), float)
         size = np.abs(column)
         largest, usual = float(size.max()), float(np.percentile(size, _USUAL))

@@ -26,6 +26,7 @@ class Segments:
         sensed: readings of N numbers of sensors where each step begins, or where it
             ends (`easi_jax.data.sensor_channels.SensorNumber.at_end`), ``(M, H, N)``;
             () where none are compared.
+        read: which of these there are, 1 or 0, ``(M, H, N)``; () where all.
         time: of the start since that of its run or episode, ``(M,)`` [s]; () where no
             simulation has use for it.
         hidden: what laws remember there (`easi_jax.data.law_states`), ``(M, S)``;
@@ -43,6 +44,7 @@ class Segments:
     past: Any = ()
     act: Any = ()
     sensed: Any = ()
+    read: Any = ()
     time: Any = ()
     hidden: Any = ()
     seen: Any = ()
@@ -81,6 +83,7 @@ def cut(
     act: np.ndarray | None = None,
     before: np.ndarray | None = None,
     sensed: np.ndarray | None = None,
+    read: np.ndarray | None = None,
     timed: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Segments | None:
     """Segments of one uninterrupted recording ``(T, ...)``, None if too short.
@@ -90,7 +93,7 @@ def cut(
         act: activations at each row, ``(T, na)``.
         before: commands before the first row, ``(D, nu)``.
         sensed: what sensors read where the step of a row begins, or ends,
-            ``(T - 1, N)``.
+            ``(T - 1, N)``; ``read`` which of these there are, 1 or 0; all where None.
         timed: time of each row ``(T,)`` and what laws remember there ``(T, S)``, where
             the pieces hold them.
     """
@@ -110,6 +113,7 @@ def cut(
         past=sent[np.maximum(earlier, 0)] if past else (),
         act=act[starts] if act is not None and act.shape[1] else (),
         sensed=sensed[steps] if sensed is not None and sensed.shape[1] else (),
+        read=read[steps] if read is not None else (),
         time=timed[0][starts] if timed is not None else (),
         hidden=timed[1][starts] if timed is not None else (),
     )

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from mujoco.mjx._src.types import SensorType
 
-from easi_jax.data.noise import resolution_of, sensor_noise
+from easi_jax.data.noise import finest, resolution_of, sensor_noise
 from easi_jax.data.recording import Run
 from easi_jax.model.sensors import sensor_columns, sensor_kind, sensor_unit
 
@@ -21,6 +21,7 @@ _NOT_ON_MJX = {"CAMPROJECTION", "CONTACT", "RANGEFINDER", "TACTILE"}
 _ON_MJX = {kind.name for kind in SensorType} - _NOT_ON_MJX
 _ACCELERATION = mujoco.mjtStage.mjSTAGE_ACC
 _EARLY = 0.8  # of the squared error otherwise: readings of before their row's command
+_FEWEST = 20  # readings of a run that say something of a model
 _EXPLAINED = 2.0  # times the squared noise: predicted but for that
 
 
@@ -90,9 +91,20 @@ class Sensors:
         """The same, those of some sensors `SensorNumber.at_end`."""
         return Sensors(tuple(replace(n, at_end=n.sensor in names) for n in self))
 
+    def known(self, run: Run) -> np.ndarray:
+        """Rows in which each was read, ``(T, N)`` bool."""
+        there = {n.sensor: _read(run, n.sensor) for n in self}
+        parts = [there[n.sensor] for n in self]
+        return np.stack(parts, 1) if parts else np.zeros((len(run), 0), bool)
+
     def readings(self, run: Run) -> np.ndarray:
-        """What was read, ``(T, N)``; quaternions of one sign."""
-        parts = [np.asarray(run.sensors[n.sensor], float)[:, n.index] for n in self]
+        """What was read, ``(T, N)``; quaternions of one sign. Between readings by
+        linear interpolation."""
+        parts, row = [], np.arange(len(run))
+        for n in self:
+            given = np.asarray(run.sensors[n.sensor], float)[:, n.index]
+            there = _read(run, n.sensor)
+            parts.append(np.interp(row, row[there], given[there]))
         out = np.stack(parts, 1) if parts else np.zeros((len(run), 0))
         for part in self.orientations:
             q = out[:, part]
@@ -101,6 +113,10 @@ class Sensors:
                 q * np.cumprod(np.r_[1.0, np.where(turned, -1.0, 1.0)])[:, None]
             )
         return out
+
+    def read(self, run: Run) -> np.ndarray:
+        """`readings`, NaN where there is none."""
+        return np.where(self.known(run), self.readings(run), np.nan)
 
     def noise(self, runs: Sequence[Run]) -> tuple[np.ndarray, np.ndarray]:
         """Standard deviations ``(N,)``, and which of them are upper bounds."""
@@ -111,7 +127,15 @@ class Sensors:
 
     def resolution(self, runs: Sequence[Run]) -> np.ndarray:
         """Smallest step between two readings, ``(N,)``."""
-        return np.max([resolution_of(self.readings(run)) for run in runs], axis=0)
+        return np.max([resolution_of(self.read(run)) for run in runs], axis=0)
+
+    def finest(self, runs: Sequence[Run]) -> np.ndarray:
+        """The least of these of all runs, ``(N,)`` (`easi_jax.data.noise.finest`)."""
+        return finest([resolution_of(self.read(run)) for run in runs])
+
+    def spread(self, runs: Sequence[Run]) -> np.ndarray:
+        """Standard deviation of all readings, ``(N,)``."""
+        return np.nanstd(np.concatenate([self.read(run) for run in runs]), 0)
 
     def simulated_by(self, engine: str) -> tuple["Sensors", dict[str, str]]:
         """Those that an engine has, and why others are left out, by channel."""
@@ -184,11 +208,18 @@ def read_at_end(sensors: Sensors, begins: np.ndarray, ends: np.ndarray) -> list[
 
     Args:
         begins, ends: errors of a model in units of the noise, ``(W, T, N)``, readings
-            compared where steps begin and where the step before ends.
+            compared where steps begin and where the step before ends; NaN where there
+            are none.
     """
 
     def squares(errors: np.ndarray) -> np.ndarray:
-        return np.nanmedian(np.mean(errors.astype(float) ** 2, 1), 0)
+        """Of windows with any; NaN where none has."""
+        square = errors.astype(float) ** 2
+        known = np.isfinite(square)
+        count = known.sum(1)
+        mean = np.where(known, square, 0.0).sum(1) / np.maximum(count, 1)
+        each = zip(mean.T, count.T, strict=True)
+        return np.array([np.median(m[n > 0]) if n.any() else np.nan for m, n in each])
 
     of = np.array([n.sensor for n in sensors])
     names = []
@@ -251,8 +282,8 @@ def moving_sensors(
     and why others are not among them."""
     known, ignored = measured_sensors(m, runs)
     sensors, unpredicted = known.simulated_by(engine)
-    read = np.concatenate([sensors.readings(run) for run in runs])
-    moves = np.ptp(read, axis=0) > 0
+    read = np.concatenate([sensors.read(run) for run in runs])
+    moves = np.nanmax(read, 0) > np.nanmin(read, 0)
     moving = {n.sensor for n, move in zip(sensors, moves, strict=True) if move}
     sensors = Sensors(tuple(n for n in sensors if n.sensor in moving))
     names = dict.fromkeys(n.sensor for n in sensors)
@@ -275,8 +306,13 @@ def _why_not(m: mujoco.MjModel, i: int, runs: Sequence[Run]) -> str:
     without = [run.name for run in runs if name not in run.sensors]
     if without:
         return f"not recorded in {', '.join(without)}"
-    read = [np.isfinite(np.asarray(run.sensors[name], float)).all(1) for run in runs]
-    rows = np.concatenate(read)
-    if not rows.all():
-        return f"no reading in {(~rows).sum()} of {len(rows)} rows"
+    for run in runs:
+        count = int(_read(run, name).sum())
+        if count < min(_FEWEST, len(run)):
+            return f"{count} readings in the {len(run)} rows of {run.name}"
     return ""
+
+
+def _read(run: Run, name: str) -> np.ndarray:
+    """Rows in which a sensor was read, ``(T,)`` bool."""
+    return np.isfinite(np.asarray(run.sensors[name], float)).all(1)

@@ -43,7 +43,7 @@ from easi_jax.estimation.prediction_error import (
     white_noise,
 )
 from easi_jax.estimation.problem import Problem
-from easi_jax.estimation.weights import step_weights
+from easi_jax.estimation.weights import readings, step_weights
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.search.config import SearchConfig
 from easi_jax.search.easi import Search, SearchData
@@ -194,7 +194,8 @@ class _Finish:
         simulator: reads ``sensors``, N numbers, that are fitted as well.
         told: noise as the rows tell it: where motion is rough, too much; ``least``
             what the resolution makes.
-        hidden: misfit that leaves out velocities that were derived from positions.
+        hidden: misfit that leaves out velocities that were derived from positions,
+            ``(H, 2 nv + N)``.
         doubts: what the model may lack; None where nothing is refined.
         lacking: what it may lack as well where it errs by more than the noise.
     """
@@ -237,7 +238,10 @@ class _Finish:
         # Velocities derived from the positions say nothing that those do not.
         nv, count = simulator.mj_model.nv, len(self.sensors)
         seen = np.concatenate([np.ones(nv), problem.measured, np.ones(count)])
-        self.hidden = jnp.asarray(np.where(seen > 0, 0.0, np.inf), self.told.dtype)
+        hidden = np.broadcast_to(
+            np.where(seen > 0, 0.0, np.inf), (self.steps, len(seen))
+        )
+        self.hidden = jnp.asarray(hidden, self.told.dtype)
 
     def compile(self) -> None:
         """Compiles both programs beside each other; the second where it is needed."""
@@ -323,7 +327,7 @@ class _Finish:
         """The finish of one search, and the weights that its pieces end with."""
         center, pieces = mean, self.pieces
         # What sensors read is taken for what the fit to the motion leaves of it.
-        motion = jnp.arange(len(self.hidden)) < len(self.problem.noise)
+        motion = jnp.arange(len(self.told)) < len(self.problem.noise)
         misfit = jnp.where(motion, self.hidden, jnp.inf)
         weighed, noise = pieces, self.told
         # The last steps on all pieces learn it, too.
@@ -334,7 +338,7 @@ class _Finish:
             robust, near = 0 if k else _ROBUST, k > 0
             given = center, cov, weighed, misfit, self.known(noise), robust, near
             found = distributed.local(self._fit(*placed(given)))
-            noise = self.learned(found.residuals)
+            noise = self.learned(found)
             misfit, weight = self.judged(found, weighed, pieces, noise)
             weighed = replace(pieces, weight=pieces.weight * weight)
             center = jax.block_until_ready(found.fit)
@@ -378,7 +382,7 @@ class _Finish:
             at = jnp.where(lost, begun, at)
             given = at, cov, last.weighed, last.misfit, known
             found = distributed.local(self.ending(doubts)(*placed(given)))
-            noise = self.learned(found.residuals)
+            noise = self.learned(found)
             misfit, weight = self.judged(found, last.weighed, self.whole, noise)
             weighed = replace(self.whole, weight=self.whole.weight * weight)
             found = jax.block_until_ready(found)
@@ -405,14 +409,15 @@ class _Finish:
         """Whether a fit is none."""
         return bool(diverged(found, self.search.space.names))
 
-    def learned(self, error: jax.Array) -> jax.Array:
+    def learned(self, found: Estimate) -> jax.Array:
         """Noise ``(2 nv + N,)`` as what a fit leaves shows it, where that is no more
         than rows alone tell; as it was given, if it was."""
-        runs = self.problem.fit
+        runs, error = self.problem.fit, found.residuals
         smooth = any(r.smoothed or r.stamps is not None for r in runs)
         if self.problem.noise_given or smooth or error.shape[1] < _READABLE:
             return self.told
-        return believed(white_noise(error), self.told, self.least)
+        there = readings(found.pieces, error.shape[2])
+        return believed(white_noise(error, there), self.told, self.least)
 
     def judged(
         self,
@@ -424,9 +429,10 @@ class _Finish:
         """What the model errs by, and new weights, from what a fit leaves."""
         assumed = effective_noise(self.simulator, pieces, noise)
         error = found.residuals
-        misfit = misfit_of(error, assumed, weighed.weight)
-        misfit = jnp.maximum(misfit, self.hidden)
-        return misfit, outlier_weights(error, assumed, misfit, _OUTLIER)
+        there = readings(pieces, error.shape[2])
+        counts = weighed.weight[:, None, None] * there
+        misfit = jnp.maximum(misfit_of(error, assumed, counts), self.hidden)
+        return misfit, outlier_weights(error, assumed, misfit, _OUTLIER, there)
 
     def counted(
         self, pieces: Segments, noise: jax.Array, misfit: jax.Array
@@ -509,7 +515,7 @@ def _resolution_noise(problem: Problem, sensors: Sensors) -> np.ndarray:
     runs, measured = problem.fit, problem.measured
     position = finest([resolutions(run) for run in runs])
     velocity = finest([resolution_of(run.qvel) for run in runs])
-    sensed = finest([resolution_of(sensors.readings(run)) for run in runs])
+    sensed = sensors.finest(runs)
     step = [position, np.where(measured, velocity, 0.0), sensed]
     return np.concatenate(step) / math.sqrt(12.0)
 

@@ -83,8 +83,8 @@ class PairedFit:
         start: standard deviations of the true starts about those of the segments,
             ``(S,)``: positions, velocities, and activations where these are free; by
             default the noise, and activations that are known.
-        misfit: what the model itself errs by in every step, standard deviations
-            ``(2 nv,)`` on top of the noise; inf leaves a channel's steps out.
+        misfit: what the model itself errs by, standard deviations on top of the noise,
+            in every step ``(2 nv,)`` or in each ``(H, 2 nv)``; inf leaves steps out.
     """
 
     simulator: Simulator

@@ -71,6 +71,7 @@ def segments_from_runs(
         ValueError: a run of another control step.
     """
     parts, none = [], np.zeros(simulator.mj_model.nv, bool)
+    whole = all(sensors.known(run).all() for run in runs)
     trusted = none if fitted else trusted_velocities(runs)
     for run in runs:
         if abs(run.dt / simulator.dt - 1) > _STEPS_AGREE:
@@ -78,25 +79,25 @@ def segments_from_runs(
         qvel = velocities(run, trusted)
         act = activation_guess(simulator.mj_model, run)
         given = run.qpos, qvel, run.ctrl, horizon, every, simulator.past_steps
-        more = act, run.before, _read_in_steps(sensors, run)
+        known = None if whole else _in_steps(sensors, 1.0 * sensors.known(run))
+        more = act, run.before, _in_steps(sensors, sensors.readings(run)), known
         timed = None
         if simulator.is_timed:
             timed = times(run), law_states(simulator.mj_model, run)
         parts.append(cut(*given, *more, timed))
-    whole = [p for p in parts if p is not None]
-    if not whole:
+    found = [p for p in parts if p is not None]
+    if not found:
         longest = max(runs, key=len)
         raise UserError(
             f"no run is longer than {horizon} steps ({horizon * simulator.dt:g} s); "
             f"the longest, {longest.name}, has {len(longest)} rows: record more, or "
             "shorten --horizon"
         )
-    return join(whole)
+    return join(found)
 
 
-def _read_in_steps(sensors: Sensors, run: Run) -> np.ndarray:
-    """What was read of each step of a run, ``(T - 1, N)``."""
-    read = sensors.readings(run)
+def _in_steps(sensors: Sensors, read: np.ndarray) -> np.ndarray:
+    """Of rows ``(T, N)`` what belongs to each step, ``(T - 1, N)``."""
     return np.where(sensors.at_end, read[1:], read[:-1])
 
 

@@ -58,7 +58,8 @@ class Estimate:
         residuals: predicted minus measured, ``(M, H, 2 nv + N)``, at the best place
             that was looked at: before its score was adjusted, or doubts went beyond
             their bounds, or what nothing refines had its starts corrected.
-        misfit: what the model errs by in every step, ``(2 nv,)``, beyond the noise.
+        misfit: what the model errs by beyond the noise, in every step ``(2 nv,)`` or
+            in each ``(H, 2 nv)``.
         start: what was known of starts, standard deviations ``(S,)``.
         doubts: of effects that the model may lack, means and standard deviations in
             those before any data, ``(k, 2)`` (`easi_jax.estimation.doubts`).
@@ -302,6 +303,7 @@ def _stated(
     spread: jax.Array,
 ) -> Estimate:
     noise, misfit = paired.noise, paired.misfit
+    misfit = jnp.zeros_like(noise) if misfit is None else misfit
     return Estimate(
         # Where next to nothing is known, what others do may lead anywhere.
         distribution=gaussian(paired.space, paired.space.clip(center), spread),
@@ -316,7 +318,7 @@ def _stated(
         simulated=fit.simulated,
         pieces=paired.segments,
         residuals=fit.residuals,
-        misfit=jnp.zeros_like(noise) if misfit is None else misfit,
+        misfit=misfit,
         start=paired.spread,
         doubts=jnp.zeros((0, 2)),
     )

@@ -10,7 +10,13 @@ from easi_jax.estimation.weights import huber
 # Second differences of white noise, their variance, and how many of them count as one
 # independent number (1 + 2 (16 + 1) / 36).
 _DIFFERENCED, _ALIKE = 6.0, 1.94
-_LEAST_NOISE = 1e-2  # times that of the rows: where nothing moves a fit leaves no error
+# Of the step, that a model's own error grows with: its variance is that of a force that
+# errs at random after 1 (speeds) and 3 (positions), of one that is wrong after 2 and 4.
+_POWERS = 0.0, 1.0, 2.0, 4.0
+_SCORED = 30  # rounds of Fisher scoring, which squares its error in each
+# Times that of the rows: where nothing moves a fit leaves no error; those of a slow
+# sensor may hold a hundred times as much motion.
+_LEAST_NOISE = 1e-3
 _SAME_NOISE = 1.05  # times the noise that rows tell: as much
 
 
@@ -22,41 +28,99 @@ def rms_of_steps(error: jax.Array, instead: jax.Array) -> jax.Array:
 
 
 def misfit_of(error: jax.Array, noise: jax.Array, weight: jax.Array) -> jax.Array:
-    """What a model errs by beyond the noise, standard deviations ``(2 nv,)``.
+    """What a model errs by beyond the noise, standard deviations ``(H, 2 nv)``; pure.
 
-    Errors of a model hang together within a segment, so that its steps count for less
-    than as many independent ones: the variance is scaled up by the number of steps
-    that count as one, ``H var(mean of a segment) / var(step)``.
+    What a model lacks adds up along a piece: the variance is in proportion to a power
+    of the step, the likeliest of `_POWERS`, none of them included. Errors of a model
+    hang together within a piece, so that its steps count for less than as many
+    independent ones: the variance is scaled up by the number of steps that count as
+    one, ``H var(mean of a piece) / var(step)``.
 
     Args:
-        error: ``(M, H, 2 nv)``; a segment that is not finite counts nothing.
-        weight: of each segment, ``(M,)``.
+        error: ``(M, H, 2 nv)``; a piece that is not finite counts nothing.
+        weight: of each number, ``(M, H, 2 nv)``; 0 where nothing was read.
     """
-    fine = _finite(error)
-    error = jnp.where(fine[:, None, None], error, 0.0)
-    weight = jnp.where(fine, weight, 0.0)
-    share = weight / jnp.maximum(weight.sum(), 1e-30)
-    square = jnp.einsum("m,mhc->c", share, error**2) / error.shape[1]
-    together = error.shape[1] * (share @ error.mean(1) ** 2)
-    alike = jnp.clip(together / jnp.maximum(square, 1e-30), 1.0, error.shape[1])
-    return jnp.sqrt(jnp.maximum(square - noise**2, 0.0) * alike)
+    fine = _finite(error)[:, None, None]
+    error, weight = jnp.where(fine, error, 0.0), jnp.where(fine, weight, 0.0)
+    steps = weight.sum(0)  # (H, c)
+    mean = (weight * error**2).sum(0) / jnp.maximum(steps, 1e-30)
+    beyond = _grown(mean, noise**2, steps)
+    own = weight.sum(1)  # (M, c)
+    whole = jnp.maximum(own.sum(0), 1e-30)
+    size = error / jnp.sqrt(noise**2 + beyond)
+    each = (weight * size).sum(1) / jnp.maximum(own, 1e-30)
+    together = (own * each**2).sum(0) / whole
+    square = (weight * size**2).sum((0, 1)) / whole
+    # Of a piece that has been read in all of its steps the count is H.
+    most = (weight > 0).sum(1).max(0)
+    alike = jnp.clip(most * together / jnp.maximum(square, 1e-30), 1.0, None)
+    return jnp.sqrt(beyond * jnp.minimum(alike, jnp.maximum(most, 1)))
 
 
-def white_noise(error: jax.Array) -> jax.Array:
+def _grown(mean: jax.Array, noise: jax.Array, weight: jax.Array) -> jax.Array:
+    """Variance of a model's own error at each step, ``(H, c)``.
+
+    Of each power of the step the likeliest factor (mean squares of Gaussian errors, by
+    Fisher scoring), and of these the likeliest power; the lowest where they are alike.
+
+    Args:
+        mean: squares of errors, ``(H, c)``; variance of the ``noise (c,)``.
+        weight: of each mean, ``(H, c)``.
+    """
+    share = jnp.arange(1, len(mean) + 1) / len(mean)
+    shape = share[:, None] ** jnp.array(_POWERS)  # (H, P)
+    shape = shape[:, None]  # (H, 1, P)
+    noise = jnp.maximum(noise, 1e-30)[:, None]
+    mean, weight = mean[..., None], weight[..., None]
+
+    def scored(_: int, factor: jax.Array) -> jax.Array:
+        w = weight * shape / (noise + factor * shape) ** 2
+        down = jnp.maximum((w * shape).sum(0), 1e-30)
+        return jnp.maximum((w * (mean - noise)).sum(0) / down, 0.0)
+
+    begin = jnp.zeros((mean.shape[1], len(_POWERS)), mean.dtype)
+    factor = jax.lax.fori_loop(0, _SCORED, scored, begin)
+    total = noise + factor * shape
+    surprise = (weight * (jnp.log(total) + mean / total)).sum(0)
+    best = jnp.argmin(surprise, axis=1)[:, None]
+    return jnp.take_along_axis(factor * shape, best[None], 2)[..., 0]
+
+
+def white_noise(error: jax.Array, there: jax.Array | None = None) -> jax.Array:
     """Noise of readings, ``(n,)``, by what errors of predictions leave white; pure.
 
-    Second differences along a piece keep white noise and little of what a model errs
-    by, which is smooth; the median over pieces keeps out those in which it jumps. In
-    the readings themselves fast motion would pass for noise.
+    Second differences of readings as near to each other as any keep white noise and
+    little of what a model errs by, which is smooth; the median over pieces keeps out
+    those in which it jumps. In the readings themselves fast motion would pass for
+    noise.
 
     Args:
         error: ``(M, H, n)``; at least three steps.
+        there: which numbers were read, 1 or 0, ``(M, H, n)``; all where None.
+
+    Not a number for those of which no piece has three readings.
     """
-    bent = jnp.diff(error, 2, axis=1)
-    square = jnp.nanmedian((bent**2).mean(1), 0) / _DIFFERENCED
+    there = jnp.ones_like(error) if there is None else there
+    row = jnp.arange(error.shape[1])[:, None]
+    latest = jax.lax.cummax(jnp.where(there > 0, row, -1), axis=1)
+    # Rows of the reading before that of each row, and of the one before this.
+    first = jnp.pad(latest[:, :-1], [(0, 0), (1, 0), (0, 0)], constant_values=-1)
+    second = jnp.take_along_axis(first, jnp.maximum(first, 0), 1)
+    before, earlier = (
+        jnp.take_along_axis(error, jnp.maximum(at, 0), 1) for at in (first, second)
+    )
+    known = (there > 0) & (first > 0) & (second >= 0)
+    # Beyond a gap more is left of what the model errs by.
+    span = jnp.where(known, row - second, error.shape[1])
+    known &= span == span.min((0, 1))
+    bent = jnp.where(known, error - 2.0 * before + earlier, 0.0) ** 2
+    count = known.sum(1)
+    square = bent.sum(1) / count  # 0 / 0: none
+    free = count.sum(0) / jnp.maximum((count > 0).sum(0), 1)
     # A chi-square's median (Wilson and Hilferty, PNAS 17, 1931).
-    free = bent.shape[1] / _ALIKE
-    return jnp.sqrt(square) / (1.0 - 2.0 / (9.0 * jnp.maximum(free, 0.5))) ** 1.5
+    free = jnp.maximum(free / _ALIKE, 0.5)
+    median = jnp.nanmedian(square, 0) / _DIFFERENCED
+    return jnp.sqrt(median) / (1.0 - 2.0 / (9.0 * free)) ** 1.5
 
 
 def believed(seen: A, told: A, least: A | float = 0.0) -> A:
@@ -74,15 +138,20 @@ def believed(seen: A, told: A, least: A | float = 0.0) -> A:
 
 
 def outlier_weights(
-    error: jax.Array, noise: jax.Array, misfit: jax.Array, limit: float
+    error: jax.Array,
+    noise: jax.Array,
+    misfit: jax.Array,
+    limit: float,
+    there: jax.Array | None = None,
 ) -> jax.Array:
-    """Weight of each segment ``(M,)``: 1, or less beyond ``limit`` median errors.
+    """Weight of each piece ``(M,)``: 1, or less beyond ``limit`` median errors.
 
-    Huber's weight on the RMS over a segment of the error in units of its expectation;
-    0 of what is not finite.
+    Huber's weight on the RMS over a piece of the error in units of its expectation;
+    0 of what is not finite. ``there``: which numbers were read, 1 or 0, all where None.
     """
-    expected = noise**2 + misfit**2
-    size = jnp.sqrt((error**2 / expected).mean((1, 2)))
+    square = error**2 / (noise**2 + misfit**2)
+    there = jnp.ones_like(square) if there is None else there
+    size = jnp.sqrt((there * square).sum((1, 2)) / jnp.maximum(there.sum((1, 2)), 1.0))
     fine = _finite(error)
     return jnp.where(fine, huber(jnp.where(fine, size, jnp.nan), limit), 0.0)
 

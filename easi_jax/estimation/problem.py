@@ -26,6 +26,7 @@ from easi_jax.devices.runtime import quick_compile
 from easi_jax.errors import UserError
 from easi_jax.estimation.pieces import segments_from_runs, visible_steps
 from easi_jax.estimation.starts import known_noise
+from easi_jax.estimation.weights import readings
 from easi_jax.model.found_effects import FoundEffects, joined
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import open_loop
@@ -92,8 +93,10 @@ class Problem:
         read = pieces.sensed[:, 1:]
         span = np.ptp(np.asarray(read), axis=(0, 1))
         size = known_noise(sensors.noise(runs)[0], span)
+        there = np.asarray(readings(pieces, len(sensors)))[:, 1:] > 0
         begins, ends = (
-            np.asarray(sensors.reading.alike(x, read) - read) / np.maximum(size, 1e-30)
+            np.where(there, np.asarray(sensors.reading.alike(x, read) - read), np.nan)
+            / np.maximum(size, 1e-30)
             for x in (each[:, 1:, 0], each[:, :-1, 1])
         )
         of_forces = {n.sensor for n in sensors if n.of_forces}

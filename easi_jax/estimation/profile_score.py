@@ -136,7 +136,7 @@ class ProfileFit(PairedFit):
             draws: standard normal, ``(M, K, H + 1, 2 nv)``: of each start, then of
                 what is measured after each step.
             spread: standard deviations of the noise of starts, then of what comes
-                after, ``(2, 2 nv)``.
+                after, of each step or of all, ``(1 + H or 2, 2 nv)``.
         """
 
         def one(item: Any) -> Any:
@@ -158,7 +158,7 @@ class ProfileFit(PairedFit):
                 """The measured piece, then those that ``e`` would have made of it."""
                 k, e = item
                 d, r, jac = real
-                first, later = e[0] * spread[0], e[1:] * spread[1]
+                first, later = e[0] * spread[0], e[1:] * spread[1:]
                 new = shift_start(self.simulator, s, d + first)
                 new = self._measured(new, r + later)
                 new = jax.tree.map(lambda x, y: jnp.where(k, x, y), new, s)
@@ -245,7 +245,8 @@ def adjust(paired: PairedFit, unit: jax.Array) -> Adjusted:
     off = jnp.zeros_like(noise) if fit.misfit is None else fit.misfit
     later = jnp.where(jnp.isfinite(off), jnp.hypot(noise, off), 0.0)
     root = _Root(fit, fit.weight, draws)
-    begin = root.begin(raised_to_range(space, unit), jnp.stack([noise, later]))
+    spread = jnp.concatenate([noise[None], jnp.atleast_2d(later)])
+    begin = root.begin(raised_to_range(space, unit), spread)
     end, rounds = jax.lax.scan(root.search, begin, jnp.array([False, True]))
     u, found = end.here
     points = (1 + _DRAWS) * _TURNS * fit.points * rounds.sum()

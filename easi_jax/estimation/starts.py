@@ -49,6 +49,8 @@ class Starts:
         known: how far they are by the noise of the rows alone, ``(s,)``.
         rows: so many first rows of a window decide on its start.
         step: sizes of differences, ``(s,)``.
+        read: which readings there are, 1 or 0, ``(W, T, c)``; ``simulate`` returns zero
+            for the others. All where None.
         parts: of the machine that each number of a start belongs to, ``(s,)``, the
             first of them those of the channels; all one where None.
         slope: of errors with the start, ``(s, W, T, c)``, of the last `linearize`.
@@ -63,12 +65,13 @@ class Starts:
     step: np.ndarray
     known: np.ndarray
     parts: np.ndarray | None = None
+    read: np.ndarray | None = None
     slope: np.ndarray = field(init=False)
     bent: float = field(init=False, default=0.0)
 
     def part(self, some: slice) -> "Starts":
         """Of some of the windows, whose errors can no longer be asked for."""
-        out = replace(self)
+        out = replace(self, read=None if self.read is None else self.read[some])
         out.slope = self.slope[:, some]
         return out
 
@@ -106,6 +109,29 @@ class Starts:
     @property
     def _weight(self) -> np.ndarray:
         return 1.0 / self.noise**2
+
+    @property
+    def noises(self) -> np.ndarray:
+        """Noise of each reading, 0 where there is none, to be broadcast to ``(W, T,
+        c)``."""
+        noise = np.where(np.isfinite(self.noise), self.noise, 0.0)
+        return noise if self.read is None else noise * self.read
+
+    def counted(self, errors: np.ndarray, first: int) -> np.ndarray:
+        """Errors ``(..., W, T, c)`` from a row on. Rows without a reading have none,
+        and the others are as much larger: mean squares are those of readings."""
+        out = errors[..., first:, :]
+        if self.read is None:
+            return out
+        return out / np.sqrt(self.share(first)).astype(errors.dtype)
+
+    def share(self, first: int) -> np.ndarray:
+        """Of readings that there are from a row of all windows on, above 0, ``(c,)``;
+        all of channels that nobody measured."""
+        if self.read is None:
+            return np.ones(len(self.noise))
+        read = self.read[:, first:]
+        return np.maximum(read.mean((0, 1)), 1.0 / read[..., 0].size)
 
     def gain(self) -> tuple[np.ndarray, np.ndarray]:
         """What turns errors of the first rows, and offsets, into a Gauss-Newton step:
@@ -215,7 +241,7 @@ class Starts:
         # Of start offsets, and of their product with each reading's own noise.
         cov = np.einsum("wstc,wutc,c->wsu", gain, gain, noise**2, optimize=True)
         out = np.einsum("swtc,wsu,uwtc->wtc", self.slope, cov, self.slope)
-        out += noise**2
+        out += self.noises**2
         near = self.slope[:, :, : self.rows]
         own = np.einsum("wstc,swtc->wtc", gain, near, optimize=True)
         out[:, : self.rows] -= 2 * noise**2 * own
@@ -260,6 +286,7 @@ def starts_about(
     act: np.ndarray,
     dt: float,
     parts: np.ndarray | None = None,
+    read: np.ndarray | None = None,
 ) -> Starts:
     """Starts of windows that begin where a log says, `lead_rows` early.
 
@@ -271,7 +298,8 @@ def starts_about(
         free: how far what nobody measured may be off, ``(2 nv,)``; infinite elsewhere.
         act: how far activations may be off, ``(na,)``.
         dt: control step [s].
-        parts: as for `Starts`; not where channels are more than positions.
+        parts, read: as for `Starts`; ``parts`` not where channels are more than
+            positions.
     """
     known = np.where(np.isfinite(noise), noise, 0.0)[: len(position)]
     small, part = _DIFFERENCE
@@ -290,6 +318,7 @@ def starts_about(
         np.concatenate([step, part * act]),
         np.concatenate([np.where(np.isfinite(free), free, by_rows), act]),
         parts if len(noise) == len(position) else None,
+        read,
     )
 
 
@@ -317,6 +346,7 @@ def floor(
     noise = np.where(known, starts.noise, 0.0)
     coarse = np.logical_and(step > 0, least > 0.5 * noise)
     white = np.sqrt(np.maximum(noise**2 - (coarse * least) ** 2, 0.0))
+    there = 1.0 if starts.read is None else starts.read
     total, count = np.zeros(exact.shape), np.zeros(len(exact))
     for first in range(0, draws, _TOGETHER):
         many = min(_TOGETHER, draws - first)
@@ -325,7 +355,7 @@ def floor(
         # Of the same grid the fitted motion would give the readings it was fitted to.
         phase = size * rng.uniform(size=(many, len(exact), 1, len(size)))
         rounded = np.round((read + phase) / size) * size - phase
-        read = np.where(coarse, rounded, read)
+        read = there * np.where(coarse, rounded, read)
         vectors = np.repeat(x[None], many, 0)
         at = np.broadcast_to(begin, (many, *begin.shape))
         _, errors = starts.fit(vectors, at, read)
@@ -335,7 +365,7 @@ def floor(
         count += fine.sum(0)
     # Of a model that predicts nothing the noise of the readings alone is known.
     each = np.broadcast_to(count[:, None, None], total.shape)
-    return np.where(each > 0, total / np.maximum(each, 1.0), noise**2)
+    return np.where(each > 0, total / np.maximum(each, 1.0), starts.noises**2)
 
 
 def _scaled(normal: np.ndarray, size: np.ndarray) -> np.ndarray:

@@ -14,14 +14,23 @@ _APART = 4.0  # standard deviations of a typical piece's cost: what fits far wor
 def step_weights(
     segments: Segments, noise: jax.Array, misfit: jax.Array | None = None
 ) -> jax.Array:
-    """Weight of each measured number, ``(M, H, 2 nv)``: 1 where the model is exact, 0
-    of what is not measured."""
+    """Weight of each measured number, ``(M, H, 2 nv)``, and of sensors: 1 where the
+    model is exact, 0 of what is not measured."""
     share = jnp.where(jnp.isfinite(noise), 1.0, 0.0)
     if misfit is not None:
         known = jnp.isfinite(noise)
         share = share / (1.0 + jnp.where(known, misfit / noise, 0.0) ** 2)
-    shape = (segments.count, segments.horizon, noise.shape[0])
-    return jnp.broadcast_to(segments.weight[:, None, None] * share, shape)
+    return segments.weight[:, None, None] * share * readings(segments, noise.shape[0])
+
+
+def readings(segments: Segments, size: int) -> jax.Array:
+    """Which numbers there are, 1 or 0, ``(M, H, size)``: positions and velocities, and
+    what was read of sensors."""
+    given, shape = segments.read, (segments.count, segments.horizon)
+    if isinstance(given, tuple):
+        return jnp.ones((*shape, size))
+    motion = jnp.ones((*shape, size - given.shape[-1]))
+    return jnp.concatenate([motion, given], -1)
 
 
 def excess(costs: jax.Array, weight: jax.Array) -> jax.Array:

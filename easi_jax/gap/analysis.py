@@ -230,7 +230,11 @@ class Analysis:
         for early in (False, True):
             p.early[:] = early
             _, errors = at.starts.solve(p.neutral, at.moved)
-            found.append(errors[:, at.data.lead + 1 :, nv:] / at.data.noise[nv:])
+            after = errors[:, at.data.lead + 1 :, nv:] / at.data.noise[nv:]
+            if at.starts.read is not None:
+                there = at.starts.read[:, at.data.lead + 1 :, nv:]
+                after = np.where(there > 0, after, np.nan)
+            found.append(after)
         names = read_at_end(p.sensors, *found)
         p.early[:] = [n.sensor in names for n in p.sensors]
         if not names:
@@ -244,7 +248,8 @@ class Analysis:
         """Recordings whose windows are predicted far worse than the others', by how
         much."""
         at, runs, kept = self.reported, self.data.runs, last_figures(outcome)
-        fitted = at.starts.solve(outcome.x, at.moved)[1][:, self.data.lead + 1 :]
+        fitted = at.starts.solve(outcome.x, at.moved)[1]
+        fitted = at.starts.counted(fitted, self.data.lead + 1)
         fitted, _ = measure.finite(fitted, self.predictor.largest)
         square = np.concatenate([measure.squares(fitted), kept.square])
         names = list(dict.fromkeys(run.recording for run in runs))

@@ -160,7 +160,8 @@ class Fitting:
         errors = self.selector.errors(x[None])[0]
         rng, after, moved = np.random.default_rng(1), self.data.lead + 1, self.moved
         noise = floor(self.starts, x, moved, _DRAWS, self.data.resolution, rng)
-        square, due = measure.squares(errors[:, after:]), noise[:, after:].mean((0, 1))
+        square = measure.squares(self.starts.counted(errors, after))
+        due = noise[:, after:].mean((0, 1)) / self.starts.share(after)
         low = openness(square, due, self.channels.scale).low
         return bool(np.nanmax(low) <= DECIDE.closed)
 
@@ -182,6 +183,9 @@ class Fitting:
         noise[nv:] = self.starts.noise[nv:]
         errors = self.selector.errors(self.neutral[None])[0].astype(float)
         moved = errors[:, -1] - errors[:, self.data.lead]
+        if self.starts.read is not None:
+            both = self.starts.read[:, [self.data.lead, -1]].all(1)
+            moved = np.where(both, moved, np.nan)
         changed = measure.with_moving(self.channels, moved, noise)
         more = changed is not self.channels
         self.channels = changed
@@ -206,7 +210,7 @@ class Fitting:
             return
         error = steps_error(self.predictor, self.data)
         error = error[: len(self.windows), : self.steps + 1]
-        mine = self.starts.left(error)[:, self.data.lead + 1 :]
+        mine = self.starts.counted(self.starts.left(error), self.data.lead + 1)
         size = float(measure.gap(measure.squares(mine).mean(0), self.channels.scale))
         if size < _STEPS_SEEN * self.floor:
             return

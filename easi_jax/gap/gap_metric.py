@@ -64,13 +64,13 @@ def channels(
     for run in runs:
         origin = np.broadcast_to(runs[0].qpos[0], run.qpos.shape)
         difference, read = run.configuration.difference, sensors.readings(run)
-        parts.append(np.c_[difference(origin, run.qpos), read])
+        parts.append(np.c_[difference(origin, run.qpos), sensors.read(run)])
         if len(run) > steps:
             moved = difference(run.qpos[:-steps], run.qpos[steps:])
             changes.append(np.c_[moved, read[steps:] - read[:-steps]])
     everything = np.concatenate(parts)
     change = np.sqrt(np.mean(np.concatenate(changes) ** 2, 0))
-    spread = everything.std(0)
+    spread = np.nanstd(everything, 0)
     names = [*names, *(n.channel for n in sensors)]
     joints = [joint_name(m, j) for j in m.dof_jntid]
     joints += [f"sensor.{n.sensor}" for n in sensors]
@@ -108,10 +108,13 @@ def with_moving(found: Channels, moved: np.ndarray, noise: np.ndarray) -> Channe
     joint is not left out; nor is one that was left out for a noise that is less.
 
     Args:
-        moved: predicted changes over a horizon, ``(W, c)``.
+        moved: predicted changes over a horizon, ``(W, c)``; NaN where there was no
+            reading.
         noise: of readings, ``(c,)``; infinite where not measured.
     """
-    size = np.maximum(np.sqrt(np.nanmedian(moved**2, 0)), found.change)
+    each = [np.abs(m[np.isfinite(m)]) for m in moved.T]
+    usual = np.array([np.median(m) if len(m) else 0.0 for m in each])
+    size = np.maximum(usual, found.change)
     stuck = (
         ~np.isfinite(found.scale) & np.isfinite(noise) & (size > DECIDE.visible * noise)
     )

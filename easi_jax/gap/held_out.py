@@ -72,7 +72,8 @@ class HeldOut:
         `easi_jax.estimation.starts.floor`."""
         rng = np.random.default_rng(0)
         got = floor(self.starts, x, self._moved, DRAWS, self.resolution, rng)
-        return got[:, self.lead + 1 :].mean((0, 1))
+        after = self.lead + 1
+        return got[:, after:].mean((0, 1)) / self.starts.share(after)
 
     def _fitted(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         begin = np.broadcast_to(self._moved, (len(x), *self._moved.shape))
@@ -85,7 +86,7 @@ class HeldOut:
         not, ``(B, W)``."""
         if share and self.steps is not None:
             errors = errors - share * self.starts.left(self.steps)
-        after = errors[:, :, self.lead + 1 :]
+        after = self.starts.counted(errors, self.lead + 1)
         return measure.finite(after, self.predictor.largest)
 
     def _figures(self, x: np.ndarray, errors: np.ndarray, share: float) -> Figures:

@@ -59,6 +59,7 @@ class Window(NamedTuple):
     speed: jax.Array
     led: jax.Array
     sensed: jax.Array
+    known: jax.Array
     last: jax.Array
     time: jax.Array
     hidden: jax.Array
@@ -203,7 +204,7 @@ class Predictor:
         self.windows, self.steps = windows, windows.ctrl.shape[1]
         moved = np.abs(self._unwrapped(windows.read)).max((0, 1))
         moved = np.where(self.wrapped, np.minimum(moved, np.pi), moved)
-        span = np.ptp(self._readings(windows), axis=(0, 1))
+        span = np.ptp(self._sensors_of(windows.sensed), axis=(0, 1))
         self.largest = np.concatenate([moved, span])[: self.channels]
         # By powers of two, so that the program of one log often serves the next.
         self._room = 1 << (self.blocks - 1).bit_length()
@@ -229,7 +230,8 @@ class Predictor:
         fill = np.minimum(np.arange(self._room * BLOCK), len(windows) - 1)
         padded = windows.take(fill)
         read = self._unwrapped(padded.read)
-        sensed = self._readings(padded)
+        sensed = self._sensors_of(padded.sensed)
+        known = self._sensors_of(padded.known, 1.0)
         whole = NamedSharding(self.mesh, PartitionSpec())
 
         def blocks(x: np.ndarray) -> jax.Array:
@@ -237,14 +239,23 @@ class Predictor:
             return jax.device_put(np.asarray(x, np.float32).reshape(shape), whole)
 
         given = {f: getattr(padded, f) for f in Window._fields}
-        given |= {"read": read, "sensed": sensed}
+        given |= {"read": read, "sensed": sensed, "known": known}
         return Window(**{name: blocks(x) for name, x in given.items()})
 
-    def _readings(self, windows: WindowSet) -> np.ndarray:
-        """Of the sensors that are predicted, ``(W, T, N)``; planned motion has none."""
-        if windows.sensed.shape[-1]:
-            return windows.sensed[..., self._sensed]
-        return np.zeros((*windows.sensed.shape[:2], len(self.sensors)))
+    def _sensors_of(self, each: np.ndarray, planned: float = 0.0) -> np.ndarray:
+        """Of numbers of sensors ``(W, T, ...)`` those that are predicted, ``(W, T,
+        N)``; ``planned`` of planned motion, which has none."""
+        if each.shape[-1]:
+            return each[..., self._sensed]
+        return np.full((*each.shape[:2], len(self.sensors)), planned)
+
+    @property
+    def read(self) -> np.ndarray:
+        """Which of the numbers that are compared there are, 1 or 0, ``(W, H + 1,
+        channels)``."""
+        sensed = self._sensors_of(self.windows.known, 1.0)
+        motion = np.ones((*sensed.shape[:2], self.nv))
+        return np.concatenate([motion, sensed], 2)[..., : self.channels]
 
     def _unwrapped(self, read: np.ndarray) -> np.ndarray:
         """``WindowSet.read`` with the turns of hinges without limits counted."""
@@ -358,7 +369,8 @@ class Predictor:
 
     def _window(self, model: Model, window: Window, moved: jax.Array) -> jax.Array:
         """Readings less measurements at each row, ``(H + 1, nv + 2 N)``: those of
-        sensors where a row's step begins, then where the step before it ends.
+        sensors where a row's step begins, then where the step before it ends; zero in
+        rows in which a sensor was not read.
 
         Where readings are late, the simulation begins by the longest delay earlier, so
         that it starts from what was read until the window's start. Each joint is
@@ -403,7 +415,9 @@ class Predictor:
         read = _between(window.sensed, read)
         readings = self.sensors.reading.alike(readings, read[:, None])
         begins, ends = readings[:, 0] - read, readings[:-1, 1] - read[1:]
-        return jnp.concatenate([error, begins, jnp.pad(ends, [(1, 0), (0, 0)])], 1)
+        each = jnp.concatenate([begins, jnp.pad(ends, [(1, 0), (0, 0)])], 1)
+        each = jnp.where(jnp.tile(window.known, 2) > 0, each, 0.0)
+        return jnp.concatenate([error, each], 1)
 
     def _misread(
         self, model: Model, window: Window, qs: jax.Array, vs: jax.Array

@@ -63,8 +63,7 @@ def recorded(
     """With motion, noise and resolution of all channels; ``noise (nv,)`` is that of
     positions."""
     runs = [*fit, *held]
-    read = np.concatenate([sensors.readings(run) for run in fit]).std(0)
-    motion = np.concatenate([scales.position, np.maximum(read, 1e-9)])
+    motion = np.concatenate([scales.position, np.maximum(sensors.spread(fit), 1e-9)])
     told, is_bound = sensors.noise(fit)
     step = np.max([resolutions(run) for run in runs], axis=0)
     return Recorded(

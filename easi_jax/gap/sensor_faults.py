@@ -96,8 +96,8 @@ def reading_faults(m: mujoco.MjModel, runs: Sequence[Run]) -> list[ReadingFault]
 def without_faults(runs: Sequence[Run], faults: Sequence[ReadingFault]) -> list[Run]:
     """Runs whose named sensors read what they would without ``faults``.
 
-    What is late is read as much later, by linear interpolation; of the last rows, the
-    last reading.
+    What is late is read as much later, by linear interpolation, in the rows in which a
+    sensor was read then; of the last rows, the last reading.
     """
     out = []
     for run in runs:
@@ -109,7 +109,12 @@ def without_faults(runs: Sequence[Run], faults: Sequence[ReadingFault]) -> list[
             bias = [x for k, x in fault.columns.items() if k.startswith("bias")]
             row = np.arange(len(run))
             at = row + fault.columns.get("late", 0.0) / run.dt
-            moved = np.stack([np.interp(at, row, x) for x in read.T], 1)
+            there = np.isfinite(read).all(1)
+            if not there.any():
+                continue
+            moved = [np.interp(at, row[there], x[there]) for x in read.T]
+            then = there[np.minimum(np.round(at).astype(int), len(run) - 1)]
+            moved = np.where(then[:, None], np.stack(moved, 1), np.nan)
             sensors[fault.at] = moved - (np.array(bias) if bias else 0.0)
         out.append(replace(run, sensors=sensors))
     return out

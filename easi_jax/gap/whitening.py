@@ -88,28 +88,28 @@ def make_residuals(
     keep &= np.tile(np.isfinite(starts.noise), k)
     slope = np.einsum("kh,swhc->wkcs", groups, starts.slope, optimize=True)
     slope = slope.reshape(count, n, size)
-    noise = np.where(np.isfinite(starts.noise), starts.noise, 0.0)
-    white = (groups**2).sum(1)[:, None] * noise**2  # (K, nv)
+    each = np.broadcast_to(starts.noises**2, (count, rows, nv))
+    white = np.einsum("kh,whc->wkc", groups**2, each)
     free = slope * starts.spread
-    spread = np.diag((white + misfit**2).reshape(-1))
+    spread = (white + misfit**2).reshape(count, n)
     root, plain = np.zeros((2, count, n, n))
     floor = np.zeros(count)
-    unit = _unit(groups, lead, scale)
+    unit = _unit(groups, lead, scale * np.sqrt(starts.share(lead + 1)))
     near = groups[:, starts.rows :].sum(1) == 0
     weight = np.where(near[:, None] & (white > 0), 1.0 / np.maximum(white, 1e-300), 0.0)
-    weight = weight.reshape(-1)
+    weight = weight.reshape(count, n)
     some = np.ix_(keep, keep)
     for w in range(count):
-        total = spread + free[w] @ free[w].T
+        total = np.diag(spread[w]) + free[w] @ free[w].T
         total += np.eye(n) * 1e-14 * max(float(np.trace(total)) / n, 1e-20)
         lower = np.linalg.cholesky(total[some])
         root[w][some] = np.linalg.inv(lower)
-        seen = free[w] * weight[:, None]
+        seen = free[w] * weight[w][:, None]
         normal = free[w].T @ seen + np.eye(size)
         refit = np.eye(n) - free[w] @ np.linalg.solve(normal, seen.T)
         refit = unit[:, None] * refit
         plain[w][some] = refit[some] @ lower
-        floor[w] = ((refit**2) @ white.reshape(-1))[keep].sum() / n
+        floor[w] = ((refit**2) @ white[w].reshape(-1))[keep].sum() / n
     return Residuals(groups, scale, root, plain, floor)
 
 

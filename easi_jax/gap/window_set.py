@@ -43,6 +43,8 @@ class WindowSet:
         led: whether the run has as many rows before the window as readings can be late.
         sensed: readings of N numbers of sensors in the rows of ``read``,
             ``(W, 2 L + 2 + H, N)``.
+        known: which of these there are, in the rows from the window's begin to its
+            end, ``(W, H + 1, N)``, 1 or 0.
         last: command of the row after the last step, which sensors of forces may read
             there, ``(W, nu)``.
         time: of the row where the window begins, ``(W,)`` [s].
@@ -61,6 +63,7 @@ class WindowSet:
     speed: np.ndarray
     led: np.ndarray
     sensed: np.ndarray
+    known: np.ndarray
     last: np.ndarray
     time: np.ndarray
     hidden: np.ndarray
@@ -152,6 +155,7 @@ def _windows_of(
         speed=moving(start + np.arange(-late - 1, late + 1)),
         led=w.start_row >= late,
         sensed=sensors.readings(run)[inside(seen)],
+        known=1.0 * sensors.known(run)[start + np.arange(steps + 1)],
         last=run.ctrl[w.start_row + steps],
         time=times(run)[w.start_row],
         hidden=law_states(m, run)[w.start_row],

@@ -9,7 +9,7 @@ from easi_jax.data.activations import activation_guess, activation_spread
 from easi_jax.data.recording import Run
 from easi_jax.data.unmeasured import start_spread
 from easi_jax.estimation.starts import Starts, starts_about
-from easi_jax.gap.predictor import Predictor
+from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.model.effect_catalog import Scales
 from easi_jax.model.separate_trees import start_parts
 
@@ -39,7 +39,11 @@ def window_starts(
     act = np.zeros(m.na)
     if m.na:
         act = activation_spread(m, runs, [activation_guess(m, run) for run in runs])
-    own = len(predictor.neutral)
+    own, whole = len(predictor.neutral), predictor.windows.known.all()
+    at = np.arange(len(predictor.windows))
+    if blocks is not None:
+        at = (blocks[:, None] * BLOCK + np.arange(BLOCK)).reshape(-1)
+    at = at[:count]
 
     def simulate(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
         return predictor.errors(x[..., :own], blocks, moved)[:, :count, :rows]
@@ -53,4 +57,5 @@ def window_starts(
         act,
         runs[0].dt,
         start_parts(m),
+        None if whole else predictor.read[at, :rows],
     )

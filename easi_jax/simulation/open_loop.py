@@ -102,7 +102,7 @@ def _between(simulator: Simulator, reference: Any, states: Any) -> jax.Array:
 
 def errors(simulator: Simulator, model: Any, segments: Segments) -> jax.Array:
     """Measured minus predicted, ``(M, H, 2 nv)``, and of N numbers of sensors where the
-    segments have readings, ``(M, H, 2 nv + N)``."""
+    segments have readings, ``(M, H, 2 nv + N)``; zero where there is none."""
     return errors_from(simulator, model, segments, segments)
 
 
@@ -137,8 +137,10 @@ def error_from(
     *states, each = _predicted(simulator, model, start, steps, True)
     reading: Any = simulator.base.sense
     sensed = reading.alike(reading.chosen(each), measured.sensed)
-    error = _between(simulator, states, target)
-    return jnp.concatenate([error, measured.sensed - sensed], -1)
+    off = measured.sensed - sensed
+    if not isinstance(measured.read, tuple):
+        off = jnp.where(measured.read > 0, off, 0.0)
+    return jnp.concatenate([_between(simulator, states, target), off], -1)
 
 
 def _senses(segments: Segments) -> bool:

@@ -347,13 +347,32 @@ def test_error_of_the_true_model_is_the_noise_floor(simulator):
 def test_misfit_counts_only_what_noise_does_not_explain():
     rng = np.random.default_rng(4)
     white = jnp.asarray(rng.standard_normal((200, 30, 2)))
-    noise, ones = jnp.ones(2), jnp.ones(200)
+    noise, ones = jnp.ones(2), jnp.ones(white.shape)
     assert float(misfit_of(white, noise, ones).max()) < 0.3
     steady = jnp.broadcast_to(3 * white[:, :1], white.shape)  # the same in each step
     expected = np.sqrt((9 - 1) * 30)
     np.testing.assert_allclose(misfit_of(steady, noise, ones), expected, rtol=0.15)
     broken = steady.at[:20, 4].set(jnp.nan)
     np.testing.assert_allclose(misfit_of(broken, noise, ones), expected, rtol=0.15)
+
+
+def test_misfit_grows_along_a_piece_as_errors_do():
+    """One channel errs as a wrong force does, one as at the start, one is read now and
+    then."""
+    rng = np.random.default_rng(5)
+    share = np.arange(1, 31) / 30
+    off = rng.standard_normal((200, 1, 3)) * [8.0, 3.0, 8.0]
+    shape = np.stack([share**2, np.ones(30), share**2], 1)
+    there = np.ones((200, 30, 3))
+    there[..., 2] = np.arange(30) % 5 == 2
+    error = there * (rng.standard_normal(off.shape) + off * shape)
+    found = misfit_of(jnp.asarray(error), jnp.ones(3), jnp.asarray(there))
+    errs = np.array([8.0, 3.0, 8.0]) * shape
+    ratio = np.asarray(found)[5:] / errs[5:]
+    # As many steps count as one: of a few readings nearly all do.
+    assert (np.ptp(ratio, axis=0) < 0.2 * ratio.mean(0)).all(), ratio
+    counted = ratio.mean(0) ** 2
+    assert 15 < counted[0] < 25 and 26 < counted[1] < 33 and 3 < counted[2] < 6, counted
 
 
 def test_noise_is_what_errors_leave_white():
@@ -365,6 +384,16 @@ def test_noise_is_what_errors_leave_white():
     error[..., 1] += 0.2 * wave + jump
     error[7] = np.nan
     np.testing.assert_allclose(white_noise(jnp.asarray(error)), sigma, rtol=0.05)
+    # Of what is slow or has gaps as well.
+    there = np.ones(error.shape)
+    there[:, 4] = there[::2, 9:12] = 0.0
+    gaps = white_noise(jnp.asarray(there * error), jnp.asarray(there))
+    np.testing.assert_allclose(gaps, sigma, rtol=0.05)
+    there[..., 0] = np.arange(25) % 4 == 1
+    there[..., 1] = np.arange(25) % 13 == 1
+    slow = white_noise(jnp.asarray(there * error), jnp.asarray(there))
+    np.testing.assert_allclose(slow[0], sigma[0], rtol=0.08)
+    assert np.isnan(slow[1])
     # Rows that tell less than that are right: then the model errs from row to row.
     told = jnp.array([0.008, 0.3])
     found = believed(white_noise(jnp.asarray(error)), told)

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from easi_jax.data.noise import Noise, noise_of, pooled, sensor_noise
+from easi_jax.data.noise import Noise, noise_of, pooled, sensor_noise, without_held
 from easi_jax.data.recording import Run
 from easi_jax.model.joint_space import Configuration
 
@@ -117,6 +117,27 @@ def test_noise_of_sensors() -> None:
     np.testing.assert_allclose(found["turn"].std, 1e-4, rtol=0.1)
     nothing = np.full((_ROWS, 1), np.nan)
     assert sensor_noise([run, _with(run, dead=nothing)]) == {}
+
+
+def test_rows_in_which_a_slow_sensor_is_held_hold_no_reading() -> None:
+    run, rng = _run(100, "smooth", 1e-3, 0.1), np.random.default_rng(4)
+    row, wave = np.arange(_ROWS), np.sin(3.0 * run.time)[:, None]
+    slow = row - row % 5
+    slow[202:] = row[202:] - (row[202:] - 1) % 5  # a clock that drifts
+    sensors = {
+        "held": wave[slow] + 1e-3 * rng.normal(size=(_ROWS, 1))[slow],
+        "touch": np.maximum(np.sin(row / 9.0), 0.0)[:, None]
+        * (row % 150 < 50)[:, None],
+        "coarse": np.round(wave / 0.05) * 0.05,
+        "fast": wave + 1e-3 * rng.normal(size=(_ROWS, 2)),
+        "none": np.full((_ROWS, 1), np.nan),
+    }
+    found = without_held(_with(run, **sensors)).sensors
+    for name in ("touch", "coarse", "fast", "none"):
+        np.testing.assert_array_equal(found[name], sensors[name])
+    new = np.diff(sensors["held"][:, 0], prepend=np.nan) != 0
+    np.testing.assert_array_equal(np.isfinite(found["held"][:, 0]), new)
+    np.testing.assert_array_equal(found["held"][new], sensors["held"][new])
 
 
 def test_jumps_of_commands_are_no_noise_of_torques() -> None:

@@ -44,7 +44,9 @@ def learned(
     finish: Any = object.__new__(_Finish)
     finish.problem = SimpleNamespace(noise_given=given, fit=runs)
     finish.told, finish.least = jnp.asarray(TOLD), jnp.asarray([0.0, least])
-    return np.asarray(finish.learned(jnp.asarray(error)))
+    pieces = SimpleNamespace(read=(), count=len(error), horizon=steps)
+    found: Any = SimpleNamespace(residuals=jnp.asarray(error), pieces=pieces)
+    return np.asarray(finish.learned(found))
 
 
 def test_noise_is_that_of_the_errors() -> None:

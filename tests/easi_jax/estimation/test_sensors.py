@@ -14,7 +14,7 @@ from easi_jax.data.measured import MeasuredRuns
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import to_device
 from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
-from easi_jax.estimation import from_runs
+from easi_jax.estimation import from_runs, weights
 from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.pieces import segments_from_runs
 from easi_jax.estimation.problem import Problem, problem_of
@@ -154,8 +154,43 @@ def test_a_torque_says_how_strong_all_of_it_is(problem: Problem) -> None:
             *(machine, space, pieces, jnp.asarray(noise)), start=jnp.asarray(_NOISE)
         )
         hessian = np.asarray(jax.jit(paired.information)(unit), float)
-        known.append(np.sqrt(np.ones(3) @ hessian @ np.ones(3)))
-    assert known[1] > 50 * known[0]
+        known.append(np.sqrt(max(np.ones(3) @ hessian @ np.ones(3), 0.0)))
+    assert known[1] > 50 * known[0] and known[1] > 50
+
+
+def test_rows_without_a_reading_say_nothing(problem: Problem) -> None:
+    """As if the readings that are there were all that there is: whatever stands in the
+    others."""
+    simulator, sensors = problem.simulator.sensing(problem.sensors), problem.sensors
+    (run,) = problem.fit
+    rng = np.random.default_rng(3)
+    gaps = {k: np.array(v) for k, v in run.sensors.items()}
+    gaps["torque"][rng.uniform(size=_ROWS) < 0.3] = np.nan
+    gaps["rate"][np.arange(_ROWS) % 4 != 1] = np.nan
+    machine = replace(run, sensors=gaps)
+    assert sensors.known(machine).mean() < sensors.known(run).mean() == 1.0
+    fits = []
+    for read in (run, machine):
+        given = simulator, [read], 20, 20
+        pieces = to_device(segments_from_runs(*given, sensors=sensors))
+        noise = jnp.asarray(np.concatenate([_NOISE, sensors.noise([read])[0]]))
+        both = simulator, simulator.space, pieces, noise
+        fits.append(PairedFit(*both, start=jnp.asarray(_NOISE)))
+    whole, some = fits
+    torque = [i + 2 for i, n in enumerate(sensors) if n.sensor == "torque"]
+    told = np.asarray(some.noise)[torque] / np.asarray(whole.noise)[torque]
+    np.testing.assert_allclose(told, 1.0, atol=0.2)
+    some = replace(some, noise=whole.noise)
+    unit = jnp.asarray(simulator.space.to_unit(jnp.array([0.4, 0.05, 2.2])))
+    mask = weights.readings(some.segments, len(noise))
+    assert float(mask[..., 2].mean()) == pytest.approx(0.7, abs=0.06)
+    still = whole.unmoved
+    expected = whole.normal(unit, still, whole.weight * mask)
+    got = some.normal(unit, still, some.weight)
+    for name in ("hessian", "gradients", "costs", "start_step"):
+        a, b = getattr(got, name), getattr(expected, name)
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4 * np.abs(b).max())
+    assert not np.asarray(got.residuals)[np.asarray(mask) == 0].any()
 
 
 @pytest.mark.parametrize("rows", [101, 102])
@@ -201,7 +236,7 @@ def test_the_finish_finds_all_of_it(problem: Problem) -> None:
     assert told.relative is None and set(told.flags) == {"determined"}
     rate = [i for i, n in enumerate(problem.sensors) if n.sensor == "rate"]
     torque = [i for i, n in enumerate(problem.sensors) if n.sensor == "torque"]
-    misfit = np.asarray(found.misfit)[2:]
+    misfit = np.asarray(found.misfit)[:, 2:].T
     assert misfit[rate].max() > 0.4 and misfit[torque].max() < _TORQUE
 
 

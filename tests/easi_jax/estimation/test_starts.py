@@ -1,10 +1,13 @@
 """Starts that are fitted with a model's own dynamics: a linear one, known exactly."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from easi_jax.estimation.prediction_error import believed
 from easi_jax.estimation.starts import Starts, floor
+from easi_jax.gap.whitening import make_residuals
 
 W, T, ROWS, DT = 400, 31, 11, 0.01
 NOISE = np.array([2e-3])
@@ -132,6 +135,43 @@ def test_a_channel_without_readings_has_no_say() -> None:
     beside, errors = fitted(both)
     np.testing.assert_allclose(beside, alone, atol=1e-9)
     assert np.isinf(both.measured_noise(errors)[1])
+
+
+def test_rows_without_a_reading_have_no_say() -> None:
+    """A channel of which three rows of four were not read beside one that was read in
+    all: starts, noise, floor and what fits compare are those of readings."""
+    rng = np.random.default_rng(7)
+    read = np.ones((W, T, 2))
+    read[..., 1] = rng.uniform(size=(W, T)) < 0.25
+    one, off = made(5)
+    more = NOISE * rng.normal(size=(W, T, 1))
+
+    def simulate(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        other = path(moved - off) - path(np.zeros(2)) - more
+        return np.concatenate([one.simulate(x, moved), other], -1) * read
+
+    noise = np.repeat(NOISE, 2)
+    both = replace(one, simulate=simulate, noise=noise, read=read)
+    _, errors = fitted(both)
+    moved = both.solve(np.zeros(1), np.zeros((W, 2)))[0]
+    np.testing.assert_allclose(both.share(ROWS), [1.0, 0.25], rtol=0.05)
+    np.testing.assert_allclose(both.measured_noise(errors), noise, rtol=0.08)
+    drawn = floor(both, np.zeros(1), moved, 20, np.zeros(2), np.random.default_rng(0))
+    assert not drawn[read == 0].any()
+    got = (both.counted(errors, ROWS) ** 2).mean((0, 1))
+    due = drawn[:, ROWS:].mean((0, 1)) / both.share(ROWS)
+    np.testing.assert_allclose(got / due, 1.0, atol=0.08)
+    np.testing.assert_allclose(got[0], got[1], rtol=0.1)
+    np.testing.assert_allclose(drawn.mean(0), both.expected().mean(0), rtol=0.15)
+    whitening = make_residuals(both, 0, np.full(2, 1e-9), np.ones(2))
+    grouped = whitening.grouped(errors[None])
+    plain = whitening.whitened(grouped)[0]
+    filled = whitening.grouped(read[None])[0].reshape(W, -1) > 0
+    assert not plain[~filled].any()
+    numbers = filled.sum(1).mean() - 2  # fitted, position and speed
+    assert (plain**2).sum(1).mean() == pytest.approx(numbers, rel=0.03)
+    expected = np.sqrt(whitening.floor.mean())
+    assert whitening.gap(plain) == pytest.approx(expected, rel=0.05)
 
 
 def test_what_is_not_linear_is_told() -> None:

@@ -60,6 +60,7 @@ def simulator() -> tuple[WindowSet, list[Run]]:
         speed=run.qvel[rows][:, None],
         led=rows >= 0,
         sensed=np.zeros((len(rows), H + 2, 0)),
+        known=np.ones((len(rows), H + 1, 0)),
         last=run.ctrl[rows + H],
         time=TIME[rows],
         hidden=np.zeros((len(rows), 0)),

@@ -1,11 +1,13 @@
 """Named sensors as channels: what is compared, and predictions beside MuJoCo C."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 
+from easi_jax.data.noise import without_held
 from easi_jax.data.recording import Run
 from easi_jax.data.scales import scales_of
 from easi_jax.data.sensor_channels import Sensors, measured_sensors
@@ -92,11 +94,19 @@ def test_what_is_compared_and_why_the_rest_is_not(arm: mujoco.MjModel) -> None:
     assert found.simulated_by("mujoco") == (found, {})
     gaps = run.sensors["acc"].copy()
     gaps[7] = np.nan
-    some = {k: v for k, v in run.sensors.items() if k != "torque"} | {"acc": gaps}
+    few = np.full_like(run.sensors["beam"], np.nan)
+    few[:3] = 1.0
+    some = {k: v for k, v in run.sensors.items() if k != "torque"}
+    some |= {"acc": gaps, "beam": few}
     other = replace(run, name="other", sensors=some)
-    _, ignored = measured_sensors(arm, [run, other])
+    found, ignored = measured_sensors(arm, [run, other])
     assert ignored["sensor.torque"] == "not recorded in other"
-    assert ignored["sensor.acc.0"] == f"no reading in 1 of {2 * ROWS} rows"
+    assert ignored["sensor.beam"] == f"3 readings in the {ROWS} rows of other"
+    acc = [i for i, n in enumerate(found) if n.sensor == "acc"]
+    assert len(acc) == 3 and not found.known(other)[7, acc].any()
+    np.testing.assert_allclose(found.readings(other)[7, acc], gaps[[6, 8]].mean(0))
+    assert np.isnan(found.read(other)[7, acc]).all()
+    assert found.known(other).sum() == found.known(run).sum() - 3
 
 
 def test_readings_of_an_orientation_have_one_sign(arm: mujoco.MjModel) -> None:
@@ -144,6 +154,12 @@ def test_predicted_readings_are_those_of_mujoco(
     got = errors()
     assert got.shape[-1] == p.channels == 1 + len(p.sensors)
     assert np.abs(got / size).max() < 2e-3
+    gaps = {k: v.copy() for k, v in run.sensors.items()}
+    gaps["gyro"][::3] = gaps["acc"][7:99] = np.nan
+    other, missing = predicted(arm, replace(run, sensors=gaps), name, stepped)
+    there = other.read > 0
+    assert 0.6 < there.mean() < 0.97 and not missing()[~there].any()
+    np.testing.assert_allclose(missing()[there], got[there], atol=1e-4)
     p.early[:] = True
     assert np.abs(errors() / size)[..., 1:].max() > 0.1  # torques, a command late
     late = recorded(arm, early=True)
@@ -169,6 +185,14 @@ def test_faults_are_taken_out_of_readings(arm: mujoco.MjModel) -> None:
     ]
     (right,) = without_faults([wrong], faults)
     np.testing.assert_allclose(right.sensors["gyro"][:-2], gyro[:-2], atol=1e-12)
+    gaps = late + bias
+    gaps[[4, 50, 51]] = np.nan
+    wrong = replace(run, sensors={**run.sensors, "gyro": gaps})
+    (right,) = without_faults([wrong], faults)
+    gone = np.flatnonzero(np.isnan(right.sensors["gyro"]).any(1))
+    assert gone.tolist() == [2, 48, 49]
+    there = np.setdiff1d(np.arange(ROWS - 2), gone)
+    np.testing.assert_allclose(right.sensors["gyro"][there], gyro[there], atol=1e-12)
     np.testing.assert_array_equal(right.sensors["acc"], run.sensors["acc"])
 
 
@@ -185,11 +209,26 @@ def noisy(run: Run, seed: int, gain: float = 1.0) -> Run:
     return replace(run, qpos=qpos, qvel=qvel, qvel_measured=False, sensors=sensors)
 
 
-def ended(arm: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch, gain: float) -> Outcome:
+def slow(run: Run) -> Run:
+    """Sensors that are slower than the rows, held or not, and one that misses rows."""
+    sensors = {k: v.copy() for k, v in run.sensors.items()}
+    sensors["gyro"][np.random.default_rng(1).uniform(size=ROWS) < 0.2] = np.nan
+    sensors["acc"][np.arange(ROWS) % 5 != 2] = np.nan
+    row = np.arange(ROWS)
+    sensors["turn"] = sensors["turn"][row - row % 3]
+    return replace(run, sensors=sensors)
+
+
+def ended(
+    arm: mujoco.MjModel,
+    monkeypatch: pytest.MonkeyPatch,
+    gain: float,
+    read: Callable[[Run], Run] = lambda run: run,
+) -> Outcome:
     """The analysis without any effect to try; torques are read ``gain`` times."""
     monkeypatch.setattr("easi_jax.gap.effect_search.places", lambda *_: [])
     monkeypatch.setattr("easi_jax.gap.effect_search.ripples", lambda *_: [])
-    runs = [noisy(recorded(arm, seed=k), k, gain) for k in range(3)]
+    runs = [read(noisy(recorded(arm, seed=k), k, gain)) for k in range(3)]
     noise = np.array([3e-4, 1.0])
     with engine.using("mujoco"):
         given = arm, ParameterSpace(()), runs[:2], runs[2:], noise, 0.2
@@ -208,6 +247,21 @@ def test_sensors_are_part_of_the_gap_beside_their_floor(
     assert compared >= {"a", "sensor.gyro.1", "sensor.torque", "sensor.acc.0"}
     assert "sensor.gyro.0" not in compared  # does not turn that way
     assert 0.9 < right.refit.gap / right.floor < 1.1
+
+
+@pytest.mark.slow
+def test_slow_sensors_and_gaps_are_at_the_same_floor(
+    arm: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right = ended(arm, monkeypatch, 1.0, lambda run: without_held(slow(run)))
+    assert right.verdict == "no_gap"
+    names = right.channels.names
+    compared = [n for n, s in zip(names, right.channels.scale, strict=True) if s < 1e9]
+    assert {"a", "sensor.gyro.1", "sensor.acc.0", "sensor.turn.2"} <= set(compared)
+    at = [names.index(n) for n in compared]
+    ratio = right.refit.si[at] / right.floor_si[at]
+    assert (np.abs(ratio - 1.0) < 0.15).all(), dict(zip(compared, ratio, strict=True))
+    assert right.refit.gap / right.floor == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.slow
