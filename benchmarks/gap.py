@@ -154,6 +154,10 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
         "parameters": [
             {k: v["value"] for k, v in e["parameters"].items()} for e in told["effects"]
         ],
+        "deviations": [
+            {k: v["std"] for k, v in e["parameters"].items()} for e in told["effects"]
+        ],
+        "outcomes": [e["outcome"] for e in told["effects"]],
         "true_parameters": [e["parameters"] for e in known],
         "gap": told["gap"],
         "true_floor": answer["gap"]["floor"],

@@ -114,6 +114,23 @@ def parameter_errors(rows: Sequence[dict[str, Any]]) -> list[float]:
     return out
 
 
+def standardised(rows: Sequence[dict[str, Any]]) -> list[float]:
+    """Errors of the parameters of effects that were named right, in units of the
+    standard deviations that were stated; as `parameter_errors`, but each number by
+    itself."""
+    out = []
+    for r in rows:
+        for name, truth in zip(r["truth"], r["true_parameters"], strict=True):
+            if name not in r["named"] or "deviations" not in r:
+                continue
+            at = r["named"].index(name)
+            told, std = r["parameters"][at], r["deviations"][at]
+            for k in (k for group in _grouped(truth) for k in group):
+                if k in told and std[k] > 0:
+                    out.append((told[k] - truth[k]) / std[k])
+    return out
+
+
 def _grouped(parameters: Mapping[str, Any]) -> list[list[str]]:
     vectors = [[k for k in v if k in parameters] for v in _VECTORS]
     inside = {k for v in _VECTORS for k in v}

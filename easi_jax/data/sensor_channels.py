@@ -315,4 +315,4 @@ def _why_not(m: mujoco.MjModel, i: int, runs: Sequence[Run]) -> str:
 
 def _read(run: Run, name: str) -> np.ndarray:
     """Rows in which a sensor was read, ``(T,)`` bool."""
-    return np.isfinite(np.asarray(run.sensors[name], float)).all(1)
+    return np.asarray(np.isfinite(np.asarray(run.sensors[name], float)).all(1))

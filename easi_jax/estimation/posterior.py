@@ -104,7 +104,7 @@ def estimate(
     keeps the initial spread about the middle of the initial range, wherever the search
     has drifted to; but not where that leads out of a bent valley (`_Whole.likelier`).
     Where the fit leaves more than the noise explains, the model lacks something, and
-    the information counts for less (`_trusted`). Without ``informed`` it is the
+    the information counts for less (`trusted`). Without ``informed`` it is the
     search's own covariance alone. What may be as good as zero is stated as `_near_zero`
     says.
 
@@ -202,7 +202,7 @@ def _of_search(
     weight, pieces = paired.weight, paired.segments
     eq = paired.normal(mean, paired.unmoved, weight)
     left = excess(eq.costs, weight)
-    open_cov, seen, _ = _posterior(eq.hessian * _trusted(left))
+    open_cov, seen, _ = _posterior(eq.hessian * trusted(left))
     spread = open_cov + seen @ cov @ seen.T
     center = _MIDDLE + seen @ (mean - _MIDDLE)
     simulated = jnp.asarray(1.0 * paired.points * pieces.count * pieces.horizon)
@@ -247,7 +247,7 @@ def _of_fit(
         center = whole.likelier(center, fit)
         fit = replace(fit, simulated=fit.simulated + whole.simulated)
     left = scattered(fit.raised_hessian, fit.hessian, fit.gradients)
-    spread = said(left * _trusted(fit.excess))[1]
+    spread = said(left * trusted(fit.excess))[1]
     return _stated(paired, fit, mean, cov, center, spread if informed else cov)
 
 
@@ -383,7 +383,7 @@ def _adjusted(paired: PairedFit, fit: RefineResult) -> RefineResult:
     return replace(found, simulated=fit.simulated + new.simulated)
 
 
-def _trusted(excess: jax.Array) -> jax.Array:
+def trusted(excess: jax.Array) -> jax.Array:
     """Share of the information that is left where the model errs beyond the noise.
 
     What a model lacks makes errors that no parameter takes up, and others that one
@@ -395,7 +395,7 @@ def _trusted(excess: jax.Array) -> jax.Array:
 
 def widened(excess: jax.Array) -> jax.Array:
     """How many times wider spreads are for what the model errs by beyond the noise."""
-    return 1.0 / jnp.sqrt(_trusted(excess))
+    return 1.0 / jnp.sqrt(trusted(excess))
 
 
 def errs_by(found: Estimate) -> jax.Array:

@@ -12,6 +12,7 @@ import numpy as np
 
 from easi_jax.data.cleaning import true_readings, trusted_velocities
 from easi_jax.data.measured import MeasuredRuns
+from easi_jax.data.noise import pooled_noise
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import to_device
 from easi_jax.data.sensor_channels import (
@@ -21,6 +22,7 @@ from easi_jax.data.sensor_channels import (
     read_at_end,
 )
 from easi_jax.data.unmeasured import hidden_in_any
+from easi_jax.data.velocity_lag import of_model, set_right
 from easi_jax.data.windows import lead_rows
 from easi_jax.devices.runtime import quick_compile
 from easi_jax.errors import UserError
@@ -28,6 +30,7 @@ from easi_jax.estimation.pieces import segments_from_runs, visible_steps
 from easi_jax.estimation.starts import known_noise
 from easi_jax.estimation.weights import readings
 from easi_jax.model.found_effects import FoundEffects, joined
+from easi_jax.model.joint_space import tangent_names
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import open_loop
 from easi_jax.simulation.logged import Logged
@@ -159,7 +162,13 @@ def problem_of(
         true_readings(mj_model, r, found.entries) for r in (runs.fit, runs.held)
     )
     hidden = hidden_in_any([*fit, *held])
+    given = [*fit, *held], tangent_names(mj_model), of_model(mj_model)
+    right, undone, changed = set_right(*given)
+    fit, held = right[: len(fit)], right[len(fit) :]
     scatter = np.where(np.tile(hidden, 2), np.inf, _noise_of(name, runs, noise))
+    if changed.any() and not len(noise):
+        told = np.concatenate([np.zeros_like(changed), changed])
+        scatter = np.where(told, pooled_noise(fit), scatter)
     logged = Logged.of([*fit, *held])
     simulator = Simulator(mj_model, space, fit[0].dt, fixed=fixed, logged=logged)
     measured, doubted = _measured(simulator, fit, hidden)
@@ -186,6 +195,7 @@ def problem_of(
                 if e.of_readings
             ),
             *simulator.notes,
+            *undone,
             *doubted,
             *sensed,
         ],

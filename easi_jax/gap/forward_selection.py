@@ -102,6 +102,17 @@ class Selector:
             found -= x[:, -1, None, None, None] * self.steps[at]
         return found
 
+    def rows_once(self) -> np.ndarray:
+        """What each fitted window counts where each row of a log counts once,
+        ``(count,)``: windows overlap."""
+        windows, length = self.predictor.windows, self.residuals.groups.shape[1]
+        at = (BLOCK * self.blocks[:, None] + np.arange(BLOCK)).reshape(-1)
+        run, row = (x[at[: self.count]] for x in (windows.run, windows.row))
+        rows = row[:, None] + np.arange(length)
+        key = run[:, None] * (row.max() + length) + rows
+        _, at, count = np.unique(key, return_inverse=True, return_counts=True)
+        return (1.0 / count[at].reshape(rows.shape)).mean(1)
+
     def windows_of(self, some: np.ndarray) -> np.ndarray:
         """Fitted windows in some of the blocks; the last block may not be full."""
         at = (BLOCK * some[:, None] + np.arange(BLOCK)).reshape(-1)

@@ -2,8 +2,14 @@
 
 from dataclasses import dataclass, field
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from easi_jax.estimation.blocks import scattered
+from easi_jax.estimation.least_squares import OUTCOMES, result_code
+from easi_jax.estimation.posterior import trusted
+from easi_jax.estimation.weights import excess
 from easi_jax.gap.effect_set import Model
 from easi_jax.gap.error_localization import Conditions
 from easi_jax.gap.forward_selection import Selector
@@ -12,6 +18,10 @@ from easi_jax.gap.table import Place
 from easi_jax.gap.verdict import Openness
 from easi_jax.gap.window_set import WindowSet
 from easi_jax.model.parameters import ParameterSpace
+from easi_jax.model.results import Outcome as Ended
+
+# Sizes of differences, that a number without bounds may be off which no data determine.
+_ANYTHING = 1e3
 
 
 @dataclass(frozen=True)
@@ -43,6 +53,7 @@ class Found:
         parts: of a shared effect (`Place.shared`), the actuators that it is seen at.
         cost: of taking it out, in cross-validated log density: nats for each
             independent number that was read.
+        outcome: how the fit of its numbers ended.
     """
 
     place: Place
@@ -54,6 +65,7 @@ class Found:
     deviations: dict[int, float] = field(default_factory=dict)
     parts: tuple[Part, ...] = ()
     cost: float = 0.0
+    outcome: Ended = "converged"
 
 
 @dataclass(frozen=True)
@@ -139,9 +151,11 @@ class Numbers:
 
     def __init__(self, selector: Selector, model: Model) -> None:
         self.selector, self.model = selector, model
-        active = model.fit.active.tolist()
-        std = _deviations(selector, model).tolist()
-        self._std = dict(zip(active, std, strict=True))
+        active = model.fit.active
+        std = np.sqrt(np.diag(_covariance(selector, model))).tolist()
+        self._std = dict(zip(active.tolist(), std, strict=True))
+        codes = model.fit.codes(selector.bounds)
+        self._codes = dict(zip(active.tolist(), codes.tolist(), strict=True))
 
     def fitted(self, place: Place) -> dict[int, float]:
         """Values of a place's columns, by number."""
@@ -152,6 +166,13 @@ class Numbers:
         """Of a place's columns that the fit moved, by number."""
         index = self.selector.columns(place, fitted=False).tolist()
         return {k: self._std[i] for k, i in enumerate(index) if i in self._std}
+
+    def outcome(self, place: Place) -> Ended:
+        """How the fit of a place's columns ended."""
+        index = self.selector.columns(place, fitted=False).tolist()
+        codes = [self._codes[i] for i in index if i in self._codes]
+        code = int(result_code(np.array(codes, int), np.isfinite(self.model.fit.cost)))
+        return OUTCOMES[code]
 
     def values(self, place: Place) -> dict[str, tuple[float, float, str]]:
         """Parameters of an effect as the table names them: value, standard deviation,
@@ -179,17 +200,23 @@ class Numbers:
         ]
 
 
-def _deviations(selector: Selector, model: Model) -> np.ndarray:
-    """Standard deviations of a fit's active entries, from its windows."""
-    f, w = model.fit, selector.weight
-    if not len(f.active):
-        return np.zeros(0)
-    size = selector.bounds.size[f.active]
+def _covariance(selector: Selector, model: Model) -> np.ndarray:
+    """Covariance of a fit's active entries ``(a, a)``, by the rules of a fit of
+    parameters (`easi_jax.estimation.posterior`): each row counts once, values scatter
+    between blocks of windows, and what the model errs by beyond the noise hides a part
+    of itself in them. What the data do not determine may be anything within bounds."""
+    f, bounds = model.fit, selector.bounds
+    size = bounds.size[f.active]
+    weight = selector.weight * selector.rows_once()
     j = f.slope * size
-    normal = np.einsum("w,wma,wmb->ab", w, j, j, optimize=True)
-    score = np.einsum("w,wma,wm->wa", w, j, f.residual, optimize=True)
-    inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
-    # Windows as they scatter, and no better than what their noise allows.
-    scattered = inverse @ (score.T @ score) @ inverse
-    cov = np.where(np.diag(scattered) > np.diag(inverse), scattered, inverse)
-    return np.sqrt(np.maximum(np.diag(cov), 0.0)) * size
+    normal = np.einsum("w,wma,wmb->ab", weight, j, j, optimize=True)
+    score = np.einsum("w,wma,wm->wa", weight, j, f.residual, optimize=True)
+    costs = 0.5 * weight * (f.residual**2).sum(1)
+    counts = np.broadcast_to(weight[:, None, None], (*f.residual.shape, 1))
+    with jax.enable_x64(True):
+        left = scattered(*map(jnp.asarray, (normal, normal, score)))
+        left *= trusted(excess(jnp.asarray(costs), jnp.asarray(counts)))
+    width = bounds.high[f.active] - bounds.low[f.active]
+    open_ = np.where(np.isfinite(width), width / np.sqrt(12.0), _ANYTHING * size)
+    prior = np.diag((size / open_) ** 2)
+    return np.linalg.inv(np.asarray(left) + prior) * np.outer(size, size)

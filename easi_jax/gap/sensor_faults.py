@@ -109,7 +109,7 @@ def without_faults(runs: Sequence[Run], faults: Sequence[ReadingFault]) -> list[
             bias = [x for k, x in fault.columns.items() if k.startswith("bias")]
             row = np.arange(len(run))
             at = row + fault.columns.get("late", 0.0) / run.dt
-            there = np.isfinite(read).all(1)
+            there = np.asarray(np.isfinite(read).all(1))
             if not there.any():
                 continue
             moved = [np.interp(at, row[there], x[there]) for x in read.T]

@@ -171,6 +171,7 @@ class _Judge:
                     numbers.deviations(place),
                     parts,
                     costs[place.key],
+                    numbers.outcome(place),
                 )
             )
         return found

@@ -133,6 +133,7 @@ def _effect(f: Found, gap: float) -> NamedEffect:
         std={columns[k].name: s for k, s in f.deviations.items()},
         shared=bool(f.parts),
         cost=f.cost,
+        outcome=f.outcome,
         pattern=f.place.at if f.place.tied else "",
     )
 

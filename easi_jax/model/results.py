@@ -41,6 +41,7 @@ class NamedEffect:
         pattern: of its places, where it was found as one of like places.
         cost: of taking it out, in cross-validated log density: nats for each
             independent number that was read; None where no prediction uses it.
+        outcome: how the fit of its values ended.
     """
 
     effect: str
@@ -56,6 +57,7 @@ class NamedEffect:
     shared: bool = False
     cost: float | None = None
     pattern: str = ""
+    outcome: Outcome = "converged"
 
     @property
     def label(self) -> str:

@@ -101,6 +101,7 @@ def _effect_json(r: GapResult, e: NamedEffect) -> Iterator[dict[str, Any]]:
             "confidence": e.confidence,
             "explains": r.share(before, gap),
             "removal_cost": e.cost,
+            "outcome": e.outcome,
             "indistinguishable": e.indistinguishable,
             "gap_after": gap,
         }

@@ -158,6 +158,28 @@ def test_a_torque_says_how_strong_all_of_it_is(problem: Problem) -> None:
     assert known[1] > 50 * known[0] and known[1] > 50
 
 
+def test_late_velocities_are_set_right_and_take_part() -> None:
+    m = mujoco.MjModel.from_xml_string(_XML)
+    fit, held = ([_recorded(m, seed)] for seed in (0, 1))
+    late = [
+        [replace(r, qvel=np.vstack([r.qvel[:1], r.qvel[:1], r.qvel[:-2]])) for r in x]
+        for x in (fit, held)
+    ]
+    noise = np.array([_NOISE[0], 1.0])  # which is not used for what is set right
+    runs = MeasuredRuns(tuple(late[0]), noise, late[0], late[1], "r", [])
+    right = MeasuredRuns(tuple(fit), noise, fit, held, "r", [])
+    # Simulated velocities are half a physics step late beside their positions.
+    assert problem_of("rod", m, ParameterSpace(()), right).fit[0] is fit[0]
+    problem = problem_of("rod", m, ParameterSpace(()), runs)
+    assert problem.measured.all()
+    (note,) = [n for n in problem.notes if "velocity of j: late by" in n]
+    assert abs(float(note.split(" ms")[0].split()[-1]) - 20.0) < 1.0
+    np.testing.assert_allclose(problem.noise, _NOISE, rtol=0.25)
+    (run,) = problem.fit
+    off = run.qvel - fit[0].qvel[: len(run)]
+    assert np.std(off) < 0.15 * np.std(late[0][0].qvel - fit[0].qvel)
+
+
 def test_rows_without_a_reading_say_nothing(problem: Problem) -> None:
     """As if the readings that are there were all that there is: whatever stands in the
     others."""
