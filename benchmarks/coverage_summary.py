@@ -55,7 +55,7 @@ def _as_stated(rows: list[dict[str, Any]]) -> str:
         mine = [r for r in rows if r["late"] == late]
         plain = [{**r, "plain": {"distance": r[WAYS[-1]]["bound"]}} for r in mine]
         inside = (
-            _share(covered(found, way, q))
+            share(covered(found, way, q))
             for found, way in ((plain, "plain"), (mine, WAYS[-1]))
             for q in (0.5, 0.9)
         )
@@ -72,7 +72,7 @@ def _as_stated(rows: list[dict[str, Any]]) -> str:
     return markdown_table(head, lines)
 
 
-def _share(hit: np.ndarray, digits: int = 0) -> str:
+def share(hit: np.ndarray, digits: int = 0) -> str:
     """How many of all, ``(targets,)`` bool, and its interval."""
     low, high = wilson(int(hit.sum()), len(hit))
     return f"{hit.mean():.0%} [{low:.{digits}%}, {high:.{digits}%}]"
@@ -95,7 +95,7 @@ def _right(rows: list[dict[str, Any]]) -> list[str]:
         ratio, most = np.quantile(beside_bound(rows, way), (0.5, 0.95))
         cells = []
         for q, hit in inside.items():
-            told = _share(hit, 1)
+            told = share(hit, 1)
             if way in MEANT:
                 told += f", {judged(hit, GOALS[q])}{few}"
             cells.append(told)

@@ -4,11 +4,16 @@ from collections.abc import Iterable, Iterator
 from functools import partial
 from itertools import product
 from pathlib import Path
-from statistics import median
+from statistics import NormalDist, median
 from typing import Any
+
+import numpy as np
 
 from benchmarks._common import markdown_table, short
 from benchmarks._page import Section, each_of, load, met, table
+from benchmarks.coverage_summary import GOALS as COVERED
+from benchmarks.coverage_summary import judged as covered
+from benchmarks.coverage_summary import share
 from benchmarks.found_laws import CLOSED, LIKE
 from benchmarks.found_laws import GOALS as LAW_GOALS
 from benchmarks.gap_real import MACHINES
@@ -25,6 +30,7 @@ from benchmarks.gap_score import (
     parameter_errors,
     ratios,
     shares,
+    standardised,
     wilson,
 )
 from benchmarks.gap_times import EFFECTS
@@ -84,6 +90,27 @@ def _fitted(rows: list[Any]) -> list[str]:
                 ),
             },
         ),
+        *_spreads(rows),
+    ]
+
+
+def _spreads(rows: list[Any]) -> list[str]:
+    """What stated deviations of effects are worth."""
+    off = np.abs(standardised(rows))
+    if not len(off):
+        return []
+    inside = {q: off <= NormalDist().inv_cdf(0.5 + q / 2) for q in COVERED}
+    told = (
+        f"{share(hit)} ({COVERED[q][0]:.0%} to {COVERED[q][1]:.0%}; "
+        f"{covered(hit, COVERED[q])})"
+        for q, hit in inside.items()
+    )
+    lines = zip((f"{q:.0%}" for q in COVERED), told, strict=True)
+    commits = ", ".join(sorted({short(r["commit"]) for r in rows if "deviations" in r}))
+    return [
+        f"True values of the effects that were named right, {len(off)} numbers of the "
+        f"cases since {commits}, inside the intervals that their deviations make:",
+        markdown_table(("interval", "inside [95 %] (goal)"), list(lines)),
     ]
 
 

@@ -116,6 +116,11 @@ def test_parameters_are_compared_as_what_they_are() -> None:
     row["parameters"] = [{"x": 3.0, "y": 4.5, "mass": 1.0, "phase": 7.0}]
     wrong = {**row, "named": ["b@x"]}
     assert gap_score.parameter_errors([row, wrong]) == pytest.approx([0.1, 0.5])
+    assert gap_score.standardised([row]) == [], "no deviations were kept then"
+    row["deviations"] = [{"x": 0.1, "y": 0.25, "mass": 2.0, "phase": 0.1}]
+    assert gap_score.standardised(
+        [row, {**wrong, "deviations": row["deviations"]}]
+    ) == (pytest.approx([0.0, 2.0, -0.5]))
     row["gap"] = {"after": 0.3, "floor": 0.2}
     assert gap_score.ratios([row, {**row, "kind": "pair"}]) == pytest.approx([1.5])
 

@@ -28,6 +28,17 @@ def enough(pieces: int) -> bool:
     return pieces // _PIECES >= FEWEST
 
 
+def too_few(count: int, what: str) -> list[str]:
+    """A note where spreads are those of the noise model, for want of blocks of
+    ``what``, of which there are ``count``; none where they are not."""
+    if enough(count):
+        return []
+    return [
+        f"spreads are those of the noise model: {count} {what} make fewer than "
+        f"{FEWEST} blocks, too few to see how values scatter between"
+    ]
+
+
 def scattered(
     information: jax.Array, hessian: jax.Array, gradients: jax.Array
 ) -> jax.Array:

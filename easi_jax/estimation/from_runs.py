@@ -22,7 +22,7 @@ from easi_jax.devices import distributed
 from easi_jax.devices.mesh import placed
 from easi_jax.devices.runtime import quick_compile
 from easi_jax.estimation import limits
-from easi_jax.estimation.blocks import FEWEST, enough
+from easi_jax.estimation.blocks import too_few
 from easi_jax.estimation.doubts import Doubts, all_doubts, doubts_of, told
 from easi_jax.estimation.identifiability import identifiability
 from easi_jax.estimation.normal_equations import PairedFit
@@ -473,11 +473,7 @@ class _Finish:
                 "sensors read before the command of their row was sent: "
                 f"{', '.join(early)}; compared as such"
             )
-        if self.refined and not enough(self.whole.count):
-            notes.append(
-                f"spreads are those of the noise model: {self.whole.count} pieces make "
-                f"fewer than {FEWEST} blocks, too few to see how values scatter between"
-            )
+        notes += too_few(self.whole.count, "pieces") if self.refined else []
         step = self.simulator.dt / self.simulator.substeps
         notes += told(found.doubted, np.asarray(found.doubts, float), step)
         return notes + self.contradictions(found, weight)

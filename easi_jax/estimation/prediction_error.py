@@ -38,10 +38,13 @@ def misfit_of(error: jax.Array, noise: jax.Array, weight: jax.Array) -> jax.Arra
 
     Args:
         error: ``(M, H, 2 nv)``; a piece that is not finite counts nothing.
+        noise: of the readings, ``(2 nv,)``; infinite where nobody measured, and
+            nothing is known of an error.
         weight: of each number, ``(M, H, 2 nv)``; 0 where nothing was read.
     """
-    fine = _finite(error)[:, None, None]
-    error, weight = jnp.where(fine, error, 0.0), jnp.where(fine, weight, 0.0)
+    fine, known = _finite(error)[:, None, None], jnp.isfinite(noise)
+    error = jnp.where(fine & known, error, 0.0)
+    weight, noise = jnp.where(fine, weight, 0.0), jnp.where(known, noise, 1.0)
     steps = weight.sum(0)  # (H, c)
     mean = (weight * error**2).sum(0) / jnp.maximum(steps, 1e-30)
     beyond = _grown(mean, noise**2, steps)

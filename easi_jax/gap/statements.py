@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from easi_jax.estimation.blocks import too_few
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.decisions import DECIDE
 from easi_jax.gap.effect_search import RIVALS, EffectSearch
@@ -95,6 +96,7 @@ def stated(
             f"the gap itself: {end.figures.gap:.3g} would be {fair:.3g} without "
             "its error; a smaller timestep in the model takes it away"
         )
+    notes += too_few(len(at.windows), "windows") if found else []
     data, x = at.data, at.plain(x)
     steps = held_out.predictor.steps - data.lead
     return Outcome(

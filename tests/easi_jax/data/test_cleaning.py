@@ -352,6 +352,8 @@ def test_misfit_counts_only_what_noise_does_not_explain():
     steady = jnp.broadcast_to(3 * white[:, :1], white.shape)  # the same in each step
     expected = np.sqrt((9 - 1) * 30)
     np.testing.assert_allclose(misfit_of(steady, noise, ones), expected, rtol=0.15)
+    hidden = misfit_of(steady, jnp.array([1.0, jnp.inf]), ones)
+    np.testing.assert_allclose(hidden[0], [expected, 0.0], rtol=0.15)
     broken = steady.at[:20, 4].set(jnp.nan)
     np.testing.assert_allclose(misfit_of(broken, noise, ones), expected, rtol=0.15)
 
