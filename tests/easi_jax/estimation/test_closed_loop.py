@@ -57,8 +57,8 @@ def _recorded(m: mujoco.MjModel, seed: int, name: str) -> Run:
 
 @pytest.mark.slow
 def test_an_estimate_from_a_closed_loop_has_no_bias() -> None:
-    """Of several machines, with a joint that nobody measured, readings that are coarse, and
-    velocities by the positions: errors are as large as they are said to be, and no
+    """Of several machines, with a joint that nobody measured, readings that are coarse,
+    and velocities by the positions: errors are as large as they are said to be, and no
     parameter is off by the same in all."""
     m = mujoco.MjModel.from_xml_string(_XML)
     space = ParameterSpace(
