@@ -210,11 +210,12 @@ class Fitting:
             return
         error = steps_error(self.predictor, self.data)
         error = error[: len(self.windows), : self.steps + 1]
+        self.selector.unseen_steps = error
         mine = self.starts.counted(self.starts.left(error), self.data.lead + 1)
         size = float(measure.gap(measure.squares(mine).mean(0), self.channels.scale))
         if size < _STEPS_SEEN * self.floor:
             return
-        self.selector.steps = error
+        self.selector.steps, self.selector.unseen_steps = error, None
         b = self.selector.bounds
         self.selector.bounds = Bounds(
             np.r_[b.low, 0.0], np.r_[b.high, _WHOLE], np.r_[b.size, 0.1]

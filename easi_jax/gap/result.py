@@ -204,7 +204,8 @@ def _covariance(selector: Selector, model: Model) -> np.ndarray:
     """Covariance of a fit's active entries ``(a, a)``, by the rules of a fit of
     parameters (`easi_jax.estimation.posterior`): each row counts once, values scatter
     between blocks of windows, and what the model errs by beyond the noise hides a part
-    of itself in them. What the data do not determine may be anything within bounds."""
+    of itself in them. What the data do not determine may be anything within bounds. By
+    how much the model's own steps move a value, it is in doubt."""
     f, bounds = model.fit, selector.bounds
     size = bounds.size[f.active]
     weight = selector.weight * selector.rows_once()
@@ -219,4 +220,11 @@ def _covariance(selector: Selector, model: Model) -> np.ndarray:
     width = bounds.high[f.active] - bounds.low[f.active]
     open_ = np.where(np.isfinite(width), width / np.sqrt(12.0), _ANYTHING * size)
     prior = np.diag((size / open_) ** 2)
-    return np.linalg.inv(np.asarray(left) + prior) * np.outer(size, size)
+    cov = np.linalg.inv(np.asarray(left) + prior)
+    if selector.unseen_steps is not None:
+        error = selector.residuals.grouped(selector.unseen_steps[None])
+        off = selector.residuals.whitened(error)[0]
+        pull = np.einsum("w,wma,wm->a", weight, j, off, optimize=True)
+        moved = np.linalg.solve(normal + prior, pull)
+        cov += np.outer(moved, moved)
+    return cov * np.outer(size, size)
