@@ -152,7 +152,7 @@ class Numbers:
     def __init__(self, selector: Selector, model: Model) -> None:
         self.selector, self.model = selector, model
         active = model.fit.active
-        std = np.sqrt(np.diag(_covariance(selector, model))).tolist()
+        std = np.sqrt(np.diag(fit_covariance(selector, model))).tolist()
         self._std = dict(zip(active.tolist(), std, strict=True))
         codes = model.fit.codes(selector.bounds)
         self._codes = dict(zip(active.tolist(), codes.tolist(), strict=True))
@@ -200,7 +200,7 @@ class Numbers:
         ]
 
 
-def _covariance(selector: Selector, model: Model) -> np.ndarray:
+def fit_covariance(selector: Selector, model: Model) -> np.ndarray:
     """Covariance of a fit's active entries ``(a, a)``, by the rules of a fit of
     parameters (`easi_jax.estimation.posterior`): each row counts once, values scatter
     between blocks of windows, and what the model errs by beyond the noise hides a part
