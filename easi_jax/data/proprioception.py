@@ -25,6 +25,7 @@ from easi_jax.errors import UserError
 from easi_jax.model.joint_space import joint_name, scalar_dofs, tangent_units
 
 _GRAVITY, _TOUCH = "gravity", "touch"
+_READ = 0.95  # share of rows in which a sensor that is compared was read
 # Sensors whose readings a heading or a place in the world does not enter.
 _OWN = {
     *("GYRO", "ACCELEROMETER", "VELOCIMETER", "FORCE", "TORQUE", "TOUCH", "FRAMEQUAT"),
@@ -176,6 +177,11 @@ def proprioception(
         channels += [(f"qvel.{named[d]}", _UNITS[units[d]]) for d in speeds]
     known, why = measured_sensors(m, runs)
     known, unsimulated = known.simulated_by(engine)
+    # Interpolated readings would be too smooth beside a simulation's.
+    read = np.min([known.known(run).mean(0) for run in runs], axis=0)
+    few = {n.sensor for n, share in zip(known, read, strict=True) if share < _READ}
+    slow = {n.channel: "it misses too many rows" for n in known if n.sensor in few}
+    known, why = Sensors(tuple(n for n in known if n.sensor not in few)), why | slow
     own = Sensors(tuple(n for n in known if n.kind in _OWN))
     notes += [f"{c} is left out: {text}" for c, text in {**why, **unsimulated}.items()]
     left = dict.fromkeys(n.sensor for n in known if n.kind not in _OWN)

@@ -23,6 +23,9 @@ _SETTLES = 5.0  # time constants of a run, until a filter has forgotten its star
 _MEAN = 0.01  # s, over which velocities are compared
 _EXPLAINS = 0.8  # share of the squared difference that is left, at most
 _CERTAIN = 0.5  # of it with as long an advance, that a delay leaves at most
+# Time constants to either side of a row, that slopes are taken over: short ones bend
+# least, and half of one makes 1.7 times the noise of it.
+_REACHES = 0.0, 0.5
 _FEWEST = 30  # rows of a run that say something of it
 
 # Of each run, steps of the positions as velocities ``(T - 1,)`` [m/s, rad/s] and what
@@ -60,8 +63,10 @@ def set_right(
         for way in (_delayed, _filtered):
             share, late = _best(parts, dt, way, simulated)
             seconds = late - simulated if way is _delayed else late
-            if share < _EXPLAINS and seconds > simulated:
-                right = [_undone(run, d, seconds, way) for run in runs]
+            if share > _EXPLAINS or seconds <= simulated:
+                continue
+            for reach in _REACHES if way is _filtered else _REACHES[:1]:
+                right = [_undone(run, d, seconds, way, reach) for run in runs]
                 # With the noise that undoing makes more of.
                 left = [_steps(run) for run in right if len(run) > _FEWEST]
                 left = [(moved[:, d], read[:, d]) for moved, read in left]
@@ -147,14 +152,14 @@ def _off(parts: _Parts, dt: float, way: _Seen, seconds: float) -> np.ndarray:
     return np.array(out)
 
 
-def _undone(run: Run, d: int, seconds: float, way: _Seen) -> Run:
-    """A run with one velocity read as much earlier, or unfiltered; without the last
-    rows, of which nothing was read later."""
+def _undone(run: Run, d: int, seconds: float, way: _Seen, reach: float) -> Run:
+    """A run with one velocity read as much earlier, without the last rows, of which
+    nothing was read later; or unfiltered, by slopes over ``reach`` time constants to
+    either side, a row at least."""
     read, qvel, row = run.qvel[:, d], run.qvel.copy(), np.arange(len(run))
     if way is _filtered:
-        # A slope over as long as the filter takes multiplies noise by 1.7.
-        reach = max(1, round(0.5 * seconds / run.dt))
-        low, high = np.maximum(row - reach, 0), np.minimum(row + reach, row[-1])
+        rows = max(1, round(reach * seconds / run.dt))
+        low, high = np.maximum(row - rows, 0), np.minimum(row + rows, row[-1])
         slope = (read[high] - read[low]) / ((high - low) * run.dt)
         qvel[:, d] = read + seconds * slope
         return replace(run, qvel=qvel)

@@ -30,6 +30,24 @@ def test_channels_are_what_neither_place_nor_heading_enters() -> None:
     assert any("place is left out: it depends on the heading" in n for n in notes)
 
 
+def test_a_slow_sensor_is_left_out_and_a_gap_is_filled() -> None:
+    """Between readings far apart nothing is as rough as a simulation's."""
+    m, run = walk(4.0)
+    sensors = {k: np.array(v) for k, v in run.sensors.items()}
+    sensors["gyro"][np.arange(len(run)) % 4 != 0] = np.nan
+    sensors["orientation"][7:9] = np.nan
+    of, notes = proprioception(m, [replace(run, sensors=sensors)], "mujoco")
+    assert not any("gyro" in name for name in of.names)
+    assert "sensor.gyro.0 is left out: it misses too many rows" in notes
+    rows = of.of_run(replace(run, sensors=sensors))
+    there = np.delete(np.arange(len(run)), [7, 8])
+    whole = proprioception(m, [run], "mujoco")[0]
+    expected = whole.of_run(run)[:, whole.of_sensor["orientation"]]
+    got = rows[:, of.of_sensor["orientation"]]
+    np.testing.assert_allclose(got[there], expected[there], atol=1e-6)
+    assert np.abs(got[7:9] - expected[7:9]).max() < 0.1
+
+
 def test_of_an_orientation_the_direction_of_gravity_is_left() -> None:
     """Whatever the heading is, and in the frame of the sensor."""
     m, run = walk(4.0)
