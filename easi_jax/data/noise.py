@@ -173,7 +173,8 @@ def without_held(run: Run) -> Run:
     no readings there, NaN.
 
     Such a sensor changes at regular intervals, by more than its resolution. One that
-    rests now and then (a touch sensor in the air) reads in every row.
+    rests now and then (a touch sensor in the air), or changes where commands do, reads
+    in every row.
     """
     sensors = dict(run.sensors)
     for name, given in run.sensors.items():
@@ -184,6 +185,11 @@ def without_held(run: Run) -> Run:
             continue
         apart = np.diff(np.flatnonzero(new))
         usual = np.median(apart)
+        # A torque may be what it is told, and commands are held.
+        sent = changed(run.ctrl) if run.ctrl.shape[1] else ~there
+        told = (sent | np.append(False, sent[:-1]))[there][new].mean()
+        if told > _REGULAR and sent.mean() < 0.5:
+            continue
         even = np.mean(np.abs(apart - usual) <= _UNEVEN * usual)
         if usual < 2 or even < _REGULAR:
             continue

@@ -52,8 +52,8 @@ def resampled(rows: Rows, dt: float, configuration: Configuration) -> Rows:
     """``rows`` at multiples of ``dt`` (s) from the first row's time.
 
     Commands are held; positions, velocities and sensors interpolated linearly,
-    orientations along the shorter arc. A velocity or sensor that one of the two
-    neighbors lacks is the nearer one's.
+    orientations along the shorter arc. A velocity that one of the two neighbors lacks
+    is the nearer one's; of a sensor only in the row that is next to the reading.
     """
     span = rows.time[-1] - rows.time[0]
     time = rows.time[0] + dt * np.arange(int(span / dt + EVEN) + 1)
@@ -69,6 +69,14 @@ def resampled(rows: Rows, dt: float, configuration: Configuration) -> Rows:
         both = np.isfinite(a) & np.isfinite(b)
         return np.where(both, a + share * (b - a), nearest)
 
+    def beside(values: np.ndarray) -> np.ndarray:
+        a, b = np.isfinite(values[before]), np.isfinite(values[before + 1])
+        near = np.where(
+            share < 0.5, rows.time[before, None], rows.time[before + 1, None]
+        )
+        far = np.abs(time[:, None] - near) > (0.5 + EVEN) * dt
+        return np.where((a != b) & far, np.nan, between(values))
+
     turn = configuration.difference(rows.qpos[before], rows.qpos[before + 1])
     return Rows(
         time=time,
@@ -76,7 +84,7 @@ def resampled(rows: Rows, dt: float, configuration: Configuration) -> Rows:
         qpos=configuration.integrate(rows.qpos[before], share * turn),
         qvel=between(rows.qvel),
         ctrl=rows.ctrl[held],
-        sensors={name: between(v) for name, v in rows.sensors.items()},
+        sensors={name: beside(v) for name, v in rows.sensors.items()},
     )
 
 

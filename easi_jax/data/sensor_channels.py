@@ -99,20 +99,11 @@ class Sensors:
 
     def readings(self, run: Run) -> np.ndarray:
         """What was read, ``(T, N)``; quaternions of one sign. Between readings by
-        linear interpolation."""
-        parts, row = [], np.arange(len(run))
-        for n in self:
-            given = np.asarray(run.sensors[n.sensor], float)[:, n.index]
-            there = _read(run, n.sensor)
-            parts.append(np.interp(row, row[there], given[there]))
-        out = np.stack(parts, 1) if parts else np.zeros((len(run), 0))
-        for part in self.orientations:
-            q = out[:, part]
-            turned = np.sum(q[1:] * q[:-1], axis=1) < 0
-            out[:, part] = (
-                q * np.cumprod(np.r_[1.0, np.where(turned, -1.0, 1.0)])[:, None]
-            )
-        return out
+        linear interpolation; zero in a run without any."""
+        kinds = {n.sensor: n.kind in _ORIENTATION for n in self}
+        filled = {name: _filled(run, name, turns) for name, turns in kinds.items()}
+        parts = [filled[n.sensor][:, n.index] for n in self]
+        return np.stack(parts, 1) if parts else np.zeros((len(run), 0))
 
     def read(self, run: Run) -> np.ndarray:
         """`readings`, NaN where there is none."""
@@ -306,11 +297,25 @@ def _why_not(m: mujoco.MjModel, i: int, runs: Sequence[Run]) -> str:
     without = [run.name for run in runs if name not in run.sensors]
     if without:
         return f"not recorded in {', '.join(without)}"
-    for run in runs:
-        count = int(_read(run, name).sum())
-        if count < min(_FEWEST, len(run)):
-            return f"{count} readings in the {len(run)} rows of {run.name}"
+    for recording in dict.fromkeys(run.recording for run in runs):
+        mine = [run for run in runs if run.recording == recording]
+        count, rows = sum(int(_read(r, name).sum()) for r in mine), sum(map(len, mine))
+        if count < min(_FEWEST, rows):
+            return f"{count} readings in the {rows} rows of {recording}"
     return ""
+
+
+def _filled(run: Run, name: str, turns: bool) -> np.ndarray:
+    """Readings of a sensor, and what lies between them, ``(T, dim)``; of an orientation
+    that ``turns`` quaternions of one sign."""
+    given, there = np.array(run.sensors[name], float), _read(run, name)
+    x, row = given[there], np.arange(len(run))
+    if not len(x):
+        return np.zeros_like(given)
+    if turns:
+        turned = np.sum(x[1:] * x[:-1], axis=1) < 0
+        x = x * np.cumprod(np.r_[1.0, np.where(turned, -1.0, 1.0)])[:, None]
+    return np.stack([np.interp(row, row[there], column) for column in x.T], 1)
 
 
 def _read(run: Run, name: str) -> np.ndarray:

@@ -5,8 +5,9 @@ behind a first-order filter. How much so shows beside the positions: their steps
 delayed or filtered likewise, are what was read.
 """
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -15,7 +16,8 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
 from easi_jax.data.cleaning import rows_of, trusted_velocities
-from easi_jax.data.recording import Run
+from easi_jax.data.recording import Run, physics_steps
+from easi_jax.data.windows import fitted_velocity
 
 _LONGEST = 0.1  # s, of a delay or a time constant
 _GRID = 40  # of them that are looked at, before the best is refined
@@ -35,60 +37,132 @@ _Parts = Sequence[tuple[np.ndarray, np.ndarray]]
 _Seen = Callable[[np.ndarray, float, float], np.ndarray]
 
 
+@dataclass(frozen=True)
+class SetRight:
+    """Runs whose late or filtered velocities are as if they were neither.
+
+    Attributes:
+        runs: as many as were given.
+        notes: one for each degree of freedom that was changed.
+        noisier: how much more noise velocities have for it, 1 where nothing was
+            changed, ``(nv,)``.
+    """
+
+    runs: list[Run]
+    notes: list[str]
+    noisier: np.ndarray
+
+
 def set_right(
     given: Sequence[Run], names: Sequence[str], simulated: float = 0.0
-) -> tuple[list[Run], list[str], np.ndarray]:
-    """Runs whose late or filtered velocities are as if they were neither.
+) -> SetRight:
+    """Sets velocities right that come late, or from a filter.
 
     Only where that explains some of how they differ from the steps of the positions,
     and they are to be trusted afterwards (`easi_jax.data.cleaning.trusted_velocities`).
+    The last rows of a run, of which nothing was read later, are left out.
 
     Args:
         names: of all degrees of freedom, ``(nv,)``.
         simulated: how late velocities of the model are beside its own positions [s];
             so late they are to be (`of_model`).
-
-    Returns:
-        The runs, a note for each degree of freedom that was changed, and which these
-        are, ``(nv,)`` bool.
     """
-    runs, changed = list(given), np.zeros(len(names), bool)
-    if not all(run.qvel_measured for run in runs):
-        return runs, [], changed
-    notes, seen = [], ~np.any([run.hidden for run in runs], 0)
-    dt, each = runs[0].dt, [_steps(run) for run in runs if len(run) > _FEWEST]
-    for d in np.flatnonzero(seen).tolist() if each else []:
-        tried = []
-        parts = [(moved[:, d], read[:, d]) for moved, read in each]
-        for way in (_delayed, _filtered):
-            share, late = _best(parts, dt, way, simulated)
-            seconds = late - simulated if way is _delayed else late
-            if share > _EXPLAINS or seconds <= simulated:
-                continue
-            for reach in _REACHES if way is _filtered else _REACHES[:1]:
-                right = [_undone(run, d, seconds, way, reach) for run in runs]
-                # With the noise that undoing makes more of.
-                left = [_steps(run) for run in right if len(run) > _FEWEST]
-                left = [(moved[:, d], read[:, d]) for moved, read in left]
-                off = _off(left, dt, _delayed, simulated).sum() if left else np.inf
-                tried.append((off, seconds, way, right))
-        for _, seconds, way, right in sorted(tried, key=lambda t: t[0]):
+    runs, noisier, notes = list(given), np.ones(len(names)), []
+    each = [_steps(run) for run in runs if len(run) > _FEWEST]
+    if not (each and all(run.qvel_measured for run in runs)):
+        return SetRight(runs, notes, noisier)
+    dt, latest = runs[0].dt, 0.0
+    for d in np.flatnonzero(~np.any([run.hidden for run in runs], 0)).tolist():
+        tried = _tried(
+            runs, d, [(moved[:, d], read[:, d]) for moved, read in each], simulated
+        )
+        for _, found in sorted(tried, key=lambda t: t[0]):
+            right = [found.undone(run, d) for run in runs]
             if trusted_velocities(right)[d]:
-                runs, changed[d] = right, True
-                kind = "late by" if way is _delayed else "filtered, time constant"
+                runs, noisier[d] = right, found.noisier(dt)
+                late = found.way is _delayed
+                latest = max(latest, found.seconds if late else 0.0)
+                kind = "late by" if late else "filtered, time constant"
                 notes.append(
-                    f"velocity of {names[d]}: {kind} {1000 * seconds:.3g} ms, by the "
-                    "positions beside it; that is taken out"
+                    f"velocity of {names[d]}: {kind} {1000 * found.seconds:.3g} ms, by "
+                    "the positions beside it; that is taken out"
                 )
                 break
-    return runs, notes, changed
+    lost = math.ceil(latest / dt - 1e-9)
+    runs = [
+        rows_of(r, 0, len(r) - lost) if lost and len(r) > lost + _FEWEST else r
+        for r in runs
+    ]
+    return SetRight(runs, notes, noisier)
 
 
-def of_model(m: mujoco.MjModel) -> float:
-    """How late velocities of a simulation are beside its positions [s]: half a physics
-    step, since all of MuJoCo's integrators but one move with the new velocity."""
+def _tried(
+    runs: Sequence[Run], d: int, parts: _Parts, simulated: float
+) -> list[tuple[float, "_Found"]]:
+    """What may have been done to a velocity, each with what it leaves once undone."""
+    dt, out = runs[0].dt, []
+    for way in (_delayed, _filtered):
+        share, late = _best(parts, dt, way, simulated)
+        seconds = late - simulated if way is _delayed else late
+        if share > _EXPLAINS or seconds <= simulated:
+            continue
+        for reach in _REACHES if way is _filtered else _REACHES[:1]:
+            found = _Found(way, seconds, reach)
+            right = [found.undone(run, d) for run in runs if len(run) > _FEWEST]
+            left = [(moved[:, d], read[:, d]) for moved, read in map(_steps, right)]
+            # With the noise that undoing makes more of.
+            out.append((float(_off(left, dt, _delayed, simulated).sum()), found))
+    return out
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What was done to a velocity.
+
+    Attributes:
+        way: what it was; ``seconds`` how much.
+        reach: time constants of a filter to either side of a row, that slopes are taken
+            over.
+    """
+
+    way: _Seen
+    seconds: float
+    reach: float
+
+    def _rows(self, dt: float) -> int:
+        return max(1, round(self.reach * self.seconds / dt))
+
+    def noisier(self, dt: float) -> float:
+        """Noise once it is undone, over that before."""
+        if self.way is _delayed:
+            return 1.0
+        return math.hypot(1.0, self.seconds / dt / self._rows(dt) / math.sqrt(2.0))
+
+    def undone(self, run: Run, d: int) -> Run:
+        """A run with one velocity as if nothing was done to it."""
+        read, qvel, row = run.qvel[:, d], run.qvel.copy(), np.arange(len(run))
+        if self.way is _filtered:
+            rows = self._rows(run.dt)
+            low, high = np.maximum(row - rows, 0), np.minimum(row + rows, row[-1])
+            slope = (read[high] - read[low]) / (np.maximum(high - low, 1) * run.dt)
+            qvel[:, d] = read + self.seconds * slope
+            return replace(run, qvel=qvel)
+        # The nearest reading, whose noise stays white; what it is off in time is made
+        # up for by the positions, and where nothing was read they take its place.
+        fitted = fitted_velocity(run.qpos, run.dt, run.configuration)[:, d]
+        at = np.minimum(np.round(row + self.seconds / run.dt).astype(int), row[-1])
+        then = np.interp(at - self.seconds / run.dt, row, fitted)
+        qvel[:, d] = np.where(at < row[-1], read[at] + fitted - then, fitted)
+        return replace(run, qvel=qvel)
+
+
+def of_model(m: mujoco.MjModel, dt: float) -> float:
+    """How late velocities of a simulation at a control step ``dt`` are beside its
+    positions [s]: half a physics step, since all of MuJoCo's integrators but one move
+    with the new velocity."""
     rk4 = int(mujoco.mjtIntegrator.mjINT_RK4)
-    return 0.0 if m.opt.integrator == rk4 else 0.5 * float(m.opt.timestep)
+    step = dt / physics_steps(dt, float(m.opt.timestep))
+    return 0.0 if m.opt.integrator == rk4 else 0.5 * step
 
 
 def _delayed(moved: np.ndarray, seconds: float, dt: float) -> np.ndarray:
@@ -150,19 +224,3 @@ def _off(parts: _Parts, dt: float, way: _Seen, seconds: float) -> np.ndarray:
         some = np.full(min(over, len(off)), 1.0 / over)
         out.append(np.mean(np.convolve(off, some, "valid") ** 2))
     return np.array(out)
-
-
-def _undone(run: Run, d: int, seconds: float, way: _Seen, reach: float) -> Run:
-    """A run with one velocity read as much earlier, without the last rows, of which
-    nothing was read later; or unfiltered, by slopes over ``reach`` time constants to
-    either side, a row at least."""
-    read, qvel, row = run.qvel[:, d], run.qvel.copy(), np.arange(len(run))
-    if way is _filtered:
-        rows = max(1, round(reach * seconds / run.dt))
-        low, high = np.maximum(row - rows, 0), np.minimum(row + rows, row[-1])
-        slope = (read[high] - read[low]) / ((high - low) * run.dt)
-        qvel[:, d] = read + seconds * slope
-        return replace(run, qvel=qvel)
-    at = row + seconds / run.dt
-    qvel[:, d] = np.interp(at, row, read)
-    return rows_of(replace(run, qvel=qvel), 0, int((at <= row[-1]).sum()))

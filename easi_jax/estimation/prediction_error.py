@@ -10,9 +10,11 @@ from easi_jax.estimation.weights import huber
 # Second differences of white noise, their variance, and how many of them count as one
 # independent number (1 + 2 (16 + 1) / 36).
 _DIFFERENCED, _ALIKE = 6.0, 1.94
-# Of the step, that a model's own error grows with: its variance is that of a force that
-# errs at random after 1 (speeds) and 3 (positions), of one that is wrong after 2 and 4.
+# Powers of the step, that the variance of a model's own error grows with: it is wrong
+# at the start, speeds by a force that errs at random, speeds or positions by one that
+# is wrong.
 _POWERS = 0.0, 1.0, 2.0, 4.0
+_TOLD = 1e-6  # of a model's squared errors: noise below it is told from none
 _SCORED = 30  # rounds of Fisher scoring, which squares its error in each
 # Times that of the rows: where nothing moves a fit leaves no error; those of a slow
 # sensor may hold a hundred times as much motion.
@@ -73,20 +75,24 @@ def _grown(mean: jax.Array, noise: jax.Array, weight: jax.Array) -> jax.Array:
     share = jnp.arange(1, len(mean) + 1) / len(mean)
     shape = share[:, None] ** jnp.array(_POWERS)  # (H, P)
     shape = shape[:, None]  # (H, 1, P)
-    noise = jnp.maximum(noise, 1e-30)[:, None]
-    mean, weight = mean[..., None], weight[..., None]
+    # In its units, so that single precision has them; it is no less than a part of what
+    # the model errs by, for nothing is told from that.
+    whole = (weight * mean).sum(0) / jnp.maximum(weight.sum(0), 1e-30)
+    noise = jnp.maximum(jnp.maximum(noise, _TOLD * whole), 1e-30)
+    mean = (mean / noise)[..., None]
+    weight = (weight / jnp.maximum(weight.max(0), 1e-30))[..., None]
 
     def scored(_: int, factor: jax.Array) -> jax.Array:
-        w = weight * shape / (noise + factor * shape) ** 2
+        w = weight * shape / (1.0 + factor * shape) ** 2
         down = jnp.maximum((w * shape).sum(0), 1e-30)
-        return jnp.maximum((w * (mean - noise)).sum(0) / down, 0.0)
+        return jnp.maximum((w * (mean - 1.0)).sum(0) / down, 0.0)
 
     begin = jnp.zeros((mean.shape[1], len(_POWERS)), mean.dtype)
     factor = jax.lax.fori_loop(0, _SCORED, scored, begin)
-    total = noise + factor * shape
+    total = 1.0 + factor * shape
     surprise = (weight * (jnp.log(total) + mean / total)).sum(0)
     best = jnp.argmin(surprise, axis=1)[:, None]
-    return jnp.take_along_axis(factor * shape, best[None], 2)[..., 0]
+    return noise * jnp.take_along_axis(factor * shape, best[None], 2)[..., 0]
 
 
 def white_noise(error: jax.Array, there: jax.Array | None = None) -> jax.Array:
@@ -114,14 +120,14 @@ def white_noise(error: jax.Array, there: jax.Array | None = None) -> jax.Array:
     )
     known = (there > 0) & (first > 0) & (second >= 0)
     # Beyond a gap more is left of what the model errs by.
-    span = jnp.where(known, row - second, error.shape[1])
-    known &= span == span.min((0, 1))
+    span = jnp.where(known, row - second, jnp.nan)
+    known &= span <= jnp.nanmedian(span, (0, 1))
     bent = jnp.where(known, error - 2.0 * before + earlier, 0.0) ** 2
     count = known.sum(1)
     square = bent.sum(1) / count  # 0 / 0: none
     free = count.sum(0) / jnp.maximum((count > 0).sum(0), 1)
     # A chi-square's median (Wilson and Hilferty, PNAS 17, 1931).
-    free = jnp.maximum(free / _ALIKE, 0.5)
+    free = jnp.maximum(1.0 + (free - 1.0) / _ALIKE, 0.5)
     median = jnp.nanmedian(square, 0) / _DIFFERENCED
     return jnp.sqrt(median) / (1.0 - 2.0 / (9.0 * free)) ** 1.5
 

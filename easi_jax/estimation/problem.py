@@ -12,7 +12,6 @@ import numpy as np
 
 from easi_jax.data.cleaning import true_readings, trusted_velocities
 from easi_jax.data.measured import MeasuredRuns
-from easi_jax.data.noise import pooled_noise
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import to_device
 from easi_jax.data.sensor_channels import (
@@ -162,13 +161,12 @@ def problem_of(
         true_readings(mj_model, r, found.entries) for r in (runs.fit, runs.held)
     )
     hidden = hidden_in_any([*fit, *held])
-    given = [*fit, *held], tangent_names(mj_model), of_model(mj_model)
-    right, undone, changed = set_right(*given)
-    fit, held = right[: len(fit)], right[len(fit) :]
+    late = of_model(mj_model, fit[0].dt)
+    right = set_right([*fit, *held], tangent_names(mj_model), late)
+    fit, held = right.runs[: len(fit)], right.runs[len(fit) :]
     scatter = np.where(np.tile(hidden, 2), np.inf, _noise_of(name, runs, noise))
-    if changed.any() and not len(noise):
-        told = np.concatenate([np.zeros_like(changed), changed])
-        scatter = np.where(told, pooled_noise(fit), scatter)
+    if not len(noise):
+        scatter = scatter * np.append(np.ones(mj_model.nv), right.noisier)
     logged = Logged.of([*fit, *held])
     simulator = Simulator(mj_model, space, fit[0].dt, fixed=fixed, logged=logged)
     measured, doubted = _measured(simulator, fit, hidden)
@@ -195,7 +193,7 @@ def problem_of(
                 if e.of_readings
             ),
             *simulator.notes,
-            *undone,
+            *right.notes,
             *doubted,
             *sensed,
         ],

@@ -208,6 +208,16 @@ def at_control_step(runs: Sequence[Run], dt: float) -> list[Run]:
     return out
 
 
+def _last(readings: np.ndarray, count: int) -> np.ndarray:
+    """The last reading of each row ``(T, dim)``, if it is one of ``count`` rows: a
+    sensor that is slower than the rows may be as fast as the controller."""
+    rows = np.arange(len(readings))
+    there = np.isfinite(readings).all(1)
+    at = np.maximum.accumulate(np.where(there, rows, -1))
+    near = (at >= 0) & (rows - at < count)
+    return np.where(near[:, None], readings[np.maximum(at, 0)], np.nan)
+
+
 def _changes(run: Run) -> np.ndarray:
     """Rows in which a new command is sent."""
     return 1 + np.flatnonzero((np.diff(run.ctrl, axis=0) != 0).any(1))
@@ -234,7 +244,7 @@ def _thinned(run: Run, count: int) -> Run:
         qvel=rest.qvel[kept],
         ctrl=rest.ctrl[kept],
         sent=None,
-        sensors={k: v[kept] for k, v in rest.sensors.items()},
+        sensors={k: _last(v, count)[rows] for k, v in run.sensors.items()},
     )
 
 

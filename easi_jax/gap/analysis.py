@@ -202,8 +202,7 @@ class Analysis:
         """A digest of all that the results depend on, for a `Journal`."""
         sensors = self.data.sensors
         logs = [
-            (run.qpos, run.ctrl, run.time, sensors.readings(run))
-            for run in self.data.runs
+            (run.qpos, run.ctrl, run.time, sensors.read(run)) for run in self.data.runs
         ]
         windows = [f.windows for f in self._fitted]
         model = np.zeros(mujoco.mj_sizeModel(self.m), np.uint8)

@@ -22,6 +22,7 @@ from easi_jax.model.results import Outcome as Ended
 
 # Sizes of differences, that a number without bounds may be off which no data determine.
 _ANYTHING = 1e3
+_ALIKE = 1e-12  # least eigenvalue of a correlation matrix that is no rounding
 
 
 @dataclass(frozen=True)
@@ -213,18 +214,32 @@ def fit_covariance(selector: Selector, model: Model) -> np.ndarray:
     normal = np.einsum("w,wma,wmb->ab", weight, j, j, optimize=True)
     score = np.einsum("w,wma,wm->wa", weight, j, f.residual, optimize=True)
     costs = 0.5 * weight * (f.residual**2).sum(1)
-    counts = np.broadcast_to(weight[:, None, None], (*f.residual.shape, 1))
+    counts = (weight[:, None] * selector.residuals.live)[..., None]
     with jax.enable_x64(True):
         left = scattered(*map(jnp.asarray, (normal, normal, score)))
         left *= trusted(excess(jnp.asarray(costs), jnp.asarray(counts)))
     width = bounds.high[f.active] - bounds.low[f.active]
     open_ = np.where(np.isfinite(width), width / np.sqrt(12.0), _ANYTHING * size)
-    prior = np.diag((size / open_) ** 2)
-    cov = np.linalg.inv(np.asarray(left) + prior)
+    prior = (size / open_) ** 2
+    cov = _inverse(np.asarray(left), prior)
     if selector.unseen_steps is not None:
         error = selector.residuals.grouped(selector.unseen_steps[None])
         off = selector.residuals.whitened(error)[0]
         pull = np.einsum("w,wma,wm->a", weight, j, off, optimize=True)
-        moved = np.linalg.solve(normal + prior, pull)
+        moved = _inverse(normal, prior) @ pull
         cov += np.outer(moved, moved)
     return cov * np.outer(size, size)
+
+
+def _inverse(information: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """Covariance ``(a, a)`` of what ``information (a, a)`` and a ``prior (a,)`` of each
+    number know. What is rounding beside the information counts as not seen, and is
+    inverted apart."""
+    size = np.sqrt(np.diag(information) + prior)
+    values, vectors = np.linalg.eigh(information / np.outer(size, size))
+    seen = values > _ALIKE
+    known = vectors.T @ (vectors * (prior / size**2)[:, None])
+    total = np.where(seen[:, None] == seen, known, 0.0)
+    total += np.diag(np.where(seen, values, 0.0))
+    back = vectors / size[:, None]
+    return back @ np.linalg.inv(total) @ back.T

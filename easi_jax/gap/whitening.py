@@ -30,6 +30,7 @@ class Residuals:
         plain: errors in units of the gap, starts fitted anew, from whitened ones,
             ``(W, n, n)``; the mean of their squares is the gap's, squared.
         floor: that mean as noise alone makes it, of each window, ``(W,)``.
+        live: which numbers hold a reading, ``(W, n)`` bool.
     """
 
     groups: np.ndarray
@@ -37,6 +38,7 @@ class Residuals:
     root: np.ndarray
     plain: np.ndarray
     floor: np.ndarray
+    live: np.ndarray
 
     def grouped(self, errors: np.ndarray) -> np.ndarray:
         """Averages over groups of rows, ``(B, W, K, nv)``."""
@@ -110,7 +112,8 @@ def make_residuals(
         refit = unit[:, None] * refit
         plain[w][some] = refit[some] @ lower
         floor[w] = ((refit**2) @ white[w].reshape(-1))[keep].sum() / n
-    return Residuals(groups, scale, root, plain, floor)
+    live = keep & (white.reshape(count, n) > 0)
+    return Residuals(groups, scale, root, plain, floor, live)
 
 
 def _unit(groups: np.ndarray, lead: int, scale: np.ndarray) -> np.ndarray:

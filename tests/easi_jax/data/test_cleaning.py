@@ -185,6 +185,22 @@ def test_visible_steps_grow_with_noise():
     assert found[2] == 50
 
 
+def test_readings_of_a_slow_sensor_do_not_multiply():
+    """Where its run is brought to another's rate: each stays one, in the row beside."""
+    coarse = make_run(sine(50, 0.02), "slow", 0.02)
+    fine = make_run(sine(1000, 0.001), "fast", 0.001)
+    read = np.full((len(coarse), 1), np.nan)
+    read[3::10] = np.sin(coarse.time[3::10])[:, None]
+    coarse = dataclasses.replace(coarse, sensors={"gyro": read})
+    runs, _ = to_common_step([coarse, fine])
+    found = runs[0].sensors["gyro"][:, 0]
+    there = np.isfinite(found)
+    assert there.sum() == np.isfinite(read).sum()
+    np.testing.assert_allclose(
+        runs[0].time[there], coarse.time[3::10], atol=0.6 * runs[0].dt
+    )
+
+
 def test_runs_of_two_rates_come_to_the_smaller_step():
     fast, slow = make_run(sine(100)), make_run(sine(50, 0.02), "slow", 0.02)
     runs, notes = to_common_step([slow, fast])
@@ -375,6 +391,17 @@ def test_misfit_grows_along_a_piece_as_errors_do():
     assert (np.ptp(ratio, axis=0) < 0.2 * ratio.mean(0)).all(), ratio
     counted = ratio.mean(0) ** 2
     assert 15 < counted[0] < 25 and 26 < counted[1] < 33 and 3 < counted[2] < 6, counted
+
+
+@pytest.mark.parametrize("pieces", [60, 1000])
+def test_misfit_of_a_reading_that_never_moves(pieces: int) -> None:
+    """Its noise is as good as none, which single precision has no square of."""
+    rng = np.random.default_rng(6)
+    error = 1e-4 * np.abs(rng.standard_normal((pieces, 1, 1))) * np.ones((1, 60, 1))
+    noise, half = jnp.array([1e-9]), 0.5 * jnp.ones(error.shape)
+    found = misfit_of(jnp.asarray(error, jnp.float32), noise, half)
+    np.testing.assert_allclose(found, 1e-4 * np.sqrt(60), rtol=0.2)
+    assert not np.asarray(misfit_of(jnp.zeros(error.shape), noise, half)).any()
 
 
 def test_noise_is_what_errors_leave_white():

@@ -123,6 +123,7 @@ def test_rows_in_which_a_slow_sensor_is_held_hold_no_reading() -> None:
     run, rng = _run(100, "smooth", 1e-3, 0.1), np.random.default_rng(4)
     row, wave = np.arange(_ROWS), np.sin(3.0 * run.time)[:, None]
     slow = row - row % 5
+    ctrl = np.repeat(rng.normal(size=(_ROWS // 10, 1)), 10, 0)
     slow[202:] = row[202:] - (row[202:] - 1) % 5  # a clock that drifts
     sensors = {
         "held": wave[slow] + 1e-3 * rng.normal(size=(_ROWS, 1))[slow],
@@ -131,9 +132,10 @@ def test_rows_in_which_a_slow_sensor_is_held_hold_no_reading() -> None:
         "coarse": np.round(wave / 0.05) * 0.05,
         "fast": wave + 1e-3 * rng.normal(size=(_ROWS, 2)),
         "none": np.full((_ROWS, 1), np.nan),
+        "torque": ctrl,  # of a motor, told by what it is asked for
     }
-    found = without_held(_with(run, **sensors)).sensors
-    for name in ("touch", "coarse", "fast", "none"):
+    found = without_held(_with(replace(run, ctrl=ctrl), **sensors)).sensors
+    for name in ("touch", "coarse", "fast", "none", "torque"):
         np.testing.assert_array_equal(found[name], sensors[name])
     new = np.diff(sensors["held"][:, 0], prepend=np.nan) != 0
     np.testing.assert_array_equal(np.isfinite(found["held"][:, 0]), new)

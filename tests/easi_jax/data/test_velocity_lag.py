@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from easi_jax.data.cleaning import trusted_velocities
+from easi_jax.data.cleaning import rows_of, trusted_velocities
 from easi_jax.data.recording import Run
 from easi_jax.data.velocity_lag import set_right
 from easi_jax.model.joint_space import Configuration
@@ -52,9 +52,9 @@ def test_what_is_late_or_filtered_is_set_right(
     dt: float, way: str, seconds: float
 ) -> None:
     given = [recorded(k, dt, way, seconds) for k in range(2)]
-    runs, notes, changed = set_right([run for run, _ in given], NAMES)
-    assert changed.tolist() == [True, False]
-    (note,) = notes
+    right = set_right([run for run, _ in given], NAMES)
+    (note,), runs = right.notes, right.runs
+    assert right.noisier[1] == 1.0
     # A short delay and a short filter are alike.
     assert note.startswith("velocity of a: ") and (seconds < 0.01 or way in note)
     assert abs(float(note.split(" ms")[0].split()[-1]) - 1e3 * seconds) < 1.0
@@ -62,11 +62,15 @@ def test_what_is_late_or_filtered_is_set_right(
     for run, (before, true) in zip(runs, given, strict=True):
         lost = len(before) - len(run)
         assert lost <= np.ceil(1.1 * seconds / dt)
-        off, was = (
-            np.std((r.qvel - true[: len(r)])[: len(run), 0]) for r in (run, before)
+        wrong, rest = (
+            r.qvel[: len(run), 0] - true[: len(run), 0] for r in (before, run)
         )
-        # Undoing a filter makes more of the noise.
-        assert off < max(0.3 * was, 2.5 * NOISE[1])
+        noise = NOISE[1] * right.noisier[0]
+        assert np.std(rest) < max(0.3 * np.std(wrong), 1.3 * noise)
+        # What is told of the noise is what second differences leave.
+        white = np.sqrt(np.mean(np.diff(rest, 2) ** 2) / 6.0)
+        if seconds / dt % 1 and "late" in note:
+            assert 0.8 * noise < white < 1.3 * noise
         np.testing.assert_array_equal(run.qvel[:, 1], before.qvel[: len(run), 1])
 
 
@@ -74,15 +78,15 @@ def test_what_is_late_or_filtered_is_set_right(
 @pytest.mark.parametrize("way", ["right", "scaled"])
 def test_other_velocities_stay_as_they_are(dt: float, way: str) -> None:
     given = [recorded(k, dt, way, 0.0)[0] for k in range(2)]
-    runs, notes, changed = set_right(given, NAMES)
-    assert not notes and not changed.any()
-    assert all(a is b for a, b in zip(runs, given, strict=True))
+    right = set_right(given, NAMES)
+    assert not right.notes and (right.noisier == 1.0).all()
+    assert all(a is b for a, b in zip(right.runs, given, strict=True))
 
 
 def test_a_delay_of_one_run_of_two_is_none_of_the_machine() -> None:
     runs = [recorded(0, 0.01, "late", 0.015)[0], recorded(1, 0.01, "right", 0.0)[0]]
-    found, _, changed = set_right(runs, NAMES)
-    assert not changed.any() and not trusted_velocities(found)[0]
+    right = set_right(runs, NAMES)
+    assert not right.notes and not trusted_velocities(right.runs)[0]
 
 
 def test_what_nobody_measured_has_no_delay() -> None:
@@ -91,4 +95,19 @@ def test_what_nobody_measured_has_no_delay() -> None:
         replace(run, hidden=np.array([True, False])),
         replace(run, qvel_measured=False),
     ):
-        assert not set_right([odd], NAMES)[2].any()
+        assert not set_right([odd], NAMES).notes
+
+
+def test_runs_are_cut_once_and_short_ones_stay() -> None:
+    """Both joints late; a piece that is shorter than that beside it."""
+    run, true = recorded(0, 0.001, "late", 0.02)
+    other, _ = recorded(0, 0.001, "right", 0.0)
+    late = np.stack([run.qvel[:, 0], np.roll(other.qvel[:, 1], 20)], 1)
+    late[:20, 1] = other.qvel[0, 1]
+    run = replace(run, qvel=late)
+    right = set_right([run, rows_of(run, 100, 112)], NAMES)
+    assert len(right.notes) == 2
+    assert [len(r) for r in right.runs] == [len(run) - 20, 12]
+    whole, short = right.runs
+    assert np.std(whole.qvel - true[: len(whole)]) < 2 * NOISE[1]
+    assert np.isfinite(short.qvel).all()

@@ -37,6 +37,20 @@ def test_of_dense_rows_those_are_kept_in_which_commands_change() -> None:
     np.testing.assert_array_equal(thin.qpos, dense.qpos[3::4])
     np.testing.assert_array_equal(thin.sensors["gyro"], dense.sensors["gyro"][3::4])
     np.testing.assert_array_equal(thin.ctrl[:-1, 0] + 1, thin.ctrl[1:, 0])
+    # A sensor as fast as the controller reads a row later, and is missing once.
+    gyro = np.full_like(dense.sensors["gyro"], np.nan)
+    gyro[::4] = dense.sensors["gyro"][::4]
+    gyro[40] = np.nan
+    slow = replace(dense, sensors={**dense.sensors, "gyro": gyro})
+    (thin,) = at_control_step([slow], DT)
+    before = dense.sensors["gyro"][:-3:4]
+    np.testing.assert_array_equal(
+        np.isnan(thin.sensors["gyro"][:, 0]), [k == 10 for k in range(len(thin))]
+    )
+    there = np.arange(len(thin)) != 10
+    np.testing.assert_array_equal(
+        thin.sensors["gyro"][there], before[: len(thin)][there]
+    )
 
 
 def test_rows_follow_a_clock_that_drifts() -> None:

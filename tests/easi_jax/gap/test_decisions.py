@@ -40,7 +40,7 @@ ELSEWHERE = {
     "predictor": {
         *("BLOCK", "_ITEMS", "_STEPPED", "_ACCELERATOR_ITEMS", "_ROW", "_PASSES"),
     },
-    "result": {"_ANYTHING"},
+    "result": {"_ANYTHING", "_ALIKE"},
     "screening": {
         *("_SHORTLIST", "_STARTS", "_HOPELESS", "_FEW", "_LONG", "_SIMULATED"),
         *("_HOLDS", "_AT_ONCE"),

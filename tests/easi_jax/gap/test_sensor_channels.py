@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from easi_jax.data.cleaning import rows_of
 from easi_jax.data.noise import without_held
 from easi_jax.data.recording import Run
 from easi_jax.data.scales import scales_of
@@ -107,6 +108,17 @@ def test_what_is_compared_and_why_the_rest_is_not(arm: mujoco.MjModel) -> None:
     np.testing.assert_allclose(found.readings(other)[7, acc], gaps[[6, 8]].mean(0))
     assert np.isnan(found.read(other)[7, acc]).all()
     assert found.known(other).sum() == found.known(run).sum() - 3
+    # A recording that was cut, at a leap or for blocks, is judged as a whole.
+    parts = [replace(rows_of(other, 0, 8), name="1", part_of="other"), other]
+    parts[1] = replace(rows_of(other, 8, ROWS), name="2", part_of="other")
+    whole, _ = measured_sensors(arm, [run, *parts])
+    assert [n.channel for n in whole] == [n.channel for n in found]
+    nothing = {**run.sensors, "turn": np.full((ROWS, 4), np.nan)}
+    parts[0] = replace(parts[0], sensors={k: v[:8] for k, v in nothing.items()})
+    whole, _ = measured_sensors(arm, [run, *parts])
+    turn = [i for i, n in enumerate(whole) if n.sensor == "turn"]
+    assert not whole.readings(parts[0])[:, turn].any()
+    assert not whole.known(parts[0])[:, turn].any()
 
 
 def test_readings_of_an_orientation_have_one_sign(arm: mujoco.MjModel) -> None:
@@ -118,6 +130,10 @@ def test_readings_of_an_orientation_have_one_sign(arm: mujoco.MjModel) -> None:
     np.testing.assert_allclose(np.abs(a), np.abs(b))
     (part,) = found.orientations
     assert np.abs(np.diff(b[:, part], axis=0)).max() < 0.1
+    turned[np.arange(ROWS) % 4 != 0] = np.nan
+    turned[::8] *= -1.0
+    slow = found.readings(replace(run, sensors={**run.sensors, "turn": turned}))
+    assert np.abs(np.diff(slow[:, part], axis=0)).max() < 0.1
 
 
 def predicted(m: mujoco.MjModel, run: Run, name: str, stepped: bool = False):

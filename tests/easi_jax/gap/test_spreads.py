@@ -19,7 +19,7 @@ BOUNDS = Bounds(np.full(2, -np.inf), np.full(2, np.inf), SIZE)
 class Plain:
     """Errors that are white as they are."""
 
-    groups = np.eye(M)
+    groups, live = np.eye(M), np.ones((W, M), bool)
 
     def grouped(self, errors: np.ndarray) -> np.ndarray:
         return errors
@@ -87,6 +87,33 @@ def test_what_a_model_errs_by_and_its_own_steps_widen() -> None:
     stepped, _ = fitted(noise, unseen_steps=steps)
     moved = fit_covariance(stepped, model) - plain
     np.testing.assert_allclose(moved, np.outer(shift, shift), rtol=1e-3)
+
+
+def test_numbers_without_a_reading_hide_no_error() -> None:
+    noise = 2.0 * np.random.default_rng(4).normal(size=(W, M))
+    selector, model = fitted(noise)
+    std = np.sqrt(np.diag(fit_covariance(selector, model)))
+    fit = model.fit
+    more = np.concatenate([fit.residual, np.zeros((W, M))], 1)
+    slope = np.concatenate([fit.slope, np.zeros((W, M, 2))], 1)
+    model.fit = Fitted(fit.x, fit.active, more, slope, fit.cost)
+    selector.residuals.live = np.arange(2 * M)[None] < np.full((W, 1), M)
+    dead = np.sqrt(np.diag(fit_covariance(selector, model)))
+    np.testing.assert_allclose(dead, std, rtol=1e-6)
+
+
+@pytest.mark.parametrize("apart", [0.0, 1e-9])
+def test_numbers_that_data_tell_by_their_sum_are_not_determined(apart: float) -> None:
+    """Of a log without noise, too."""
+    selector, model = fitted(np.random.default_rng(5).normal(size=(W, M)))
+    slope = model.fit.slope
+    slope[..., 1] = 1e5 * slope[..., 0] * SIZE[0] / SIZE[1] * (1.0 + apart)
+    slope[..., 0] *= 1e5
+    cov = fit_covariance(selector, model)
+    std = np.sqrt(np.diag(cov))
+    assert np.isfinite(std).all() and (std > 50 * SIZE).all()
+    both = np.array([1.0, SIZE[0] / SIZE[1]])
+    assert np.sqrt(both @ cov @ both) < 1e-2 * std[0]
 
 
 def test_what_no_data_show_may_be_anything() -> None:

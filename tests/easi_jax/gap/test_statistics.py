@@ -389,7 +389,10 @@ def test_some_blocks_are_whitened_as_among_all(predictor: Predictor) -> None:
     rng = np.random.default_rng(0)
     groups = row_groups(predictor.steps + 1, 11)
     root = rng.normal(size=(count, len(groups), len(groups)))
-    selector.residuals = Residuals(groups, np.ones(1), root, root, np.zeros(count))
+    selector.residuals = Residuals(
+        *(groups, np.ones(1), root, root, np.zeros(count)),
+        np.ones(root.shape[:2], bool),
+    )
     selector.steps = rng.normal(size=(count, predictor.steps + 1, 1))
     selector.moved = 1e-3 * rng.normal(size=(count, predictor.size))
     assert count % BLOCK  # the last block is not full
