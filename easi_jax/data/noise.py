@@ -179,7 +179,7 @@ def without_held(run: Run) -> Run:
     sensors = dict(run.sensors)
     for name, given in run.sensors.items():
         x = np.asarray(given, float)
-        there = np.isfinite(x).all(1)
+        there = np.asarray(np.isfinite(x).all(1))
         new = changed(x[there])
         if not _leaps(x[there], new):
             continue
