@@ -24,6 +24,7 @@ _ROUNDS = 12
 _TRIED = np.array([1.0, 30.0, 1000.0])  # dampings, relative to the last one
 _DAMPING = Damping(falls=0.2, rises=1.0, least=1e-6)
 _PAYS = 0.05  # relative gain of a round that lets slopes be followed further
+_FOLLOWED = 0.05  # sizes, that a move is at least whose change says a slope
 _SETTLED = 5e-3  # relative gain of a round below which a fit is done
 _HUBER = 3.0
 _DIM = 1e-2  # least curvature that damping assumes, of the largest
@@ -204,9 +205,10 @@ def _steps(
 
 
 def _followed(slope: np.ndarray, change: np.ndarray, move: np.ndarray) -> np.ndarray:
-    """Slopes ``(W, m, a)`` that say what a ``move (a,)`` did change, ``(W, m)``."""
+    """Slopes ``(W, m, a)`` that say what a ``move (a,)`` in sizes did change,
+    ``(W, m)``. Over a short one that is rounding for the most part."""
     length = float(move @ move)
-    if not length > 0:
+    if not length > _FOLLOWED**2:
         return slope
     return slope + (change - slope @ move)[..., None] * move / length
 

@@ -20,6 +20,7 @@ ELSEWHERE = {
     "analysis": {"_SHORT", "_MIDDLE", "_LONG", "_FITTED", "_LONGEST", "_STEPS"},
     "batched_least_squares": {
         *("_ROUNDS", "_PAYS", "_SETTLED", "_HUBER", "_DIM", "_UNSEEN", "_AT"),
+        "_FOLLOWED",
     },
     "candidates": {"_PAIRS"},
     "discretization_error": {"_FINER", "_OWN_SHIFT"},

@@ -210,6 +210,24 @@ def test_what_the_data_do_not_see_stays() -> None:
     np.testing.assert_allclose(fit.x, [2.0, 0.0], atol=1e-3)
 
 
+def test_slopes_are_those_of_the_errors_and_not_of_their_rounding() -> None:
+    """Predictions are of single precision, and the last move of a fit is short."""
+    rng = np.random.default_rng(0)
+    along, bent, noise = rng.normal(size=(3, 60, 8))
+
+    def simulate(x: np.ndarray) -> np.ndarray:
+        off = x[:, :1, None] - 0.7
+        exact = 100.0 + off * along + 0.02 * off**2 * bent + 1e-3 * noise
+        return exact.astype(np.float32).astype(float) - 100.0
+
+    bounds = Bounds(np.full(1, -5.0), np.full(1, 5.0), np.full(1, 0.1))
+    for start in (0.0, 0.69, 0.7002):
+        ask = least_squares(np.full((1, 1), start), [0], bounds, np.ones(60))
+        (fit,) = lockstep([ask], simulate)
+        off = fit.slope[..., 0] - along
+        assert np.sqrt(np.mean(off**2)) < 0.02, start
+
+
 def test_outliers_weigh_less() -> None:
     residual = np.ones((20, 5))
     residual[3] = 50.0
