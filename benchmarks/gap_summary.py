@@ -73,8 +73,8 @@ def _fitted(rows: list[Any]) -> list[str]:
         f"{len(rows)} generated machines of one or two joints (`python -m "
         f"benchmarks.gap --engine mujoco --cheap`), commits {commits}. Starts of "
         "windows are fitted with each model's own dynamics, and verdicts are by "
-        "channel; the cases above are of the measure before. Seeds from 90000 on, none "
-        "left out.",
+        "channel; the cases above are of the measure before. Seeds from 90000 and from "
+        "91000 on, none left out.",
         table(
             [(kind, some) for kind, some in kinds.items() if some],
             {
