@@ -165,18 +165,18 @@ def test_late_velocities_are_set_right_and_take_part() -> None:
         [replace(r, qvel=np.vstack([r.qvel[:1], r.qvel[:1], r.qvel[:-2]])) for r in x]
         for x in (fit, held)
     ]
-    noise = np.array([_NOISE[0], 1.0])  # which is not used for what is set right
-    runs = MeasuredRuns(tuple(late[0]), noise, late[0], late[1], "r", [])
-    right = MeasuredRuns(tuple(fit), noise, fit, held, "r", [])
+    runs = MeasuredRuns(tuple(late[0]), _NOISE, late[0], late[1], "r", [])
+    right = MeasuredRuns(tuple(fit), _NOISE, fit, held, "r", [])
     # Simulated velocities are half a physics step late beside their positions.
     assert problem_of("rod", m, ParameterSpace(()), right).fit[0] is fit[0]
     problem = problem_of("rod", m, ParameterSpace(()), runs)
     assert problem.measured.all()
     (note,) = [n for n in problem.notes if "velocity of j: late by" in n]
     assert abs(float(note.split(" ms")[0].split()[-1]) - 20.0) < 1.0
-    np.testing.assert_allclose(problem.noise, _NOISE, rtol=0.25)
+    np.testing.assert_array_equal(problem.noise, _NOISE)
     (run,) = problem.fit
     off = run.qvel - fit[0].qvel[: len(run)]
+    assert np.std(off) < 4 * _NOISE[1]
     assert np.std(off) < 0.15 * np.std(late[0][0].qvel - fit[0].qvel)
 
 
