@@ -1,6 +1,6 @@
 """How often train.gap is right, counted over the cases of ``benchmarks.gap``."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import hypot, sqrt
 from typing import Any
 
@@ -102,15 +102,12 @@ def parameter_errors(rows: Sequence[dict[str, Any]]) -> list[float]:
     size.
     """
     out = []
-    for r in rows:
-        for name, truth in zip(r["truth"], r["true_parameters"], strict=True):
-            if name not in r["named"]:
-                continue
-            told = r["parameters"][r["named"].index(name)]
-            for group in _grouped(truth):
-                size = hypot(*(truth[k] for k in group))
-                if size > 0 and all(k in told for k in group):
-                    out.append(hypot(*(told[k] - truth[k] for k in group)) / size)
+    for r, at, truth in _named_right(rows):
+        told = r["parameters"][at]
+        for group in _grouped(truth):
+            size = hypot(*(truth[k] for k in group))
+            if size > 0 and all(k in told for k in group):
+                out.append(hypot(*(told[k] - truth[k] for k in group)) / size)
     return out
 
 
@@ -119,16 +116,22 @@ def standardised(rows: Sequence[dict[str, Any]]) -> list[float]:
     standard deviations that were stated; as `parameter_errors`, but each number by
     itself."""
     out = []
+    for r, at, truth in _named_right([r for r in rows if "deviations" in r]):
+        told, std = r["parameters"][at], r["deviations"][at]
+        for k in (k for group in _grouped(truth) for k in group):
+            if k in told and std[k] > 0:
+                out.append((told[k] - truth[k]) / std[k])
+    return out
+
+
+def _named_right(
+    rows: Sequence[dict[str, Any]],
+) -> Iterator[tuple[dict[str, Any], int, dict[str, Any]]]:
+    """Cases, the place of a true effect among their names, and its parameters."""
     for r in rows:
         for name, truth in zip(r["truth"], r["true_parameters"], strict=True):
-            if name not in r["named"] or "deviations" not in r:
-                continue
-            at = r["named"].index(name)
-            told, std = r["parameters"][at], r["deviations"][at]
-            for k in (k for group in _grouped(truth) for k in group):
-                if k in told and std[k] > 0:
-                    out.append((told[k] - truth[k]) / std[k])
-    return out
+            if name in r["named"]:
+                yield r, r["named"].index(name), truth
 
 
 def _grouped(parameters: Mapping[str, Any]) -> list[list[str]]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from easi_jax.data.recording import Run
 from easi_jax.data.windows import fitted_velocity
-from easi_jax.model.joint_space import Configuration
+from easi_jax.model.joint_space import Configuration, one_sign
 
 _ORDERS = range(2, 13)
 _ROWS_PER_ORDER = 8  # at least, of a recording: higher orders would hardly scatter less
@@ -159,11 +159,7 @@ def _fresh(readings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if len(x) < 2:
         return x, rows
     if x.shape[1] == 4 and np.allclose(np.linalg.norm(x, axis=1), 1.0, atol=1e-3):
-        turned = np.sum(x[1:] * x[:-1], axis=1) < 0
-        x = (
-            x
-            * np.cumprod(np.concatenate([[1.0], np.where(turned, -1.0, 1.0)]))[:, None]
-        )
+        x = one_sign(x)
     new = changed(x)
     return (x[new], rows[new]) if _leaps(x, new) else (x, rows)
 

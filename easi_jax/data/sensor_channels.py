@@ -12,6 +12,7 @@ from mujoco.mjx._src.types import SensorType
 
 from easi_jax.data.noise import finest, resolution_of, sensor_noise
 from easi_jax.data.recording import Run
+from easi_jax.model.joint_space import one_sign
 from easi_jax.model.sensors import sensor_columns, sensor_kind, sensor_unit
 
 _OF_NO_MOTION = {"CLOCK", "USER", "PLUGIN"}
@@ -312,9 +313,7 @@ def _filled(run: Run, name: str, turns: bool) -> np.ndarray:
     x, row = given[there], np.arange(len(run))
     if not len(x):
         return np.zeros_like(given)
-    if turns:
-        turned = np.sum(x[1:] * x[:-1], axis=1) < 0
-        x = x * np.cumprod(np.r_[1.0, np.where(turned, -1.0, 1.0)])[:, None]
+    x = one_sign(x) if turns else x
     return np.stack([np.interp(row, row[there], column) for column in x.T], 1)
 
 

@@ -72,22 +72,27 @@ def set_right(
     if not (each and all(run.qvel_measured for run in runs)):
         return SetRight(runs, notes, noisier)
     dt, latest = runs[0].dt, 0.0
+    left, chosen = {}, {}
     for d in np.flatnonzero(~np.any([run.hidden for run in runs], 0)).tolist():
-        tried = _tried(
-            runs, d, [(moved[:, d], read[:, d]) for moved, read in each], simulated
+        parts = [(moved[:, d], read[:, d]) for moved, read in each]
+        left[d] = _tried(runs, d, parts, simulated)
+    # The best of each at once, then the next of those that are not to be trusted.
+    while left := {d: found for d, found in left.items() if found}:
+        right = runs
+        for d, found in left.items():
+            right = [found[0].undone(run, d) for run in right]
+        trusted = trusted_velocities(right)
+        chosen |= {d: found[0] for d, found in left.items() if trusted[d]}
+        left = {d: found[1:] for d, found in left.items() if not trusted[d]}
+    for d, found in sorted(chosen.items()):
+        runs, noisier[d] = [found.undone(run, d) for run in runs], found.noisier(dt)
+        late = found.way is _delayed
+        latest = max(latest, found.seconds if late else 0.0)
+        kind = "late by" if late else "filtered, time constant"
+        notes.append(
+            f"velocity of {names[d]}: {kind} {1000 * found.seconds:.3g} ms, by the "
+            "positions beside it; that is taken out"
         )
-        for _, found in sorted(tried, key=lambda t: t[0]):
-            right = [found.undone(run, d) for run in runs]
-            if trusted_velocities(right)[d]:
-                runs, noisier[d] = right, found.noisier(dt)
-                late = found.way is _delayed
-                latest = max(latest, found.seconds if late else 0.0)
-                kind = "late by" if late else "filtered, time constant"
-                notes.append(
-                    f"velocity of {names[d]}: {kind} {1000 * found.seconds:.3g} ms, by "
-                    "the positions beside it; that is taken out"
-                )
-                break
     lost = math.ceil(latest / dt - 1e-9)
     runs = [
         rows_of(r, 0, len(r) - lost) if lost and len(r) > lost + _FEWEST else r
@@ -98,8 +103,8 @@ def set_right(
 
 def _tried(
     runs: Sequence[Run], d: int, parts: _Parts, simulated: float
-) -> list[tuple[float, "_Found"]]:
-    """What may have been done to a velocity, each with what it leaves once undone."""
+) -> list["_Found"]:
+    """What may have been done to a velocity; what leaves least once undone first."""
     dt, out = runs[0].dt, []
     for way in (_delayed, _filtered):
         share, late = _best(parts, dt, way, simulated)
@@ -108,11 +113,14 @@ def _tried(
             continue
         for reach in _REACHES if way is _filtered else _REACHES[:1]:
             found = _Found(way, seconds, reach)
-            right = [found.undone(run, d) for run in runs if len(run) > _FEWEST]
-            left = [(moved[:, d], read[:, d]) for moved, read in map(_steps, right)]
+            right = [found.undone(run, d).qvel for run in runs if len(run) > _FEWEST]
+            left = [
+                (moved, _between(qvel[:, d]))
+                for (moved, _), qvel in zip(parts, right, strict=True)
+            ]
             # With the noise that undoing makes more of.
             out.append((float(_off(left, dt, _delayed, simulated).sum()), found))
-    return out
+    return [found for _, found in sorted(out, key=lambda t: t[0])]
 
 
 @dataclass(frozen=True)
@@ -181,7 +189,12 @@ def _steps(run: Run) -> tuple[np.ndarray, np.ndarray]:
     """Velocities by the steps of the positions, and as read on either side of each,
     ``(T - 1, nv)``."""
     moved = run.configuration.difference(run.qpos[:-1], run.qpos[1:]) / run.dt
-    return moved, 0.5 * (run.qvel[:-1] + run.qvel[1:])
+    return moved, _between(run.qvel)
+
+
+def _between(qvel: np.ndarray) -> np.ndarray:
+    """Means of velocities on either side of each step, ``(T - 1, ...)``."""
+    return 0.5 * (qvel[:-1] + qvel[1:])
 
 
 def _best(

@@ -151,6 +151,30 @@ def result_code(flags: A, finite: Any = True) -> A:
     return xp.where(finite, xp.where(lost, NOT_DETERMINED, bound), DIVERGED)
 
 
+def inverted(information: A, prior: A, resolved: float) -> tuple[A, A]:
+    """Covariance ``(n, n)`` of what ``information (n, n)`` and a ``prior (n,)`` of each
+    entry know, and the variance along what the information shows alone, ``(n,)``.
+
+    Information spans ten decades, and rounding leaves noise where it should be zero
+    that a plain inverse would take for knowledge. So it is scaled to a unit diagonal,
+    what is at most ``resolved`` there counts as not seen, and seen and unseen are
+    inverted apart.
+    """
+    xp = array_module(information)
+    size = xp.sqrt(xp.maximum(xp.diag(information), prior))
+    scaled = information / size[:, None] / size
+    values, vectors = xp.linalg.eigh(0.5 * (scaled + scaled.T))
+    seen = values > resolved
+    known = vectors.T @ (vectors * (prior / size**2)[:, None])
+    total = xp.where(seen[:, None] == seen, known, 0.0)
+    total = total + xp.diag(xp.where(seen, values, 0.0))
+    root = xp.sqrt(xp.diag(total))
+    back = vectors / size[:, None] / root
+    inverse = xp.linalg.inv(total / root[:, None] / root)
+    shown = xp.sum((back * seen) @ inverse * (back * seen), 1)
+    return back @ inverse @ back.T, shown
+
+
 def moved(space: ParameterSpace, unit: jax.Array, du: jax.Array) -> jax.Array:
     """``unit`` moved by ``du (..., n)`` along the SI values themselves.
 

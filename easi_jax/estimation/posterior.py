@@ -13,6 +13,7 @@ from easi_jax.data.segments import Segments
 from easi_jax.estimation import limits
 from easi_jax.estimation.blocks import scattered
 from easi_jax.estimation.doubts import Doubts, followed, without
+from easi_jax.estimation.least_squares import inverted
 from easi_jax.estimation.levenberg_marquardt import RefineResult, refine
 from easi_jax.estimation.normal_equations import RESOLVED, PairedFit
 from easi_jax.estimation.pieces import effective_noise, finish_pieces, finish_rest
@@ -446,25 +447,12 @@ def diverged(found: Estimate, names: Sequence[str]) -> str:
 
 def _posterior(hessian: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """``(F + prior)^-1``, the filter of directions that the data show, and the
-    variance of each parameter along those alone, ``(n,)``.
-
-    F spans ten decades, and single precision leaves noise where it should be zero that
-    a plain inverse would take for knowledge. So F is scaled to a unit diagonal, what is
-    below `RESOLVED` there counts as not seen, and seen and unseen are inverted apart.
-    """
-    size = jnp.sqrt(jnp.maximum(jnp.diag(hessian), 1.0 / _INITIAL_VARIANCE))
-    scaled = hessian / size[:, None] / size
-    values, vectors = jnp.linalg.eigh(0.5 * (scaled + scaled.T))
-    seen = values > RESOLVED
-    prior = vectors.T @ (vectors / (_INITIAL_VARIANCE * size**2)[:, None])
-    total = jnp.where(seen[:, None] == seen, prior, 0.0)
-    total = total + jnp.diag(jnp.where(seen, values, 0.0))
-    root = jnp.sqrt(jnp.diag(total))
-    back = vectors / size[:, None] / root
-    inverse = jnp.linalg.inv(total / root[:, None] / root)
-    cov = back @ inverse @ back.T
-    shown = jnp.sum((back * seen) @ inverse * (back * seen), 1)
-    return cov, jnp.eye(hessian.shape[0]) - cov / _INITIAL_VARIANCE, shown
+    variance of each parameter along those alone, ``(n,)``; what is below `RESOLVED`
+    counts as not seen (`easi_jax.estimation.least_squares.inverted`)."""
+    n = hessian.shape[0]
+    prior = jnp.full(n, 1.0 / _INITIAL_VARIANCE, hessian.dtype)
+    cov, shown = inverted(hessian, prior, RESOLVED)
+    return cov, jnp.eye(n) - cov / _INITIAL_VARIANCE, shown
 
 
 def _draws(mean: jax.Array, cov: jax.Array, count: int) -> jax.Array:

@@ -58,8 +58,8 @@ def misfit_of(error: jax.Array, noise: jax.Array, weight: jax.Array) -> jax.Arra
     square = (weight * size**2).sum((0, 1)) / whole
     # Of a piece that has been read in all of its steps the count is H.
     most = (weight > 0).sum(1).max(0)
-    alike = jnp.clip(most * together / jnp.maximum(square, 1e-30), 1.0, None)
-    return jnp.sqrt(beyond * jnp.minimum(alike, jnp.maximum(most, 1)))
+    alike = most * together / jnp.maximum(square, 1e-30)
+    return jnp.sqrt(beyond * jnp.clip(alike, 1.0, jnp.maximum(most, 1.0)))
 
 
 def _grown(mean: jax.Array, noise: jax.Array, weight: jax.Array) -> jax.Array:

@@ -22,7 +22,7 @@ from easi_jax.gap.decisions import DECIDE
 from easi_jax.gap.effect_set import Candidate, Model
 from easi_jax.gap.gap_metric import finite
 from easi_jax.gap.model_comparison import better, contains
-from easi_jax.gap.predictor import BLOCK, Predictor
+from easi_jax.gap.predictor import Predictor, windows_in
 from easi_jax.gap.table import Place
 from easi_jax.gap.whitening import Residuals
 from easi_jax.io.runs.step_cache import Arrays, Journal
@@ -108,8 +108,8 @@ class Selector:
         """What each fitted window counts where each row of a log counts once,
         ``(count,)``: windows overlap."""
         windows, length = self.predictor.windows, self.residuals.groups.shape[1]
-        at = (BLOCK * self.blocks[:, None] + np.arange(BLOCK)).reshape(-1)
-        run, row = (x[at[: self.count]] for x in (windows.run, windows.row))
+        at = windows_in(self.blocks)[: self.count]
+        run, row = windows.run[at], windows.row[at]
         rows = row[:, None] + np.arange(length)
         key = run[:, None] * (row.max() + length) + rows
         _, at, count = np.unique(key, return_inverse=True, return_counts=True)
@@ -117,7 +117,7 @@ class Selector:
 
     def windows_of(self, some: np.ndarray) -> np.ndarray:
         """Fitted windows in some of the blocks; the last block may not be full."""
-        at = (BLOCK * some[:, None] + np.arange(BLOCK)).reshape(-1)
+        at = windows_in(some)
         return at[at < self.count]
 
     def simulate(self, x: np.ndarray, some: np.ndarray | None = None) -> np.ndarray:

@@ -114,6 +114,12 @@ def _fields(layout: Layout) -> tuple[str, ...]:
     return tuple(f for f in Effects.__dataclass_fields__ if f in varied)
 
 
+def windows_in(blocks: np.ndarray) -> np.ndarray:
+    """Places of the windows of some blocks, ``(nb * BLOCK,)``; those of a last one that
+    is not full, too."""
+    return (BLOCK * blocks[:, None] + np.arange(BLOCK)).reshape(-1)
+
+
 class Predictor:
     """Errors of open-loop predictions of a fixed set of windows.
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from easi_jax.estimation.blocks import scattered
-from easi_jax.estimation.least_squares import OUTCOMES, result_code
+from easi_jax.estimation.least_squares import OUTCOMES, inverted, result_code
 from easi_jax.estimation.posterior import trusted
 from easi_jax.estimation.weights import excess
 from easi_jax.gap.effect_set import Model
@@ -221,25 +221,11 @@ def fit_covariance(selector: Selector, model: Model) -> np.ndarray:
     width = bounds.high[f.active] - bounds.low[f.active]
     open_ = np.where(np.isfinite(width), width / np.sqrt(12.0), _ANYTHING * size)
     prior = (size / open_) ** 2
-    cov = _inverse(np.asarray(left), prior)
+    cov = inverted(np.asarray(left), prior, _ALIKE)[0]
     if selector.unseen_steps is not None:
         error = selector.residuals.grouped(selector.unseen_steps[None])
         off = selector.residuals.whitened(error)[0]
         pull = np.einsum("w,wma,wm->a", weight, j, off, optimize=True)
-        moved = _inverse(normal, prior) @ pull
+        moved = inverted(normal, prior, _ALIKE)[0] @ pull
         cov += np.outer(moved, moved)
     return cov * np.outer(size, size)
-
-
-def _inverse(information: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """Covariance ``(a, a)`` of what ``information (a, a)`` and a ``prior (a,)`` of each
-    number know. What is rounding beside the information counts as not seen, and is
-    inverted apart."""
-    size = np.sqrt(np.diag(information) + prior)
-    values, vectors = np.linalg.eigh(information / np.outer(size, size))
-    seen = values > _ALIKE
-    known = vectors.T @ (vectors * (prior / size**2)[:, None])
-    total = np.where(seen[:, None] == seen, known, 0.0)
-    total += np.diag(np.where(seen, values, 0.0))
-    back = vectors / size[:, None]
-    return back @ np.linalg.inv(total) @ back.T

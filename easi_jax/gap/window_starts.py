@@ -9,7 +9,7 @@ from easi_jax.data.activations import activation_guess, activation_spread
 from easi_jax.data.recording import Run
 from easi_jax.data.unmeasured import start_spread
 from easi_jax.estimation.starts import Starts, starts_about
-from easi_jax.gap.predictor import BLOCK, Predictor
+from easi_jax.gap.predictor import Predictor, windows_in
 from easi_jax.model.effect_catalog import Scales
 from easi_jax.model.separate_trees import start_parts
 
@@ -40,10 +40,8 @@ def window_starts(
     if m.na:
         act = activation_spread(m, runs, [activation_guess(m, run) for run in runs])
     own, whole = len(predictor.neutral), predictor.windows.known.all()
-    at = np.arange(len(predictor.windows))
-    if blocks is not None:
-        at = (blocks[:, None] * BLOCK + np.arange(BLOCK)).reshape(-1)
-    at = at[:count]
+    every = np.arange(len(predictor.windows))
+    at = (every if blocks is None else windows_in(blocks))[:count]
 
     def simulate(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
         return predictor.errors(x[..., :own], blocks, moved)[:, :count, :rows]

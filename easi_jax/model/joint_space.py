@@ -67,6 +67,14 @@ def numbered(name: str, width: int) -> tuple[str, ...]:
     return (name,) if width == 1 else tuple(f"{name}.{i}" for i in range(width))
 
 
+def one_sign(q: np.ndarray) -> np.ndarray:
+    """Quaternions ``(T, 4)`` of one path, each of the sign that is nearer to the one
+    before: q and -q are the same orientation."""
+    turned = np.sum(q[1:] * q[:-1], axis=1) < 0
+    sign = np.cumprod(np.append(1.0, np.where(turned, -1.0, 1.0)))
+    return q * sign[: len(q), None]
+
+
 def tangent_names(m: Any) -> tuple[str, ...]:
     """Names of the ``nv`` entries of a tangent vector or velocity."""
     return tuple(

@@ -19,6 +19,7 @@ from easi_jax.model.joint_space import (
     is_hinge,
     is_scalar,
     joint_name,
+    one_sign,
     scalar_dofs,
     turns_fully,
     widths,
@@ -210,9 +211,7 @@ def normalized(
                 "were normalized"
             )
         quaternion /= norm[:, None]
-        turned = np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0
-        sign = np.cumprod(np.concatenate([[1.0], np.where(turned, -1.0, 1.0)]))
-        qpos[rows, start : start + 4] = quaternion * sign[: len(rows), None]
+        qpos[rows, start : start + 4] = one_sign(quaternion)
     return qpos, notes
 
 
