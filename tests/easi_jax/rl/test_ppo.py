@@ -86,12 +86,22 @@ def test_values(trained: Trained, name: str, expected: tuple[float, float]) -> N
 @pytest.mark.parametrize(
     ("name", "expected"), [("action", (0.5, 0.5)), ("both", (-0.5, 0.5))]
 )
-def test_actions(trained: Trained, name: str, expected: tuple[float, float]) -> None:
-    policy = trained.ppo.policy(state_of(trained, name))
-    best = act(policy, OBS, deterministic=True)[:, 0]
-    # A policy that does not see the observation is 0.5 off. How near one run of so few
-    # updates comes differs between processors, by their rounding (0.01 to 0.12 seen).
-    np.testing.assert_allclose(best, expected, atol=0.2)
+def test_actions(ppo: Ppo, name: str, expected: tuple[float, float]) -> None:
+    """The middle of 16 seeds.
+
+    Of 32 seeds a fifth stop exploring 0.2 and more beside the best action at one of
+    the observations, other ones on each processor. A policy that does not see the
+    observation is 0.5 off.
+    """
+    model, keys = probe_models()[name], jax.random.split(jax.random.key(1), 16)
+
+    @jax.jit
+    def best(keys: jax.Array) -> jax.Array:
+        final, _ = run_seeds(ppo, init_seeds(ppo, keys, model), model, 2 * HALF)
+        acted = jax.vmap(lambda s: act(ppo.policy(s), OBS, deterministic=True))
+        return acted(final)[..., 0]
+
+    np.testing.assert_allclose(np.median(best(keys), 0), expected, atol=0.03)
 
 
 def test_time_limit_bootstraps_from_the_terminal_observation(trained: Trained) -> None:
