@@ -7,7 +7,7 @@ wrong. So the last steps of a fit to measured logs are made with such effects as
 nuisances, each with a prior about nothing: what the data tell of them is taken off the
 parameters, and what they leave open widens what is stated. Commands that come late are
 always in doubt (`doubts_of`); where the model errs by more than the noise, drives,
-friction and constant forces are too (`all_doubts`).
+friction, constant forces and the zeros of joints are too (`all_doubts`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,7 +23,7 @@ from easi_jax.estimation.levenberg_marquardt import RefineResult
 from easi_jax.model import effects
 from easi_jax.model.addresses import describe
 from easi_jax.model.effect_catalog import Scales
-from easi_jax.model.effect_numbers import EFFECT_TABLE
+from easi_jax.model.effect_numbers import NUMBERS
 from easi_jax.model.joint_space import joint_name, scalar_dofs
 from easi_jax.model.parameters import Parameter, ParameterSpace
 from easi_jax.simulation.simulator import Simulator
@@ -38,8 +38,11 @@ _SMALL = 0.02  # deviations before any data: nobody would look for so little
 # seals and cables seldom lighter.
 _STRENGTH = 0.05  # of a drive's force
 _FORCE = 0.05  # of what moves a joint: dry friction, a constant force
+# Of a joint's zero: half a degree, as set by eye or by a stop; of a slide's motion.
+_ZERO = np.radians(0.5), 0.01
 _ROOM = 10.0  # deviations that these go
 _EACH = 6  # joints or drives at most that have doubts of their own
+_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
 _SETS_FORCE = ("gain", "strength", "gear", "kp", "kv")
 
 
@@ -84,8 +87,9 @@ def all_doubts(
     simulator: Simulator, space: ParameterSpace, scales: Scales
 ) -> Doubts | None:
     """Doubts where the model is known to lack something: late commands, the strength of
-    drives, dry friction and constant forces of joints, of each kind what no parameter
-    that is asked for sets. Of more than six joints or drives all have the same.
+    drives, dry friction, constant forces and zeros of joints, of each kind what no
+    parameter that is asked for sets. Of more than six joints or drives all have the
+    same strength or friction.
 
     Args:
         scales: of the logs.
@@ -93,15 +97,17 @@ def all_doubts(
     m = simulator.mj_model
     asked = {a for p in space.parameters for a in p.addresses} | set(simulator.fixed)
     drives = {m.actuator(a).name or str(a): _STRENGTH for a in range(m.nu)}
-    joints = {
-        joint_name(m, j): _FORCE * float(scales.torque[d])
-        for j, (_, d) in scalar_dofs(m).items()
-        if not scales.hidden or not scales.hidden[d]
-    }
+    joints, zeros, (turn, way) = {}, {}, _ZERO
+    for j, (_, d) in scalar_dofs(m).items():
+        if not scales.hidden or not scales.hidden[d]:
+            name, hinge = joint_name(m, j), m.jnt_type[j] == _HINGE
+            joints[name] = _FORCE * float(scales.torque[d])
+            zeros[name] = turn if hinge else way * float(scales.position[d])
     kinds = (
         ("strength", "the strength of {} is another", drives, _SETS_FORCE),
         ("coulomb", "{} has more dry friction", joints, ("frictionloss", "coulomb")),
         ("constant", "a constant force acts on {}", joints, ("constant", "springref")),
+        ("bias", "readings of {} have an offset", zeros, ()),
     )
     found = list(_late(simulator))
     for field, text, sizes, same in kinds:
@@ -112,7 +118,7 @@ def all_doubts(
             and _possible(m, f"effect.{field}.{name}")
         ]
         together = len(free) > _EACH
-        if together and field == "constant":
+        if together and field in ("constant", "bias"):
             continue  # of one sign and size in all joints: nobody's effect
         for group in [free] if together else [[name] for name in free]:
             shown = "every joint or drive" if together else f'"{group[0]}"'
@@ -146,7 +152,7 @@ def _parameter(
     """An effect at the places of a ``group``, alike, of a deviation ``size``."""
     places = tuple(f"effect.{field}.{place}" for place in group)
     unit, (least, most) = describe(m, places)
-    neutral = EFFECT_TABLE[field].neutral
+    neutral = NUMBERS[field].neutral
     low, high = neutral - _ROOM * size, min(most, neutral + _ROOM * size)
     # A force that only brakes has no slope at none at all.
     none = neutral + _NEVER * size if least >= neutral else neutral

@@ -25,6 +25,7 @@ from easi_jax.estimation import limits
 from easi_jax.estimation.blocks import too_few
 from easi_jax.estimation.doubts import Doubts, all_doubts, doubts_of, told
 from easi_jax.estimation.identifiability import identifiability
+from easi_jax.estimation.least_squares import raised_to_range
 from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.pieces import effective_noise, few, segments_from_runs
 from easi_jax.estimation.posterior import (
@@ -380,6 +381,8 @@ class _Finish:
             # From a plateau nothing leads back.
             lost = self.limited & np.asarray(limits.unmet(last.found.hessian))
             at = jnp.where(lost, begun, at)
+            if k == 0:  # nor from where a value is as good as zero
+                at = raised_to_range(self.search.space, at)
             given = at, cov, last.weighed, last.misfit, known
             found = distributed.local(self.ending(doubts)(*placed(given)))
             noise = self.learned(found)

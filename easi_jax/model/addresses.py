@@ -13,6 +13,7 @@ checks addresses against a model and returns what `easi_jax.model.mjx_model` wri
 import copy
 import math
 import re
+from collections import ChainMap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -21,11 +22,21 @@ from mujoco.mjx._src.collision_driver import geom_pairs
 
 from easi_jax.errors import UserError, nearest
 from easi_jax.model.contact_pairs import pair_names
-from easi_jax.model.effect_numbers import EFFECT_TABLE, is_vector
+from easi_jax.model.effect_numbers import (
+    EFFECT_TABLE,
+    READING_TABLE,
+    EffectNumber,
+    is_vector,
+)
 from easi_jax.model.quantities import TABLE as MODEL_TABLE
 from easi_jax.model.quantities import Entry, Inert, Quantity, direct_solref, value_of
 
-TABLE: Mapping[str, Mapping[str, Quantity]] = {**MODEL_TABLE, "effect": EFFECT_TABLE}
+# A constant offset of a joint's readings is the one number of what is read that a fit
+# to logs may vary (`easi_jax.simulation.open_loop`); `declare` refuses it to others.
+TABLE: Mapping[str, Mapping[str, Quantity]] = {
+    **MODEL_TABLE,
+    "effect": ChainMap(EFFECT_TABLE, {"bias": READING_TABLE["bias"]}),
+}
 
 # Of what sensors read, not of a model: a search has such numbers beside a model's.
 READING = "reading"
@@ -137,7 +148,7 @@ def places(m: mujoco.MjModel, address: str) -> tuple[tuple[str, str, int], ...]:
             f"(known: {', '.join(TABLE)})"
         )
     row = TABLE[kind][quantity]
-    at = EFFECT_TABLE[quantity].on if kind == "effect" else kind
+    at = row.on if isinstance(row, EffectNumber) else kind
     if at in ("option", "model"):
         if name:
             raise UserError(f'address "{address}": it is of the whole model, no name')
@@ -329,8 +340,8 @@ def nominal(m: mujoco.MjModel, addresses: Iterable[str]) -> float:
     values = []
     for w in resolve(m, (addresses,)):
         read = w.row.read
-        if w.kind == "effect":
-            values.append(EFFECT_TABLE[w.quantity].neutral)
+        if isinstance(w.row, EffectNumber):
+            values.append(w.row.neutral)
         else:
             values += [read(m, w.id)] if read else [value_of(m, e) for e in w.entries]
     shown = ", ".join(addresses)

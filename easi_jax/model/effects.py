@@ -226,6 +226,11 @@ def has_own(e: Effects | None, present: tuple[str, ...] | None) -> bool:
     return e is not None and bool(e.laws) and (present is None or OWN in present)
 
 
+def has_bias(present: tuple[str, ...] | None) -> bool:
+    """Whether readings of joints may have an offset."""
+    return present is None or "bias" in present
+
+
 def has_body_drag(present: tuple[str, ...] | None) -> bool:
     """Whether bodies may have drag."""
     return present is None or "resistance" in present

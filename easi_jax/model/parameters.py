@@ -266,6 +266,12 @@ def declare(
             range that must be given.
     """
     texts = (addresses,) if isinstance(addresses, str) else tuple(addresses)
+    for text in texts:
+        if text.startswith("effect.bias."):
+            raise UserError(
+                f'parameter "{name}": {text} is in what is read, not in the machine: '
+                "train.gap finds it as sensor_bias, and --effects takes it out of logs"
+            )
     default_unit, physics = language.describe(mj_model, texts)
     value = language.nominal(mj_model, texts) if nominal is None else float(nominal)
     bounds = physics if bounds is None else bounds

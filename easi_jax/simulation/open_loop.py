@@ -1,12 +1,14 @@
 """Simulating measured segments under a model: logged commands, logged starts."""
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from easi_jax.data.segments import Segments
+from easi_jax.model import effects
 from easi_jax.simulation.simulator import Simulator
 
 
@@ -128,8 +130,17 @@ def error_from(
     measured: Segments,
     steps: int | jax.Array | None = None,
 ) -> jax.Array:
-    """`errors_from` of one segment, without an axis for it."""
-    target = (measured.next_qpos, measured.next_qvel)
+    """`errors_from` of one segment, without an axis for it.
+
+    Where readings of joints have an offset, the start is where the joints are, and what
+    is predicted is what would be read.
+    """
+    where = measured.next_qpos
+    if model.effects is not None and effects.has_bias(model.present):
+        true = partial(simulator.move, tangent=-model.effects.bias)
+        start = dataclasses.replace(start, qpos=true(start.qpos))
+        where = true(where)
+    target = (where, measured.next_qvel)
     if not _senses(measured):
         model = simulator.without_sense(model)
         states = _predicted(simulator, model, start, steps, False)[:2]

@@ -1,7 +1,8 @@
-"""Effects that a model may lack: commands that come late."""
+"""Effects that a model may lack: late commands, friction, zeros of joints."""
 
 import copy
 from collections.abc import Callable
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ import pytest
 from easi_jax.data.recording import Run
 from easi_jax.data.scales import scales_of
 from easi_jax.data.segments import Segments, cut, join, to_device
+from easi_jax.errors import UserError
 from easi_jax.estimation.doubts import (
     LATE,
     Doubts,
@@ -26,12 +28,14 @@ from easi_jax.estimation.posterior import Estimate, as_fitted, no_region, polish
 from easi_jax.model.distribution import covariance
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace, declare
+from easi_jax.simulation.open_loop import errors
 from easi_jax.simulation.simulator import Simulator
 
 _DT, _STEPS = 0.01, 20  # s, control steps
 _NOISE = np.array([2e-4, 5e-3])  # rad, rad/s
 _LATE = 0.004  # s
 _FRICTION = 0.05  # N m
+_OFFSET = 0.01  # rad
 _XML = """<mujoco><option timestep="0.002" integrator="implicitfast"/>
   <worldbody><body><joint name="j" axis="0 1 0" damping="0.1" armature="0.01"/>
     <geom type="capsule" size="0.02" fromto="0 0 0 0 0 -0.3" mass="0.5"/></body>
@@ -171,12 +175,14 @@ def test_what_is_in_doubt_where_something_is_missing() -> None:
     asked = _space(m).select(["damping"])
     found = all_doubts(Simulator(m, asked, _DT, engine="mujoco"), asked, scales)
     assert found is not None
-    late, strength, friction, force = found.parameters
+    late, strength, friction, force, zero = found.parameters
     assert late.name == LATE and strength.addresses == ("effect.strength.a",)
     assert strength.nominal == 1.0 and strength.initial == (1.0, 1.05)
     assert friction.addresses == ("effect.coulomb.j",) and friction.bounds[0] > 0
     assert force.addresses == ("effect.constant.j",) and force.bounds[0] < 0
     assert force.initial[1] == pytest.approx(0.05 * scales.torque[0])
+    assert zero.addresses == ("effect.bias.j",) and zero.bounds[0] < 0
+    assert zero.initial[1] == pytest.approx(np.radians(0.5))
     # A drive's gains are its strength.
     whole = _space(m)
     found = all_doubts(Simulator(m, whole, _DT, engine="mujoco"), whole, scales)
@@ -205,6 +211,52 @@ def test_values_hold_where_friction_is_missing() -> None:
     told_of = list(told(marginal.doubted, np.asarray(marginal.doubts), 0.002))
     assert any('"j" has more dry friction' in line for line in told_of)
     assert not no_region(marginal)
+
+
+def test_values_hold_where_a_zero_is_off() -> None:
+    """A joint that reads 0.01 rad too much: its drive pulls to another place."""
+    m = mujoco.MjModel.from_xml_string(_XML)
+    space = _space(m)
+    simulator = Simulator(m, space, _DT, engine="mujoco")
+    _, run = _recorded(m, 0, 0, 4)
+    doubts = all_doubts(simulator, space, scales_of(m, [run]))
+    assert doubts is not None
+    pieces, _ = _recorded(m, 0, doubts.simulator.past_steps, 4)
+    read = replace(
+        pieces, qpos=pieces.qpos + _OFFSET, next_qpos=pieces.next_qpos + _OFFSET
+    )
+    truth = space.to_unit(jnp.asarray(space.nominal))
+    alone, marginal = _fits(simulator, space, doubts)(read)
+    std = np.sqrt(np.diag(covariance(marginal.distribution)))
+    assert (np.abs(alone.distribution.mean - truth) / std).max() > 5.0
+    assert (np.abs(marginal.distribution.mean - truth) / std).max() < 3.0
+    mean, spread = np.asarray(marginal.doubts[-1]) * np.ptp(
+        doubts.parameters[-1].initial
+    )
+    assert abs(mean - _OFFSET) < 4.0 * spread and spread < 0.3 * _OFFSET
+    told_of = list(told(marginal.doubted, np.asarray(marginal.doubts), 0.002))
+    assert any('readings of "j" have an offset' in line for line in told_of)
+
+
+def test_offset_of_readings_is_that_of_what_is_predicted() -> None:
+    """Exact motion, read with an offset, under a model that knows of it."""
+    m = mujoco.MjModel.from_xml_string(_XML)
+    space = _space(m)
+    plain = Simulator(m, space, _DT, engine="mujoco")
+    known = Simulator(m, space, _DT, fixed={"effect.bias.j": 0.3}, engine="mujoco")
+    pieces, _ = _recorded(m, 0, 0, 5)
+    nominal = jnp.asarray(space.nominal)
+    before = errors(plain, plain.model(nominal), pieces)
+    read = replace(pieces, qpos=pieces.qpos + 0.3, next_qpos=pieces.next_qpos + 0.3)
+    after = errors(known, known.model(nominal), read)
+    np.testing.assert_allclose(after, before, atol=2e-6)
+    assert np.abs(errors(plain, plain.model(nominal), read)).max() > 0.01
+
+
+def test_offsets_are_no_parameters_of_a_machine() -> None:
+    m = mujoco.MjModel.from_xml_string(_XML)
+    with pytest.raises(UserError, match=r"in what is read.*sensor_bias.*--effects"):
+        declare(m, "zero", "effect.bias.j", initial=(-0.1, 0.1))
 
 
 def test_no_region_is_stated_where_nothing_likely_explains_the_error() -> None:
