@@ -13,6 +13,7 @@ from easi_jax.data.resampling import Rows, mean_held, resampled
 from easi_jax.data.windows import fitted_velocity, slope_noise
 from easi_jax.model import addresses
 from easi_jax.model.found_effects import EffectEntry
+from easi_jax.model.joint_space import tangent_names
 
 _STEPS_AGREE = 1e-3
 _AGREES = 0.1
@@ -210,34 +211,41 @@ def true_readings(
     """Runs rid of what ``entries`` say of the readings: offsets and delays of joints.
 
     A late reading is that of some time ago, so rows are read as much later, by linear
-    interpolation; the last rows, which nothing follows, are left out.
+    interpolation; the last rows, which nothing follows, are left out. Of velocities
+    that are read (``qvel.JOINT``) the offset is taken off; how late they are shows
+    beside the positions (`easi_jax.data.velocity_lag`).
 
     Raises:
         UserError: a joint that the model lacks, or that is no hinge or slide.
     """
-    bias, late = np.zeros(m.nv), np.zeros(m.nv)
+    bias, late, faster = np.zeros(m.nv), np.zeros(m.nv), np.zeros(m.nv)
+    names = [f"qvel.{name}" for name in tangent_names(m)]
     for e in entries:
+        if e.at in names:
+            faster[names.index(e.at)] += e.columns.get("bias", 0.0)
+            continue
         named = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SENSOR, e.at) >= 0
         own = e.kind == "sensor" and named
-        if not e.of_readings or own or e.at.startswith("qvel."):  # such are not used
+        if not e.of_readings or own:  # those are not used
             continue
         (place,) = addresses.places(m, f"joint.{e.at}.damping")
         dof = int(m.jnt_dofadr[place[2]])
         bias[dof] += e.columns.get("bias", 0.0)
         late[dof] += e.columns.get("late", 0.0)
-    if not bias.any() and not late.any():
+    if not (bias.any() or late.any() or faster.any()):
         return list(runs)
     out = []
     for run in runs:
         count = len(run) - math.ceil(late.max() / run.dt - _JITTER)
-        qpos, qvel = run.qpos.copy(), run.qvel.copy()
+        qpos = run.qpos.copy()
+        qvel = run.qvel - (faster if run.qvel_measured else 0.0)
         for q, d in zip(
             run.configuration.scalar_qpos, run.configuration.scalar_qvel, strict=True
         ):
             row = np.arange(len(run))
             at = row + late[d] / run.dt
             qpos[:, q] = np.interp(at, row, run.qpos[:, q]) - bias[d]
-            qvel[:, d] = np.interp(at, row, run.qvel[:, d])
+            qvel[:, d] = np.interp(at, row, qvel[:, d])
         smoothed = run.smoothed or bool(late.any())
         read = replace(run, qpos=qpos, qvel=qvel, smoothed=smoothed)
         out.append(rows_of(read, 0, max(count, 2)))

@@ -1,8 +1,9 @@
-"""Measured velocities that come late, or from a filter, set right by the positions.
+"""Measured velocities that are late, filtered or off, set right by the positions.
 
 A drive's velocity is often the derivative of its encoder some milliseconds ago, or
 behind a first-order filter. How much so shows beside the positions: their steps,
-delayed or filtered likewise, are what was read.
+delayed or filtered likewise, are what was read. A constant offset (a gyroscope's, an
+amplifier's) shows as well.
 """
 
 import math
@@ -29,6 +30,9 @@ _CERTAIN = 0.5  # of it with as long an advance, that a delay leaves at most
 # least, and half of one makes 1.7 times the noise of it.
 _REACHES = 0.0, 0.5
 _FEWEST = 30  # rows of a run that say something of it
+_BLOCKS = 10  # of all rows, whose means say how sure an offset is
+_SURE = 4.0  # standard errors that an offset is at least
+_MATTERS = 0.2  # of the noise of single readings: what a start would notice
 
 # Of each run, steps of the positions as velocities ``(T - 1,)`` [m/s, rad/s] and what
 # was read between the same rows.
@@ -39,7 +43,7 @@ _Seen = Callable[[np.ndarray, float, float], np.ndarray]
 
 @dataclass(frozen=True)
 class SetRight:
-    """Runs whose late or filtered velocities are as if they were neither.
+    """Runs whose late, filtered or offset velocities are as if they were none of it.
 
     Attributes:
         runs: as many as were given.
@@ -56,11 +60,12 @@ class SetRight:
 def set_right(
     given: Sequence[Run], names: Sequence[str], simulated: float = 0.0
 ) -> SetRight:
-    """Sets velocities right that come late, or from a filter.
+    """Sets velocities right that are off by a constant, come late, or from a filter.
 
-    Only where that explains some of how they differ from the steps of the positions,
-    and they are to be trusted afterwards (`easi_jax.data.cleaning.trusted_velocities`).
-    The last rows of a run, of which nothing was read later, are left out.
+    Lateness and filters only where they explain some of how velocities differ from the
+    steps of the positions, and these are to be trusted afterwards
+    (`easi_jax.data.cleaning.trusted_velocities`). The last rows of a run, of which
+    nothing was read later, are left out.
 
     Args:
         names: of all degrees of freedom, ``(nv,)``.
@@ -73,8 +78,10 @@ def set_right(
         return SetRight(runs, notes, noisier)
     dt, latest = runs[0].dt, 0.0
     left, chosen = {}, {}
-    for d in np.flatnonzero(~np.any([run.hidden for run in runs], 0)).tolist():
-        parts = [(moved[:, d], read[:, d]) for moved, read in each]
+    seen = ~np.any([run.hidden for run in runs], 0)
+    runs, offset = _centered(runs, seen)
+    for d in np.flatnonzero(seen).tolist():
+        parts = [(moved[:, d], read[:, d] - offset[d]) for moved, read in each]
         left[d] = _tried(runs, d, parts, simulated)
     # The best of each at once, then the next of those that are not to be trusted.
     while left := {d: found for d, found in left.items() if found}:
@@ -98,7 +105,31 @@ def set_right(
         rows_of(r, 0, len(r) - lost) if lost and len(r) > lost + _FEWEST else r
         for r in runs
     ]
+    runs, more = _centered(runs, seen)  # which lateness had hidden
+    offset = offset + more
+    notes += [
+        f"velocity of {names[d]}: off by {offset[d]:.3g}, by the positions beside it; "
+        "that is taken out"
+        for d in np.flatnonzero(offset).tolist()
+    ]
     return SetRight(runs, notes, noisier)
+
+
+def _centered(runs: list[Run], seen: np.ndarray) -> tuple[list[Run], np.ndarray]:
+    """Runs without what velocities read beyond the steps of the positions, and that,
+    ``(nv,)`` [m/s, rad/s]: 0 where blocks of the runs do not agree, or where it is
+    small beside the noise."""
+    each = [_steps(run) for run in runs if len(run) > _FEWEST]
+    off = np.concatenate([read - moved for moved, read in each])
+    means = np.array([part.mean(0) for part in np.array_split(off, _BLOCKS)])
+    offset, error = means.mean(0), means.std(0, ddof=1) / math.sqrt(_BLOCKS)
+    read = np.concatenate([read for _, read in each])
+    noise = np.diff(read, 2, axis=0).std(0) / math.sqrt(6.0)  # of white noise
+    sure = np.abs(offset) > np.maximum(_SURE * error, _MATTERS * noise)
+    offset = np.where(sure & seen, offset, 0.0)
+    if offset.any():
+        runs = [replace(run, qvel=run.qvel - offset) for run in runs]
+    return runs, offset
 
 
 def _tried(
@@ -158,9 +189,10 @@ class _Found:
         # The nearest reading, whose noise stays white; what it is off in time is made
         # up for by the positions, and where nothing was read they take its place.
         fitted = fitted_velocity(run.qpos, run.dt, run.configuration)[:, d]
-        at = np.minimum(np.round(row + self.seconds / run.dt).astype(int), row[-1])
+        later = np.round(row + self.seconds / run.dt).astype(int)
+        at = np.minimum(later, row[-1])
         then = np.interp(at - self.seconds / run.dt, row, fitted)
-        qvel[:, d] = np.where(at < row[-1], read[at] + fitted - then, fitted)
+        qvel[:, d] = np.where(later <= row[-1], read[at] + fitted - then, fitted)
         return replace(run, qvel=qvel)
 
 

@@ -17,7 +17,7 @@ from easi_jax.data.cleaning import rows_of
 from easi_jax.data.recording import Run
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.gap.decisions import DECIDE
-from easi_jax.model.joint_space import joint_name
+from easi_jax.model.joint_space import tangent_names, tangent_units
 from easi_jax.model.sensors import (
     reads_joints,
     sensor_columns,
@@ -27,8 +27,6 @@ from easi_jax.model.sensors import (
 
 _LONGEST = 0.1  # s
 PIECES = 10
-
-_LONGEST = 0.1  # s
 _SAME_STEP = 1e-6
 # Rows, and steps [rad, m, rad/s, m/s], in which a sensor's share of what is hidden
 # shows beyond rounding.
@@ -69,12 +67,7 @@ class ReadingFault:
 
 def reading_faults(m: mujoco.MjModel, runs: Sequence[Run]) -> list[ReadingFault]:
     """What is wrong with the velocities and the named sensors of ``runs``."""
-    joints = {int(d): joint_name(m, j) for j, d in enumerate(m.jnt_dofadr)}
-    out = [
-        _late(f"qvel.{joints[dof]}", lag.seconds, lag.std, lag.confidence)
-        for dof, lag in velocity_lags(runs).items()
-        if dof in joints
-    ]
+    out = _of_velocities(m, runs)
     asked = [i for i in range(m.nsensor) if m.sensor(i).name and _follows(m, i)]
     unknown = _of_hidden(m, runs[0])
     asked = [i for i in asked if not unknown[sensor_columns(m, i)].any()]
@@ -89,7 +82,26 @@ def reading_faults(m: mujoco.MjModel, runs: Sequence[Run]) -> list[ReadingFault]
             if name in run.sensors
         ]
         if both:
-            out += _faults(m, i, both, used[0].dt)
+            # What joints do not read alone may be off by the model's geometry.
+            sure = 1.0 if reads_joints(m, i) else DECIDE.geometry
+            out += _faults(m, name, sensor_unit(m, i), both, used[0].dt, sure)
+    return out
+
+
+def _of_velocities(m: mujoco.MjModel, runs: Sequence[Run]) -> list[ReadingFault]:
+    """Of measured velocities, beside those that the positions make."""
+    measured = [run for run in runs if run.qvel_measured]
+    if not measured:
+        return []
+    fitted = [fitted_velocity(r.qpos, r.dt, r.configuration) for r in measured]
+    names, units, out = tangent_names(m), tangent_units(m), []
+    for dof in np.flatnonzero(~measured[0].hidden).tolist():
+        both = [
+            (run.qvel[:, [dof]], right[:, [dof]])
+            for run, right in zip(measured, fitted, strict=True)
+        ]
+        dt, unit = measured[0].dt, f"{units[dof]}/s"
+        out += _faults(m, f"qvel.{names[dof]}", unit, both, dt)
     return out
 
 
@@ -136,10 +148,15 @@ def _follows(m: mujoco.MjModel, i: int) -> bool:
 
 
 def _faults(
-    m: mujoco.MjModel, i: int, both: Sequence[tuple[np.ndarray, np.ndarray]], dt: float
+    m: mujoco.MjModel,
+    name: str,
+    unit: str,
+    both: Sequence[tuple[np.ndarray, np.ndarray]],
+    dt: float,
+    sure: float = 1.0,
 ) -> list[ReadingFault]:
-    """Of one sensor, from its readings and what they should be, ``(T, dim)`` each."""
-    name = m.sensor(i).name
+    """Of one sensor, from its readings and what they should be, ``(T, dim)`` each;
+    ``sure`` that an offset is not the model's."""
     shifts = round(_LONGEST / dt) + 1
     pieces = _pieces(both, shifts)
     if pieces is None:
@@ -166,12 +183,8 @@ def _faults(
     large &= bias**2 > 0.5 * np.nanmean(rest**2, 0)
     if large.any():
         shown = np.abs(means) > 0.5 * np.abs(bias)
-        sure = (int((shown & (means * bias > 0))[:, large].all(1).sum()) + 1) / (
-            PIECES + 2
-        )
-        if not reads_joints(m, i):
-            sure *= DECIDE.geometry
-        unit = sensor_unit(m, i)
+        share = int((shown & (means * bias > 0))[:, large].all(1).sum())
+        sure *= (share + 1) / (PIECES + 2)
         many = len(bias) > 1
         words = [f"bias.{k}" if many else "bias" for k in range(len(bias))]
         value = {w: float(b) for w, b in zip(words, bias, strict=True)}
@@ -235,42 +248,6 @@ def _expected(
     return out
 
 
-@dataclass(frozen=True)
-class Lag:
-    """How late a measured velocity is.
-
-    Attributes:
-        seconds: of all data.
-        std: standard error, from pieces of the data.
-        confidence: share of the pieces that are late by themselves, one more of either
-            kind counted (Laplace).
-    """
-
-    seconds: float
-    std: float
-    confidence: float
-
-
-def velocity_lags(runs: Sequence[Run]) -> dict[int, Lag]:
-    """Lag of each measured velocity (place in qvel) behind the positions.
-
-    A filtered velocity is the derivative of the positions of some time ago. The lag is
-    the shift at which both agree best; only where it explains most of the difference.
-    """
-    measured = [r for r in runs if r.qvel_measured]
-    if not measured:
-        return {}
-    dt = measured[0].dt
-    shifts = round(_LONGEST / dt) + 1
-    found = {}
-    for dof in np.flatnonzero(~measured[0].hidden).tolist():
-        costs = _costs(measured, dof, shifts)
-        lag = shift_of(costs.sum(0), dt)
-        if lag is not None:
-            found[dof] = Lag(lag, *alike([shift_of(c, dt) for c in costs], dt))
-    return found
-
-
 def alike(alone: Sequence[float | None], dt: float) -> tuple[float, float]:
     """Standard error and confidence of a lag, from those of single pieces."""
     late = [x for x in alone if x is not None]
@@ -279,25 +256,7 @@ def alike(alone: Sequence[float | None], dt: float) -> tuple[float, float]:
     return std, (len(late) + 1) / (len(alone) + 2)
 
 
-def _costs(runs: Sequence[Run], dof: int, shifts: int) -> np.ndarray:
-    """Squared differences by pieces of the data and shifts, ``(pieces, shifts)``."""
-    rows = []
-    for run in runs:
-        fitted = fitted_velocity(run.qpos, run.dt, run.configuration)[:, dof]
-        told = run.qvel[shifts:, dof]
-        n = len(told)
-        if n < shifts:
-            continue
-        rows.append(
-            [(told - fitted[shifts - s : shifts - s + n]) ** 2 for s in range(shifts)]
-        )
-    if not rows:
-        return np.zeros((1, shifts))
-    pieces = np.array_split(np.concatenate(rows, 1), PIECES, axis=1)
-    return np.array([p.sum(1) for p in pieces])
-
-
-def shift_of(cost: np.ndarray, dt: float, least: float = 0.0) -> float | None:
+def shift_of(cost: np.ndarray, dt: float, least: float) -> float | None:
     """The shift of least cost [s]; None where it is no better than none.
 
     Args:

@@ -74,6 +74,20 @@ def test_what_is_late_or_filtered_is_set_right(
         np.testing.assert_array_equal(run.qvel[:, 1], before.qvel[: len(run), 1])
 
 
+@pytest.mark.parametrize("way", ["right", "late"])
+def test_an_offset_is_taken_out(way: str) -> None:
+    """Beside others, which stay as they were read; of a late one too."""
+    given, by = [recorded(k, 0.004, way, 0.012)[0] for k in range(2)], 0.03
+    read = [replace(run, qvel=run.qvel + np.array([by, 0.0])) for run in given]
+    plain, right = set_right(given, NAMES), set_right(read, NAMES)
+    assert right.notes[-1].startswith("velocity of a: off by 0.0")
+    assert len(right.notes) == 1 + (way == "late")
+    for one, other in zip(right.runs, plain.runs, strict=True):
+        rows = min(len(one), len(other))
+        np.testing.assert_allclose(one.qvel[:rows], other.qvel[:rows], atol=4e-3)
+        np.testing.assert_array_equal(one.qvel[:rows, 1], other.qvel[:rows, 1])
+
+
 @pytest.mark.parametrize("dt", [0.02, 0.004, 0.001])
 @pytest.mark.parametrize("way", ["right", "scaled"])
 def test_other_velocities_stay_as_they_are(dt: float, way: str) -> None:

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from easi_jax.data.cleaning import true_readings
 from easi_jax.data.recording import Run, physics_steps
 from easi_jax.data.scales import scales_of
 from easi_jax.data.windows import fitted_velocity, lead_rows
@@ -37,12 +38,13 @@ from easi_jax.gap.model_comparison import (
 )
 from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.screening import as_sine, shortlist
-from easi_jax.gap.sensor_faults import velocity_lags
+from easi_jax.gap.sensor_faults import reading_faults
 from easi_jax.gap.table import Place
 from easi_jax.gap.whitening import Residuals, make_residuals, row_groups
 from easi_jax.gap.window_set import window_set
 from easi_jax.gap.window_starts import window_starts
 from easi_jax.model.effect_catalog import EFFECTS
+from easi_jax.model.effect_numbers import EffectEntry
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace
 
@@ -266,14 +268,32 @@ def test_late_velocities_are_noticed(lag: float, model: mujoco.MjModel) -> None:
     run = recording(model, 3, noise=1e-4)
     true = fitted_velocity(run.qpos, DT, run.configuration)[:, 0]
     late = np.interp(run.time - lag, run.time, true)
-    from dataclasses import replace
-
-    found = velocity_lags([replace(run, qvel=late[:, None], qvel_measured=True)])
+    read = replace(run, qvel=late[:, None], qvel_measured=True)
+    found = reading_faults(model, [read])
     if lag:
-        assert found[0].seconds == pytest.approx(lag, abs=0.003)
-        assert found[0].std < 0.002 and found[0].confidence > 0.9
+        (fault,) = found
+        assert (fault.effect, fault.at) == ("sensor_delay", "qvel.hinge")
+        assert fault.columns["late"] == pytest.approx(lag, abs=0.003)
+        assert fault.std["late"] < 0.002 and fault.confidence > 0.9
     else:
-        assert found == {}
+        assert found == []
+
+
+def test_velocities_with_an_offset_are_noticed(model: mujoco.MjModel) -> None:
+    """They are named, and taken off where the file of effects is given."""
+    run = recording(model, 3, noise=1e-4)
+    true = fitted_velocity(run.qpos, DT, run.configuration)
+    read = replace(run, qvel=true + 0.2, qvel_measured=True)
+    (fault,) = reading_faults(model, [read])
+    assert (fault.effect, fault.at) == ("sensor_bias", "qvel.hinge")
+    value, std, unit = fault.parameters["bias"]
+    assert value == pytest.approx(0.2, abs=0.01) and std < 0.01 and unit == "rad/s"
+    assert fault.confidence > 0.9
+    entry = EffectEntry(fault.effect, fault.at, "sensor", fault.columns, fault.std)
+    (right,) = true_readings(model, [read], [entry])
+    np.testing.assert_allclose(right.qvel, true + 0.2 - value)
+    np.testing.assert_array_equal(right.qpos, read.qpos)
+    assert reading_faults(model, [right]) == []
 
 
 def test_stiffness_is_told_with_its_rest(
