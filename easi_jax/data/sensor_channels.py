@@ -117,12 +117,9 @@ class Sensors:
         bound = [bool(found[n.sensor].is_bound[n.index]) | n.of_forces for n in self]
         return std, np.array(bound, bool)
 
-    def resolution(self, runs: Sequence[Run]) -> np.ndarray:
-        """Smallest step between two readings, ``(N,)``."""
-        return np.max([resolution_of(self.read(run)) for run in runs], axis=0)
-
     def finest(self, runs: Sequence[Run]) -> np.ndarray:
-        """The least of these of all runs, ``(N,)`` (`easi_jax.data.noise.finest`)."""
+        """Smallest step between two readings of a run, ``(N,)``
+        (`easi_jax.data.noise.finest`)."""
         return finest([resolution_of(self.read(run)) for run in runs])
 
     def spread(self, runs: Sequence[Run]) -> np.ndarray:

@@ -23,9 +23,9 @@ from easi_jax.data.windows import fitted_velocity
 _LONGEST = 0.1  # s, of a delay or a time constant
 _GRID = 40  # of them that are looked at, before the best is refined
 _SETTLES = 5.0  # time constants of a run, until a filter has forgotten its start
-_MEAN = 0.01  # s, over which velocities are compared
+_MEAN, _ROWS = 0.02, 5  # s and rows at least, over which velocities are compared
 _EXPLAINS = 0.8  # share of the squared difference that is left, at most
-_CERTAIN = 0.5  # of it with as long an advance, that a delay leaves at most
+_CERTAIN = 0.5  # of it the other way in time, that lateness leaves at most
 # Time constants to either side of a row, that slopes are taken over: short ones bend
 # least, and half of one makes 1.7 times the noise of it.
 _REACHES = 0.0, 0.5
@@ -211,7 +211,10 @@ def _delayed(moved: np.ndarray, seconds: float, dt: float) -> np.ndarray:
 
 
 def _filtered(moved: np.ndarray, seconds: float, dt: float) -> np.ndarray:
-    """At either end of each step, and of these the mean."""
+    """At either end of each step, and of these the mean; of a time below zero, by what
+    comes instead of what was."""
+    if seconds < 0.0:
+        return _filtered(moved[::-1], -seconds, dt)[::-1]
     keeps = np.exp(-dt / max(seconds, 1e-9))
     after, _ = lfilter([1.0 - keeps], [1.0, -keeps], moved, zi=[keeps * moved[0]])
     return 0.5 * (after + np.concatenate([moved[:1], after[:-1]]))
@@ -234,8 +237,8 @@ def _best(
 ) -> tuple[float, float]:
     """How much the best time leaves of the mean square of velocities less steps of the
     positions, beside none and one that is ``simulated``, and that time [s]. Infinite
-    where a run is the worse for it, or an advance would do as well: shifts by parts of
-    a row smooth the noise."""
+    where a run is the worse for it, or as much the other way in time would do as well:
+    filters, and shifts by parts of a row, smooth the noise of the steps."""
 
     def cost(seconds: float) -> float:
         return float(rows @ _off(parts, dt, way, seconds))
@@ -251,7 +254,9 @@ def _best(
         for x in ((way, best), (_delayed, 0.0), (_delayed, simulated))
     )
     now = np.minimum(*now)
-    ahead = rows @ _off(parts, dt, _delayed, -best)
+    # A delay beside that of a simulation, a filter beside none.
+    middle = simulated if way is _delayed else 0.0
+    ahead = rows @ _off(parts, dt, way, 2.0 * middle - best)
     if (here > now).any() or rows @ here > _CERTAIN * ahead:
         return np.inf, best
     return float(rows @ here / max(rows @ now, 1e-300)), best
@@ -260,12 +265,15 @@ def _best(
 def _off(parts: _Parts, dt: float, way: _Seen, seconds: float) -> np.ndarray:
     """Mean squares of velocities less steps of the positions as they would be read, of
     each run."""
-    over, out = max(1, round(_MEAN / dt)), []
+    over, out = max(_ROWS, round(_MEAN / dt)), []
     shortest = min(len(moved) for moved, _ in parts)
-    first = min(round(_SETTLES * _LONGEST / dt), max(0, shortest - over - _FEWEST))
+    # A filter forgets where it began, at either end.
+    first = round(_SETTLES * _LONGEST / dt)
+    first = min(first, max(0, shortest - over - _FEWEST) // 2)
     for moved, read in parts:
-        off = (read - way(moved, seconds, dt))[first:]
-        # Noise of single steps is as large as motion at a fast rate.
-        some = np.full(min(over, len(off)), 1.0 / over)
-        out.append(np.mean(np.convolve(off, some, "valid") ** 2))
+        off = (read - way(moved, seconds, dt))[first : len(read) - first]
+        # Noise of single steps is as large as motion at a fast rate. Without ends that
+        # are sharp, or a shift by half a row would be the one that averages most of it.
+        some = np.hanning(min(over, len(off)) + 2)[1:-1]
+        out.append(np.mean(np.convolve(off, some / some.sum(), "valid") ** 2))
     return np.array(out)

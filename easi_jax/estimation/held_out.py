@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from easi_jax.data import unmeasured
-from easi_jax.data.noise import resolutions
+from easi_jax.data.noise import finest, resolutions
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import to_device
 from easi_jax.data.windows import lead_rows
@@ -61,8 +61,8 @@ class WindowErrors:
         windows = to_device(cut.spread(most) if cut.count > most else cut)
         largest = jnp.abs(open_loop.motion(simulator, windows)[..., :nv])
         self.largest = jnp.asarray(np.asarray(largest).max((0, 1)))
-        self.resolution = np.max(
-            [resolutions(r) for r in (*problem.fit, *problem.held)], 0
+        self.resolution = finest(
+            [resolutions(r) for r in (*problem.fit, *problem.held)]
         )
 
         def errors(theta: jax.Array, moved: jax.Array) -> jax.Array:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from easi_jax.data.noise import pooled, resolutions
+from easi_jax.data.noise import finest, pooled, resolutions
 from easi_jax.data.recording import Run
 from easi_jax.data.sensor_channels import Sensors
 from easi_jax.estimation.starts import known_noise
@@ -65,7 +65,7 @@ def recorded(
     runs = [*fit, *held]
     motion = np.concatenate([scales.position, np.maximum(sensors.spread(fit), 1e-9)])
     told, is_bound = sensors.noise(fit)
-    step = np.max([resolutions(run) for run in runs], axis=0)
+    step = finest([resolutions(run) for run in runs])
     return Recorded(
         m,
         fit,
@@ -77,5 +77,5 @@ def recorded(
         motion,
         known_noise(np.concatenate([noise, told]), motion),
         np.concatenate([pooled(fit).is_bound[: m.nv], is_bound]),
-        np.concatenate([step, sensors.resolution(runs)]),
+        np.concatenate([step, sensors.finest(runs)]),
     )

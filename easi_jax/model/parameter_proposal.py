@@ -7,6 +7,7 @@ drives or its weight can do, and from its inertia. What moves nothing is left ou
 """
 
 import copy
+import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -100,12 +101,16 @@ def _felt(m: mujoco.MjModel) -> np.ndarray:
     out = np.zeros(m.nbody, bool)
     inertia, weight = _loads(m, poses)
     for b in np.flatnonzero((m.body_weldid > 0) & (m.body_mass > 0)):
+        # Half of it: without any, a body's own joint would have no inertia.
         lighter = copy.copy(m)
-        lighter.body_mass[b] = lighter.body_inertia[b] = 0.0
+        lighter.body_mass[b] *= 0.5
+        lighter.body_inertia[b] *= 0.5
+        mujoco.mj_setConst(lighter, mujoco.MjData(lighter))
         rest = _loads(lighter, poses)
-        lost = np.abs(weight - rest[1])
+        lost = 2.0 * np.abs(weight - rest[1])
         heavy = lost > _FELT * np.maximum(np.abs(weight).max(0), inertia)
-        out[b] = bool(heavy.any() or (inertia - rest[0] > _FELT * inertia).any())
+        moved = 2.0 * (inertia - rest[0]) > _FELT * inertia
+        out[b] = bool(heavy.any() or moved.any())
     return out
 
 
@@ -365,12 +370,17 @@ def as_text(proposals: list[Proposal], head: list[str], notes: dict[str, str]) -
         if p.tied:
             lines += [f"    # one value for {', '.join(p.tied)}"]
         lines += [
-            f'    address: "{q.addresses[0]}"',
+            f"    address: {_text(q.addresses[0])}",
             f"    initial: [{_number(q.initial[0])}, {_number(q.initial[1])}]",
             f"    bounds: [{_number(q.bounds[0])}, {_number(q.bounds[1])}]",
-            f'    unit: "{q.unit}"',
+            f"    unit: {_text(q.unit)}",
         ]
     return "\n".join(lines) + "\n"
+
+
+def _text(x: str) -> str:
+    """In quotes, as YAML and JSON both read it."""
+    return json.dumps(x, ensure_ascii=False)
 
 
 def _number(x: float) -> str:

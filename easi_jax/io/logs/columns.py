@@ -1,6 +1,5 @@
 """The columns that a model gives a log, and their check."""
 
-import fnmatch
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from easi_jax.data.unmeasured import placed_by_model
 from easi_jax.errors import UserError, nearest
 from easi_jax.io.logs.cure import cure
 from easi_jax.io.models.completed import held_joint
+from easi_jax.model.addresses import matching
 from easi_jax.model.joint_space import FREE_WIDTH, given_name, numbered, widths
 
 _CHECKED = ("qpos.", "qvel.", "ctrl.")
@@ -130,7 +130,7 @@ def named_joints(model: mujoco.MjModel, unmeasured: Sequence[str]) -> set[str]:
     joints = [given_name(model, j) for j in range(model.njnt)]
     out = set[str]()
     for pattern in unmeasured:
-        found = fnmatch.filter(joints, pattern)
+        found = matching(pattern, joints)
         if not found and pattern != _ALL:
             raise UserError(
                 f'--unmeasured "{pattern}": the model has no such joint'

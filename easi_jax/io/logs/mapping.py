@@ -4,7 +4,6 @@ One schema for tables (``--mapping`` of every command that reads logs) and for t
 recordings that are imported.
 """
 
-import fnmatch
 import math
 import os
 from collections.abc import Collection, Iterable, Mapping
@@ -17,6 +16,7 @@ import numpy as np
 from easi_jax.errors import UserError, nearest
 from easi_jax.io.logs.tables import Cells, Table
 from easi_jax.io.strict_yaml import check_keys, read_yaml
+from easi_jax.model.addresses import matching
 
 _NAMES = ("columns", "joints", "actuators")
 _NUMBERS = ("scale", "offset")
@@ -97,7 +97,7 @@ class LogMapping:
             UserError: naming it and the nearest column.
         """
         for key in (*self.scale, *self.offset):
-            if not any(fnmatch.fnmatchcase(name, key) for name in columns):
+            if not matching(key, columns):
                 raise UserError(
                     f'{self.source}: scale or offset of "{key}", which no column of '
                     f"the log is called{nearest(key, columns)}"
@@ -151,7 +151,7 @@ class LogMapping:
         table: Mapping[str, float] = getattr(self, kind)
         if column in table:
             return table[column]
-        fitting = [key for key in table if fnmatch.fnmatchcase(column, key)]
+        fitting = [key for key in table if matching(key, [column])]
         if len(fitting) > 1:
             raise UserError(
                 f'{self.source}: {kind} of "{column}" is given by "{fitting[0]}" and '

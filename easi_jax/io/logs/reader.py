@@ -44,6 +44,7 @@ from easi_jax.model.joint_space import FREE_WIDTH, Configuration, given_name, nu
 PathLike = str | os.PathLike[str]
 
 HOLE_STEPS = 3.0
+_SPARSE = 0.6  # of the rows with a number: a column with fewer leaves none in a row
 _HELD_WITHIN = 0.05  # m and rad that a stand may give, and readings be off
 
 
@@ -271,7 +272,8 @@ class _Reader:
         if not runs:
             raise UserError(
                 f"{self.path}: no two successive rows are whole and within "
-                f"{HOLE_STEPS:.0f} control steps of each other"
+                f"{HOLE_STEPS:.0f} control steps of each other; "
+                f"{self._why_no_runs(raw)}"
             )
         still = log_checks.still_base(self.path, self.model, runs)
         if still:
@@ -291,6 +293,23 @@ class _Reader:
         if estimated:
             self.note(f"velocities estimated from positions: {', '.join(estimated)}")
         return runs
+
+    def _why_no_runs(self, raw: Rows) -> str:
+        """Which columns are mostly empty, or else what time does; and what to do."""
+        names = ("time", *self.columns.qpos, *self.columns.ctrl)
+        cells = np.column_stack([raw.time, raw.qpos, raw.ctrl])
+        share = np.isfinite(cells).mean(0)
+        empty = [
+            f'"{names[i]}" has a number in {share[i]:.0%} of the rows'
+            for i in np.argsort(share, kind="stable")[:3]
+            if share[i] < _SPARSE
+        ]
+        if not empty:
+            return "its time steps differ too much: log at a steady rate"
+        return (
+            f"{', '.join(empty)}: give a command in each row, as it was held; leave "
+            "joints that nobody read out (--unmeasured)"
+        )
 
     def _without_hidden(self, table: Table) -> Table:
         """``table`` without columns of hidden joints, of which is told."""
@@ -410,8 +429,9 @@ class _Reader:
                 )
             raise UserError(
                 f"{self.path}: time goes back or stands still from row {a + 1} "
-                f"({raw.time[a]:.9g} s) to row {b + 1} ({raw.time[b]:.9g} s); several "
-                'recordings in one file need a "run" column'
+                f"({raw.time[a]:.16g} s) to row {b + 1}, by {gaps[back[0]]:.3g} s; "
+                'several recordings in one file need a "run" column, stamps of one '
+                "clock a log that is sorted by them"
             )
         # nine digits: equal rates stay equal under the rounding of time stamps
         dt = float(f"{np.median(gaps):.9g}")

@@ -74,6 +74,20 @@ def test_what_is_late_or_filtered_is_set_right(
         np.testing.assert_array_equal(run.qvel[:, 1], before.qvel[: len(run), 1])
 
 
+@pytest.mark.parametrize("late", [4.0, 4.1, 4.25])
+def test_lateness_has_no_bias_by_the_noise_of_positions(late: float) -> None:
+    """Steps of positions that are as noisy as they are fast: shifted by half a row they
+    are averaged most, and nothing else may make that shift look better."""
+    given = [recorded(k, 0.001, "late", 1e-3 * late)[0] for k in range(2)]
+    rng = np.random.default_rng(3)
+    given = [
+        replace(run, qpos=run.qpos + 2e-4 * rng.normal(size=run.qpos.shape))
+        for run in given
+    ]
+    (note,) = set_right(given, NAMES).notes
+    assert abs(float(note.split(" ms")[0].split()[-1]) - late) < 0.03
+
+
 @pytest.mark.parametrize("way", ["right", "late"])
 def test_an_offset_is_taken_out(way: str) -> None:
     """Beside others, which stay as they were read; of a late one too."""
@@ -95,6 +109,25 @@ def test_other_velocities_stay_as_they_are(dt: float, way: str) -> None:
     right = set_right(given, NAMES)
     assert not right.notes and (right.noisier == 1.0).all()
     assert all(a is b for a, b in zip(right.runs, given, strict=True))
+
+
+@pytest.mark.parametrize("moving", [0.0, 0.02, 1.0])
+def test_velocities_better_than_the_steps_of_positions_stay(moving: float) -> None:
+    """Steps of positions that are read with ten times the noise of the velocities, also
+    of a joint at rest: whatever smooths them comes nearer to what was read."""
+    for dt in (0.02, 0.01, 0.002):
+        given = []
+        for seed in range(2):
+            run, true = recorded(seed, dt, "right", 0.0)
+            rng = np.random.default_rng(9 + seed)
+            noise = 1e-3 * dt / 0.01 * rng.normal(size=run.qpos.shape)
+            read = moving * true + NOISE[1] * rng.normal(size=true.shape)
+            qpos = moving * run.qpos + noise
+            given.append(replace(run, qpos=qpos, qvel=read))
+        right = set_right(given, NAMES)
+        assert not right.notes and all(
+            a is b for a, b in zip(right.runs, given, strict=True)
+        )
 
 
 def test_a_delay_of_one_run_of_two_is_none_of_the_machine() -> None:

@@ -7,12 +7,17 @@ import mujoco
 import numpy as np
 import pytest
 
+from easi_jax.data.cleaning import rows_of
+from easi_jax.data.noise import resolutions
 from easi_jax.data.recording import Configuration, Run
 from easi_jax.data.scales import scales_of
+from easi_jax.data.sensor_channels import NO_SENSORS
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.gap import effect_search
 from easi_jax.gap.analysis import Analysis
+from easi_jax.gap.batched_least_squares import Bounds
 from easi_jax.gap.candidates import places
+from easi_jax.gap.recorded import recorded as recorded_data
 from easi_jax.gap.result import Outcome
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import engine
@@ -114,3 +119,16 @@ def test_friction_that_stops_all_motion_is_out_of_bounds() -> None:
     s = replace(scales_of(m, [recorded(0, rows=100)]), most=np.array([3.0]))
     (dry,) = [p for p in places(m, s) if p.effect == "coulomb_friction"]
     assert dry.columns[0].high == pytest.approx(6.0)
+
+
+def test_a_few_rows_have_no_resolution() -> None:
+    """Of thirteen rows two are far apart by chance; a floor that took that for the step
+    of a coarse encoder would hide everything."""
+    m = mujoco.MjModel.from_xml_string(MODEL.format(more=""))
+    run = recorded(0)
+    short = rows_of(run, 40, 53)
+    assert resolutions(short)[0] > 10 * NOISE
+    scales = scales_of(m, [run])
+    bounds = Bounds(*(np.zeros(0) for _ in range(3)))
+    given = m, [run], [short], scales, bounds, NO_SENSORS, np.full(1, NOISE), 5
+    assert recorded_data(*given).resolution[0] < NOISE

@@ -8,6 +8,7 @@ import pytest
 
 from easi_jax.io.models.parameter_file import read_parameter_file
 from easi_jax.model.addresses import resolve
+from easi_jax.model.mujoco_warnings import warnings_to
 from easi_jax.model.parameter_proposal import as_text, propose, space_of
 
 LINK = '<geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="0.5"/>'
@@ -141,6 +142,31 @@ def test_what_moves_nothing_is_left_out() -> None:
     assert "body.arm.mass" in found
     assert not {"body.base.mass", "body.mast.mass"} & {*found}
     assert not [a for a in addresses(MODELS["negative gain"]) if "idle" in a]
+
+
+def test_masses_that_only_their_own_joint_moves_are_proposed() -> None:
+    """A carriage on its slide and a turntable, whose inertia MuJoCo keeps apart; and no
+    model without inertia is simulated on the way."""
+    xml = f"""<mujoco><worldbody>
+      <body name="carriage"><joint name="x" type="slide" axis="1 0 0"/>{LINK}</body>
+      <body name="table" pos="0 1 0"><joint name="z" axis="0 0 1"/>
+        <geom type="cylinder" size=".2 .02" mass="2"/></body>
+    </worldbody></mujoco>"""
+    said: list[str] = []
+    with warnings_to(said.append):
+        found = addresses(xml)
+    assert {"body.carriage.mass", "body.table.mass"} <= {*found}
+    assert not said
+
+
+@pytest.mark.parametrize("name", ['m"1', "a\\left", "leg[0]", "ä b"])
+def test_odd_names_are_read_back(name: str, tmp_path: Path) -> None:
+    spec = mujoco.MjSpec.from_string(MODELS["serial arm"])
+    spec.actuators[0].name = name
+    m = spec.compile()
+    path = tmp_path / "p.yaml"
+    path.write_text(as_text(propose(m), [], {}), encoding="utf-8")
+    assert read_parameter_file(path, m).addresses == space_of(propose(m)).addresses
 
 
 def test_ranges_follow_the_inertia_where_nothing_weighs() -> None:

@@ -16,6 +16,8 @@ from easi_jax.data.cleaning import split_at_resets
 from easi_jax.data.recording import Run
 from easi_jax.errors import UserError
 from easi_jax.io.logs import tables as log_tables
+from easi_jax.io.logs.columns import named_joints
+from easi_jax.io.logs.mapping import LogMapping
 from easi_jax.io.logs.reader import read_logs, write_log
 from easi_jax.model.joint_space import Configuration
 
@@ -664,10 +666,28 @@ def test_single_rows(tmp_path, cart, extension):
     assert "no rows" in failure(none, cart)
 
 
+def test_names_with_brackets_are_names() -> None:
+    """No pattern has any but ``*``."""
+    m = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><joint name="leg[0]"/><geom size=".1"/>
+        <body><joint name="leg[1]"/><geom size=".1"/></body></body></worldbody>
+        </mujoco>"""
+    )
+    assert named_joints(m, ["leg[0]"]) == {"leg[0]"}
+    assert named_joints(m, ["leg*"]) == {"leg[0]", "leg[1]"}
+    names = LogMapping(source="m", scale={"qpos.leg[0]": 2.0})
+    names.check_used(["qpos.leg[0]"])
+    assert names.apply("qpos.leg[0]", np.ones(2)).tolist() == [2.0, 2.0]
+    assert names.apply("qpos.leg[1]", np.ones(2)).tolist() == [1.0, 1.0]
+
+
 def test_rows_that_stand_alone(tmp_path, cart):
     columns = cart_columns()
     columns["qpos.pole"][1::2] = np.nan
-    assert "no two successive rows" in failure(save(tmp_path / "a.csv", columns), cart)
+    text = failure(save(tmp_path / "a.csv", columns), cart)
+    assert (
+        "no two successive rows" in text and '"qpos.pole" has a number in 50%' in text
+    )
     columns = cart_columns()
     columns["qpos.pole"][1] = np.nan
     log = read_logs(save(tmp_path / "b.csv", columns), cart)
