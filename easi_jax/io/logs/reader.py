@@ -429,7 +429,7 @@ class _Reader:
                 )
             raise UserError(
                 f"{self.path}: time goes back or stands still from row {a + 1} "
-                f"({raw.time[a]:.16g} s) to row {b + 1}, by {gaps[back[0]]:.3g} s; "
+                f"({raw.time[a]:.13g} s) to row {b + 1}, by {gaps[back[0]]:.3g} s; "
                 'several recordings in one file need a "run" column, stamps of one '
                 "clock a log that is sorted by them"
             )
