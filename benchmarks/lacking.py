@@ -147,7 +147,6 @@ def _recorded(case: Case, truth: dict[str, float]) -> tuple[list[Any], float]:
     shape = Configuration.of(mujoco.MjModel.from_xml_string(mjcf(truth)))
     off = 0.01 * size * rng.normal(size=2) if case.lacks == "zeros" else np.zeros(2)
     sub = round(_DT / m.opt.timestep)
-    # Commands move in steps of a tenth of a millisecond on their way.
     late = size if case.lacks == "late commands" else 0.0
     runs = []
     for k in range(_RUNS):
@@ -162,9 +161,11 @@ def _recorded(case: Case, truth: dict[str, float]) -> tuple[list[Any], float]:
             for i in range(sub):
                 then = row * _DT + (i + 0.5) * m.opt.timestep - late
                 u = gain * sent[max(0, int(then / _DT))]
-                keeps = np.exp(-m.opt.timestep / size) if case.lacks == "lag" else 0.0
-                arrived = keeps * arrived + (1.0 - keeps) * u
-                d.ctrl[:] = arrived
+                d.ctrl[:] = u
+                if case.lacks == "lag":  # of a step, the mean of what arrives
+                    share = m.opt.timestep / size
+                    d.ctrl[:] = u - (u - arrived) * -np.expm1(-share) / share
+                    arrived = u - (u - arrived) * np.exp(-share)
                 more = _torque(case.lacks, size, d.qpos[:2], d.qvel[:2])
                 if more is not None:
                     d.qfrc_applied[:2] = more

@@ -28,7 +28,7 @@ from easi_jax.model.joint_space import joint_name, scalar_dofs
 from easi_jax.model.parameters import Parameter, ParameterSpace
 from easi_jax.simulation.simulator import Simulator
 
-LATE = "commands come late"
+LATE, LAG = "commands come late", "commands act through a lag"
 _LATE = 0.005  # s, or a control step, that commands may well be late: a deviation
 _FARTHEST = 3.0  # deviations that a late command's simulation goes
 _NEVER = 1e-4  # deviations: at none at all the slope would be that of an early command
@@ -86,10 +86,10 @@ def doubts_of(simulator: Simulator, space: ParameterSpace) -> Doubts | None:
 def all_doubts(
     simulator: Simulator, space: ParameterSpace, scales: Scales
 ) -> Doubts | None:
-    """Doubts where the model is known to lack something: late commands, the strength of
-    drives, dry friction, constant forces and zeros of joints, of each kind what no
-    parameter that is asked for sets. Of more than six joints or drives all have the
-    same strength or friction.
+    """Doubts where the model is known to lack something: late commands and their lag,
+    the strength of drives, dry friction, constant forces and zeros of joints, of each
+    kind what no parameter that is asked for sets. Of more than six joints or drives all
+    have the same strength or friction.
 
     Args:
         scales: of the logs.
@@ -109,7 +109,7 @@ def all_doubts(
         ("constant", "a constant force acts on {}", joints, ("constant", "springref")),
         ("bias", "readings of {} have an offset", zeros, ()),
     )
-    found = list(_late(simulator))
+    found = [*_late(simulator), *_lagging(simulator)]
     for field, text, sizes, same in kinds:
         free = [
             name
@@ -133,17 +133,38 @@ def _late(simulator: Simulator) -> tuple[Parameter, ...]:
     told = base.effects is not None and effects.has_command_memory(base.present)
     if not m.nu or told:
         return ()
-    places = tuple(f"effect.delay.{m.actuator(i).name or i}" for i in range(m.nu))
-    unit, (_, most) = describe(m, places)
+    drives = [m.actuator(i).name or str(i) for i in range(m.nu)]
+    return (_on_the_way(simulator, "delay", LATE, drives),)
+
+
+def _lagging(simulator: Simulator) -> tuple[Parameter, ...]:
+    """Commands that act through a lag, where they may come late, of drives without an
+    activation of their own."""
+    m = simulator.mj_model
+    drives = [
+        m.actuator(i).name or str(i)
+        for i in range(m.nu)
+        if m.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_NONE
+    ]
+    if not drives or not _late(simulator):
+        return ()
+    return (_on_the_way(simulator, "lag", LAG, drives),)
+
+
+def _on_the_way(
+    simulator: Simulator, field: str, name: str, drives: Sequence[str]
+) -> Parameter:
+    """A time that commands of ``drives`` take."""
+    places = tuple(f"effect.{field}.{drive}" for drive in drives)
+    unit, (_, most) = describe(simulator.mj_model, places)
     usual = max(_LATE, simulator.dt)
     never = _NEVER * usual
-    late = Parameter(
-        *(LATE, places, never, (never, usual)),
+    return Parameter(
+        *(name, places, never, (never, usual)),
         bounds=(never, min(_FARTHEST * usual, most)),
         unit=unit,
         log=False,
     )
-    return (late,)
 
 
 def _parameter(
@@ -213,6 +234,26 @@ def without(fit: RefineResult, count: int) -> tuple[RefineResult, jax.Array]:
     return reduced, told
 
 
+def shown(
+    parameters: Sequence[Parameter], found: np.ndarray, step: float
+) -> list[Parameter]:
+    """Effects that the data show, but for what the model's own ``step`` [s] makes;
+    arguments as for `told`."""
+    return [
+        p
+        for p, (mean, std) in zip(parameters, found, strict=True)
+        if _is_shown(mean, std) and not _within_a_step(p, mean, step)
+    ]
+
+
+def _is_shown(mean: float, std: float) -> bool:
+    return abs(mean) > _SHOWN * std and abs(mean) > _SMALL
+
+
+def _within_a_step(p: Parameter, mean: float, step: float) -> bool:
+    return p.name == LATE and mean * (p.initial[1] - p.initial[0]) < step
+
+
 def told(
     parameters: Sequence[Parameter], found: np.ndarray, step: float
 ) -> Iterator[str]:
@@ -225,13 +266,13 @@ def told(
     """
     for p, (mean, std) in zip(parameters, found, strict=True):
         size = p.initial[1] - p.initial[0]
-        if abs(mean) <= _SHOWN * std or abs(mean) <= _SMALL:
+        if not _is_shown(mean, std):
             continue
         by = (
             f"{p.name}, by {mean * size:.2g} ± {std * size:.1g} {p.unit}".rstrip()
             + ", which the model does not know: values are stated as if it did"
         )
-        if p.name == LATE and mean * size < step:
+        if _within_a_step(p, mean, step):
             yield (
                 f"{by} (a timestep of {step:g} s makes about half of itself; a smaller "
                 "one predicts better)"

@@ -21,9 +21,9 @@ from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
 from easi_jax.devices import distributed
 from easi_jax.devices.mesh import placed
 from easi_jax.devices.runtime import quick_compile
-from easi_jax.estimation import limits
+from easi_jax.estimation import limits, step_error
 from easi_jax.estimation.blocks import too_few
-from easi_jax.estimation.doubts import Doubts, all_doubts, doubts_of, told
+from easi_jax.estimation.doubts import Doubts, all_doubts, doubts_of, shown, told
 from easi_jax.estimation.identifiability import identifiability
 from easi_jax.estimation.least_squares import raised_to_range
 from easi_jax.estimation.normal_equations import PairedFit
@@ -44,10 +44,12 @@ from easi_jax.estimation.prediction_error import (
     white_noise,
 )
 from easi_jax.estimation.problem import Problem
+from easi_jax.estimation.step_error import error_of_steps, is_visible, widened_by
 from easi_jax.estimation.weights import readings, step_weights
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.search.config import SearchConfig
 from easi_jax.search.easi import Search, SearchData
+from easi_jax.simulation.slopes import shift_readings
 
 Tell = Callable[[str], None]
 
@@ -215,9 +217,10 @@ class _Finish:
         simulator = problem.sensing if refined else problem.simulator
         self.simulator = simulator
         self.doubts = doubts_of(simulator, search.space) if refined else None
+        widest = self.lacking or self.doubts if refined else None
         self.endings: dict[tuple[Doubts | None, int], Any] = {}
         # With commands before each piece, where one that comes late needs them.
-        cutting = self.doubts.simulator if self.doubts else simulator
+        cutting = widest.simulator if widest else simulator
         steps = max(problem.steps, round(_FINISH / simulator.dt))
         steps = min(steps, max(len(r) for r in problem.fit) - 1)
         # Twice over, each counted half: where pieces begin matters less. A piece has a
@@ -361,8 +364,10 @@ class _Finish:
             # near where the fit was before anything else could take up errors.
             last = self.ended(undoubted, cov, None, ", as the model is", self.lost)
         found = last.found
-        if self.beyond(found) and not self.lost(found):
-            found = as_fitted(self.search.space, found)
+        if not self.lost(found):
+            beyond = self.beyond(found)
+            space = self.search.space
+            found = as_fitted(space, found) if beyond else self.of_steps(found, cov)
         return replace(found, search_mean=mean, search_cov=cov), last.weight
 
     def ended(
@@ -396,17 +401,44 @@ class _Finish:
                 break
         return last
 
+    def of_steps(self, found: Estimate, cov: Any) -> Estimate:
+        """What is stated with the model's own physics steps in doubt."""
+        given = self.problem.simulator, found.fit, found.pieces, found.delta
+        error = error_of_steps(*given)
+        if not is_visible(found, error):
+            return found
+        pieces = shift_readings(self.simulator, found.pieces, error)
+        given = found.fit, cov, pieces, found.misfit, (found.noise, found.start)
+        other = self.ending(self.doubts_in(found))(*placed(given))
+        self.tell("on all of the logs, as the model's timestep would have made them")
+        other = distributed.local(other)
+        return (
+            found if self.lost(other) else widened_by(self.search.space, found, other)
+        )
+
+    def doubts_in(self, found: Estimate) -> Doubts | None:
+        """The doubts that an estimate was made with."""
+        made = {d.parameters if d else (): d for d, _ in self.endings}
+        return made[found.doubted]
+
     def beyond(self, found: Estimate) -> bool:
         """Whether no region can be stated."""
         return bool(no_region(found))
 
     def lacks(self, found: Estimate) -> bool:
-        """Whether the model surely errs by more than the noise, and more can be in
-        doubt than was."""
-        errs = float(widened(found.excess)) > _LACKING
-        if not errs or self.lost(found) or self.lacking is None:
+        """Whether the model surely errs by more than the noise, or what is in doubt is
+        there, and may be of another kind; and more can be in doubt than was."""
+        lacks = float(widened(found.excess)) > _LACKING
+        doubts = np.asarray(found.doubts, float)
+        lacks |= bool(shown(found.doubted, doubts, self.step))
+        if not lacks or self.lost(found) or self.lacking is None:
             return False
         return self.lacking.count > len(found.doubted)
+
+    @property
+    def step(self) -> float:
+        """Of the physics [s]."""
+        return self.simulator.dt / self.simulator.substeps
 
     def lost(self, found: Estimate) -> bool:
         """Whether a fit is none."""
@@ -477,8 +509,8 @@ class _Finish:
                 f"{', '.join(early)}; compared as such"
             )
         notes += too_few(self.whole.count, "pieces") if self.refined else []
-        step = self.simulator.dt / self.simulator.substeps
-        notes += told(found.doubted, np.asarray(found.doubts, float), step)
+        notes += told(found.doubted, np.asarray(found.doubts, float), self.step)
+        notes += step_error.notes(self.search.space, found, self.step)
         return notes + self.contradictions(found, weight)
 
     def contradictions(self, found: Estimate, weight: jax.Array) -> list[str]:
@@ -487,7 +519,7 @@ class _Finish:
         names = _worst(self.owner, np.asarray(weight))
         if not self.refined or len(names) < 2:
             return []
-        doubts = {d.parameters if d else (): d for d, _ in self.endings}[found.doubted]
+        doubts = self.doubts_in(found)
         # A larger robot's program for fewer pieces is compiled in less time than the
         # others take; one of a smaller robot is there.
         wide, notes = self.simulator.wide, []

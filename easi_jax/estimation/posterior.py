@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import flax.struct
 import jax
@@ -65,6 +66,9 @@ class Estimate:
         doubts: of effects that the model may lack, means and standard deviations in
             those before any data, ``(k, 2)`` (`easi_jax.estimation.doubts`).
         doubted: these effects.
+        steps: how far values without the model's physics steps are from those stated,
+            unit coordinates, ``(n,)``; () where that was not looked at or cannot be
+            told (`easi_jax.estimation.step_error`).
     """
 
     distribution: Distribution
@@ -83,6 +87,7 @@ class Estimate:
     start: jax.Array
     doubts: jax.Array
     doubted: tuple[Parameter, ...] = flax.struct.field(pytree_node=False, default=())
+    steps: Any = ()
 
 
 def estimate(

@@ -31,7 +31,7 @@ from easi_jax.estimation.least_squares import (
 from easi_jax.estimation.limits import EDGE, beyond_edge
 from easi_jax.estimation.normal_equations import RESOLVED, PairedFit
 from easi_jax.model.parameters import ParameterSpace
-from easi_jax.simulation.slopes import shift_start
+from easi_jax.simulation.slopes import shift_readings, shift_start
 
 _DRAWS = 2  # of the noise, for every piece
 _ROUNDS = 20  # at most
@@ -160,7 +160,7 @@ class ProfileFit(PairedFit):
                 d, r, jac = real
                 first, later = e[0] * spread[0], e[1:] * spread[1:]
                 new = shift_start(self.simulator, s, d + first)
-                new = self._measured(new, r + later)
+                new = shift_readings(self.simulator, new, r + later)
                 new = jax.tree.map(lambda x, y: jnp.where(k, x, y), new, s)
                 *found, parts = fitted(new)
                 # The truth of what is made is known: its score is zero on average.
@@ -193,16 +193,6 @@ class ProfileFit(PairedFit):
             cost=cost.sum(),
             expected=expected.sum(),
             delta=delta,
-        )
-
-    def _measured(self, s: Segments, error: jax.Array) -> Segments:
-        """One piece with what was measured moved by tangents ``error (H, 2 nv)``."""
-        nv = self.simulator.mj_model.nv
-        move = self.simulator.move
-        return replace(
-            s,
-            next_qpos=move(s.next_qpos, error[:, :nv]),
-            next_qvel=s.next_qvel + error[:, nv:],
         )
 
 

@@ -41,6 +41,17 @@ def shift_start(simulator: Simulator, seg: Segments, delta: jax.Array) -> Segmen
     )
 
 
+def shift_readings(simulator: Simulator, seg: Segments, error: jax.Array) -> Segments:
+    """Segments, or one, with what was measured after each step moved by tangents
+    ``(..., H, 2 nv)``."""
+    along, speed = jnp.split(error, 2, axis=-1)
+    return replace(
+        seg,
+        next_qpos=simulator.move(seg.next_qpos, along),
+        next_qvel=seg.next_qvel + speed,
+    )
+
+
 def residuals(
     simulator: Simulator,
     space: ParameterSpace,

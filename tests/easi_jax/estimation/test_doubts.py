@@ -15,6 +15,7 @@ from easi_jax.data.scales import scales_of
 from easi_jax.data.segments import Segments, cut, join, to_device
 from easi_jax.errors import UserError
 from easi_jax.estimation.doubts import (
+    LAG,
     LATE,
     Doubts,
     all_doubts,
@@ -175,8 +176,10 @@ def test_what_is_in_doubt_where_something_is_missing() -> None:
     asked = _space(m).select(["damping"])
     found = all_doubts(Simulator(m, asked, _DT, engine="mujoco"), asked, scales)
     assert found is not None
-    late, strength, friction, force, zero = found.parameters
-    assert late.name == LATE and strength.addresses == ("effect.strength.a",)
+    late, lag, strength, friction, force, zero = found.parameters
+    assert (late.name, lag.name) == (LATE, LAG)
+    assert lag.addresses == ("effect.lag.a",) and lag.bounds[0] > 0
+    assert strength.addresses == ("effect.strength.a",)
     assert strength.nominal == 1.0 and strength.initial == (1.0, 1.05)
     assert friction.addresses == ("effect.coulomb.j",) and friction.bounds[0] > 0
     assert force.addresses == ("effect.constant.j",) and force.bounds[0] < 0
