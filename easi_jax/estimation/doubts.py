@@ -40,6 +40,7 @@ _STRENGTH = 0.05  # of a drive's force
 _FORCE = 0.05  # of what moves a joint: dry friction, a constant force
 # Of a joint's zero: half a degree, as set by eye or by a stop; of a slide's motion.
 _ZERO = np.radians(0.5), 0.01
+_ASKEW = float(np.radians(1.0))  # rad, that a base is off the level
 _ROOM = 10.0  # deviations that these go
 _EACH = 6  # joints or drives at most that have doubts of their own
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -109,7 +110,7 @@ def all_doubts(
         ("constant", "a constant force acts on {}", joints, ("constant", "springref")),
         ("bias", "readings of {} have an offset", zeros, ()),
     )
-    found = [*_late(simulator), *_lagging(simulator)]
+    found = [*_late(simulator), *_lagging(simulator), *_tilted(simulator)]
     for field, text, sizes, same in kinds:
         free = [
             name
@@ -149,6 +150,24 @@ def _lagging(simulator: Simulator) -> tuple[Parameter, ...]:
     if not drives or not _late(simulator):
         return ()
     return (_on_the_way(simulator, "lag", LAG, drives),)
+
+
+def _tilted(simulator: Simulator) -> Iterator[Parameter]:
+    """A base that stands askew; of a machine that floats nobody reads an angle so."""
+    m = simulator.mj_model
+    told = {a for p in simulator.space.parameters for a in p.addresses}
+    told |= set(simulator.fixed)
+    floats = (m.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any()
+    for i, way in enumerate(("roll", "pitch")):
+        address = f"effect.tilt.{i}"
+        if floats or address in told or not _possible(m, address):
+            continue
+        yield Parameter(
+            *(f"the base has a {way}", (address,), 0.0, (0.0, _ASKEW)),
+            bounds=(-_ROOM * _ASKEW, _ROOM * _ASKEW),
+            unit="rad",
+            log=False,
+        )
 
 
 def _on_the_way(

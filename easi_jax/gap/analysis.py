@@ -6,6 +6,7 @@ Held-out windows take part in none but the last, and the horizon that figures ar
 reported at in nothing else.
 """
 
+import copy
 import itertools
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -21,10 +22,11 @@ from easi_jax.data.windows import lead_rows, window_steps
 from easi_jax.errors import UserError
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.batched_least_squares import bounds_of
+from easi_jax.gap.discretization_error import FINER
 from easi_jax.gap.effect_search import EffectSearch, Places
 from easi_jax.gap.effect_set import Model
 from easi_jax.gap.effect_vector import Layout
-from easi_jax.gap.fitting import Fitting, steps_error
+from easi_jax.gap.fitting import STEPS_SEEN, Fitting, steps_error
 from easi_jax.gap.held_out import HeldOut
 from easi_jax.gap.law_search import LawSearch, Proposed
 from easi_jax.gap.predictor import BLOCK, Predictor
@@ -332,11 +334,32 @@ class Analysis:
     def _stated(self, c: _Chosen) -> Outcome:
         """What held-out data say of them."""
         search = self.search
-        if search.at.own_steps:
+        at = search.at
+        if at.own_steps:
             error = steps_error(self.predictor, self.data)
             self.held_out.steps = error[-len(self.held_out.windows) :]
+        noises = at.doubt_steps(c.model.fit.x, self._finer(at))
         found = c.base, c.model, c.rivals
-        return stated(search, self.held_out, self.space, *found, self.step)
+        outcome = stated(search, self.held_out, self.space, *found, self.step)
+        if not at.sticks or noises < STEPS_SEEN:
+            return outcome
+        note = (
+            f"the model's physics step of {1000 * self.step:.3g} ms makes an error of "
+            f"{noises:.2g} times the noise where feet stick and slip, which cannot be "
+            "told from what the model lacks: a smaller timestep takes it away"
+        )
+        return replace(outcome, notes=[*outcome.notes, note])
+
+    def _finer(self, at: Fitting) -> Predictor:
+        """Predictions of positions in the windows of ``at``, by native MuJoCo with
+        smaller steps."""
+        p, m = self.predictor, copy.copy(self.m)
+        m.opt.timestep = self.step / FINER
+        windows = at.predictor.windows
+        none = {k: getattr(windows, k)[..., :0] for k in ("sensed", "known")}
+        given = m, self.space, p.layout, replace(windows, **none), self.data.dt
+        logged, wait = p.simulator.logged, self._more["wait"]
+        return Predictor(*given, self.fixed, logged, wait, engine="mujoco")
 
     def native_predictor(self, at: Fitting) -> Predictor:
         """Predictions of the windows of ``at`` by native MuJoCo."""

@@ -18,7 +18,7 @@ from easi_jax.gap.window_set import WindowSet
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.mujoco_warnings import warnings_to
 
-_FINER = 8
+FINER = 8
 _OWN_SHIFT = 0.75  # of a physics step
 
 
@@ -44,7 +44,7 @@ def error_of_steps(
     configuration, paths = Configuration.of(m), []
     # What explodes is left out below; MuJoCo would write a file about it.
     with warnings_to():
-        for fine in (_FINER * parts, parts):
+        for fine in (FINER * parts, parts):
             m.opt.timestep = dt / fine
             ctrl = np.repeat(windows.ctrl, fine, axis=1)
             states, _ = rollout.rollout(m, mujoco.MjData(m), state, ctrl)

@@ -26,7 +26,7 @@ from easi_jax.gap.window_starts import window_starts
 from easi_jax.progress import Progress, silent
 
 _DRAWS = 5  # of the noise of each window: its mean over all of them is wanted
-_STEPS_SEEN = 0.75  # of the floor: less is lost in noise
+STEPS_SEEN = 0.75  # of the floor: less is lost in noise
 _WHOLE = 1.15  # of the error of steps; a finer simulation leaves some of it
 _BENT = 0.1  # second beside first differences of errors with a start: not linear
 _LET_PASS = 0.05  # of what the model errs by, that no fit hangs on
@@ -211,16 +211,43 @@ class Fitting:
         error = steps_error(self.predictor, self.data)
         error = error[: len(self.windows), : self.steps + 1]
         self.selector.unseen_steps = error
-        mine = self.starts.counted(self.starts.left(error), self.data.lead + 1)
-        size = float(measure.gap(measure.squares(mine).mean(0), self.channels.scale))
-        if size < _STEPS_SEEN * self.floor:
+        noises = self._noises(error)
+        if noises < STEPS_SEEN:
             return
         self.selector.steps, self.selector.unseen_steps = error, None
         b = self.selector.bounds
         self.selector.bounds = Bounds(
             np.r_[b.low, 0.0], np.r_[b.high, _WHOLE], np.r_[b.size, 0.1]
         )
-        self.own_steps = size / self.floor
+        self.own_steps = noises
+
+    def doubt_steps(self, x: np.ndarray, finer: Predictor) -> float:
+        """Lets values of a fit at ``x`` be in doubt by what the model's own steps do
+        there, beyond the share of what they do in the model as given; how large that
+        is, in units of the floor.
+
+        Args:
+            finer: predictions of the same windows with smaller steps, of positions.
+        """
+        chosen, nv = self.selector, self.data.m.nv
+        given = self.plain(x)[None], chosen.blocks, chosen.moved[None]
+        own = self.predictor.errors(*given)[0, : self.selector.count, :, :nv]
+        right = finer.errors(*given)[0, : self.selector.count]
+        error = (own - right)[:, : self.steps + 1].astype(float)
+        finite = np.isfinite(error).all((1, 2), keepdims=True)
+        error = np.where(finite, error, 0.0)
+        error = np.pad(error, [(0, 0), (0, 0), (0, len(self.data.sensors))])
+        if chosen.steps is not None:
+            error -= self.share(x) * chosen.steps
+        chosen.unseen_steps = error
+        return self._noises(error)
+
+    def _noises(self, error: np.ndarray) -> float:
+        """An error of predictions ``(W, T, c)`` once starts are fitted, in units of the
+        floor."""
+        mine = self.starts.counted(self.starts.left(error), self.data.lead + 1)
+        size = measure.gap(measure.squares(mine).mean(0), self.channels.scale)
+        return float(size) / self.floor
 
     def refit(self, own: Sequence[int]) -> Model:
         """The model as given, whitened there, with some of its own parameters
