@@ -11,6 +11,7 @@ from easi_jax.data.noise import _JITTER, _USUAL, estimate_noise
 from easi_jax.data.recording import Run
 from easi_jax.data.resampling import Rows, mean_held, resampled
 from easi_jax.data.windows import fitted_velocity, slope_noise
+from easi_jax.errors import UserError
 from easi_jax.model import addresses
 from easi_jax.model.found_effects import EffectEntry
 from easi_jax.model.joint_space import tangent_names
@@ -221,8 +222,14 @@ def true_readings(
     bias, late, faster = np.zeros(m.nv), np.zeros(m.nv), np.zeros(m.nv)
     names = [f"qvel.{name}" for name in tangent_names(m)]
     for e in entries:
-        if e.at in names:
-            faster[names.index(e.at)] += e.columns.get("bias", 0.0)
+        if e.at.startswith("qvel."):
+            if "bias" in e.columns and e.at not in names:
+                raise UserError(
+                    f"{e.effect}@{e.at}: the model has no such velocity (known: "
+                    f"{', '.join(names)})"
+                )
+            if e.at in names:
+                faster[names.index(e.at)] += e.columns.get("bias", 0.0)
             continue
         named = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SENSOR, e.at) >= 0
         own = e.kind == "sensor" and named

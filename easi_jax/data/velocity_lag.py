@@ -79,16 +79,15 @@ def set_right(
     dt, latest = runs[0].dt, 0.0
     left, chosen = {}, {}
     seen = ~np.any([run.hidden for run in runs], 0)
-    runs, offset = _centered(runs, seen)
     for d in np.flatnonzero(seen).tolist():
-        parts = [(moved[:, d], read[:, d] - offset[d]) for moved, read in each]
+        parts = [(moved[:, d], read[:, d]) for moved, read in each]
         left[d] = _tried(runs, d, parts, simulated)
     # The best of each at once, then the next of those that are not to be trusted.
     while left := {d: found for d, found in left.items() if found}:
         right = runs
         for d, found in left.items():
             right = [found[0].undone(run, d) for run in right]
-        trusted = trusted_velocities(right)
+        trusted = trusted_velocities(_centered(right, seen, simulated)[0])
         chosen |= {d: found[0] for d, found in left.items() if trusted[d]}
         left = {d: found[1:] for d, found in left.items() if not trusted[d]}
     for d, found in sorted(chosen.items()):
@@ -105,8 +104,7 @@ def set_right(
         rows_of(r, 0, len(r) - lost) if lost and len(r) > lost + _FEWEST else r
         for r in runs
     ]
-    runs, more = _centered(runs, seen)  # which lateness had hidden
-    offset = offset + more
+    runs, offset = _centered(runs, seen, simulated)
     notes += [
         f"velocity of {names[d]}: off by {offset[d]:.3g}, by the positions beside it; "
         "that is taken out"
@@ -115,17 +113,23 @@ def set_right(
     return SetRight(runs, notes, noisier)
 
 
-def _centered(runs: list[Run], seen: np.ndarray) -> tuple[list[Run], np.ndarray]:
-    """Runs without what velocities read beyond the steps of the positions, and that,
-    ``(nv,)`` [m/s, rad/s]: 0 where blocks of the runs do not agree, or where it is
-    small beside the noise."""
+def _centered(
+    runs: list[Run], seen: np.ndarray, simulated: float
+) -> tuple[list[Run], np.ndarray]:
+    """Runs without what velocities read beyond the steps of the positions, which a
+    simulation reads a little later, and that, ``(nv,)`` [m/s, rad/s]: 0 where blocks of
+    the runs do not agree, or where it is small beside the noise or what such lateness
+    makes."""
     each = [_steps(run) for run in runs if len(run) > _FEWEST]
     off = np.concatenate([read - moved for moved, read in each])
+    total = sum(len(run) * run.dt for run in runs)
+    pull = sum(np.abs(run.qvel[-1] - run.qvel[0]) for run in runs) / total
     means = np.array([part.mean(0) for part in np.array_split(off, _BLOCKS)])
     offset, error = means.mean(0), means.std(0, ddof=1) / math.sqrt(_BLOCKS)
     read = np.concatenate([read for _, read in each])
     noise = np.diff(read, 2, axis=0).std(0) / math.sqrt(6.0)  # of white noise
-    sure = np.abs(offset) > np.maximum(_SURE * error, _MATTERS * noise)
+    least = np.maximum(_MATTERS * noise, 2.0 * simulated * pull)
+    sure = np.abs(offset) > np.maximum(_SURE * error, least)
     offset = np.where(sure & seen, offset, 0.0)
     if offset.any():
         runs = [replace(run, qvel=run.qvel - offset) for run in runs]

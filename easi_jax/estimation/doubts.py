@@ -6,8 +6,9 @@ so no scatter shows it. Whoever trusts the model in this states values that are 
 wrong. So the last steps of a fit to measured logs are made with such effects as
 nuisances, each with a prior about nothing: what the data tell of them is taken off the
 parameters, and what they leave open widens what is stated. Commands that come late are
-always in doubt (`doubts_of`); where the model errs by more than the noise, drives,
-friction, constant forces and the zeros of joints are too (`all_doubts`).
+always in doubt (`doubts_of`); where they show, or the model errs by more than the
+noise, a lag, drives, friction, constant forces, the zeros of joints and a tilted base
+are too (`all_doubts`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,7 +22,7 @@ import numpy as np
 from easi_jax.errors import UserError
 from easi_jax.estimation.levenberg_marquardt import RefineResult
 from easi_jax.model import effects
-from easi_jax.model.addresses import describe
+from easi_jax.model.addresses import describe, places
 from easi_jax.model.effect_catalog import Scales
 from easi_jax.model.effect_numbers import NUMBERS
 from easi_jax.model.joint_space import joint_name, scalar_dofs
@@ -96,7 +97,7 @@ def all_doubts(
         scales: of the logs.
     """
     m = simulator.mj_model
-    asked = {a for p in space.parameters for a in p.addresses} | set(simulator.fixed)
+    asked = _asked(simulator, space)
     drives = {m.actuator(a).name or str(a): _STRENGTH for a in range(m.nu)}
     joints, zeros, (turn, way) = {}, {}, _ZERO
     for j, (_, d) in scalar_dofs(m).items():
@@ -126,6 +127,22 @@ def all_doubts(
             size = float(np.median([sizes[name] for name in group]))
             found.append(_parameter(m, field, text.format(shown), group, size))
     return doubted(simulator, space, found)
+
+
+def _asked(simulator: Simulator, space: ParameterSpace) -> set[str]:
+    """Addresses that parameters and fixed values set, one for each place."""
+    m = simulator.mj_model
+    given = {a for p in space.parameters for a in p.addresses} | set(simulator.fixed)
+    out = set(given)
+    for address in given:
+        for kind, quantity, i in places(m, address):
+            of = {"effect": NUMBERS[quantity].on} if kind == "effect" else {}
+            at = of.get(kind, kind)
+            if at in ("joint", "actuator", "body"):
+                name = getattr(m, at)(i).name
+                text = f"effect.{quantity}.{name}", f"{kind}.{name}.{quantity}"
+                out.add(text[kind != "effect"])
+    return out
 
 
 def _late(simulator: Simulator) -> tuple[Parameter, ...]:
@@ -174,12 +191,12 @@ def _on_the_way(
     simulator: Simulator, field: str, name: str, drives: Sequence[str]
 ) -> Parameter:
     """A time that commands of ``drives`` take."""
-    places = tuple(f"effect.{field}.{drive}" for drive in drives)
-    unit, (_, most) = describe(simulator.mj_model, places)
+    given = tuple(f"effect.{field}.{drive}" for drive in drives)
+    unit, (_, most) = describe(simulator.mj_model, given)
     usual = max(_LATE, simulator.dt)
     never = _NEVER * usual
     return Parameter(
-        *(name, places, never, (never, usual)),
+        *(name, given, never, (never, usual)),
         bounds=(never, min(_FARTHEST * usual, most)),
         unit=unit,
         log=False,
@@ -190,14 +207,14 @@ def _parameter(
     m: mujoco.MjModel, field: str, name: str, group: Sequence[str], size: float
 ) -> Parameter:
     """An effect at the places of a ``group``, alike, of a deviation ``size``."""
-    places = tuple(f"effect.{field}.{place}" for place in group)
-    unit, (least, most) = describe(m, places)
+    given = tuple(f"effect.{field}.{place}" for place in group)
+    unit, (least, most) = describe(m, given)
     neutral = NUMBERS[field].neutral
     low, high = neutral - _ROOM * size, min(most, neutral + _ROOM * size)
     # A force that only brakes has no slope at none at all.
     none = neutral + _NEVER * size if least >= neutral else neutral
     return Parameter(
-        *(name, places, none, (none, neutral + size)),
+        *(name, given, none, (none, neutral + size)),
         bounds=(none if least >= neutral else max(least, low), high),
         unit=unit,
         log=False,

@@ -200,7 +200,8 @@ class _Finish:
         hidden: misfit that leaves out velocities that were derived from positions,
             ``(H, 2 nv + N)``.
         doubts: what the model may lack; None where nothing is refined.
-        lacking: what it may lack as well where it errs by more than the noise.
+        lacking: what it may lack as well where it errs by more than the noise, or
+            what is in doubt shows.
     """
 
     def __init__(

@@ -421,10 +421,10 @@ def no_region(found: Estimate) -> str:
         return ""
     return (
         f"no region is stated: the model errs by {times:.2g} times the noise, more "
-        "than late commands, friction, constant forces and the strength of drives "
-        "explain. How far values are from the truth cannot be said, only that they "
-        "predict best. train.gap with these logs names what is missing; then give "
-        "--effects"
+        "than late commands, friction, constant forces, zeros of joints, a tilted "
+        "base and the strength of drives explain. How far values are from the truth "
+        "cannot be said, only that they predict best. train.gap with these logs names "
+        "what is missing; then give --effects"
     )
 
 

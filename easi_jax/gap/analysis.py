@@ -358,8 +358,9 @@ class Analysis:
         windows = at.predictor.windows
         none = {k: getattr(windows, k)[..., :0] for k in ("sensed", "known")}
         given = m, self.space, p.layout, replace(windows, **none), self.data.dt
-        logged, wait = p.simulator.logged, self._more["wait"]
-        return Predictor(*given, self.fixed, logged, wait, engine="mujoco")
+        logged, wait, own = p.simulator.logged, self._more["wait"], p.simulator
+        engine = own.engine if own.moves_centers else "mujoco"
+        return Predictor(*given, self.fixed, logged, wait, engine=engine)
 
     def native_predictor(self, at: Fitting) -> Predictor:
         """Predictions of the windows of ``at`` by native MuJoCo."""

@@ -234,11 +234,13 @@ class Fitting:
         own = self.predictor.errors(*given)[0, : self.selector.count, :, :nv]
         right = finer.errors(*given)[0, : self.selector.count]
         error = (own - right)[:, : self.steps + 1].astype(float)
+        turns = 2 * np.pi * np.round(error / (2 * np.pi))
+        error -= np.where(self.predictor.wrapped, turns, 0.0)
         finite = np.isfinite(error).all((1, 2), keepdims=True)
         error = np.where(finite, error, 0.0)
         error = np.pad(error, [(0, 0), (0, 0), (0, len(self.data.sensors))])
         if chosen.steps is not None:
-            error -= self.share(x) * chosen.steps
+            error = self.share(x) * (error - chosen.steps)
         chosen.unseen_steps = error
         return self._noises(error)
 

@@ -124,9 +124,10 @@ def split(address: str) -> tuple[str, str, str]:
                 f"such as {kind}.NAME.{next(iter(TABLE[kind]))}"
             )
     if quantity not in TABLE[kind]:
+        known = EFFECT_TABLE if kind == "effect" else TABLE[kind]
         raise UserError(
             f'address "{address}": {kind} has no quantity "{quantity}" (known: '
-            f"{', '.join(TABLE[kind])}){nearest(quantity, TABLE[kind])}"
+            f"{', '.join(known)}){nearest(quantity, known)}"
         )
     return kind, name, quantity
 

@@ -323,7 +323,7 @@ EFFECT_TABLE: dict[str, EffectNumber] = {
     "slip": _pair("slip", "friction", low=1e-3),
     **{f"give.{i}": _pair("give", word, i) for i, word in enumerate(_SOFTNESS)},
 }
-# In the readings, which no address reaches.
+# In the readings, which no parameter of a machine reaches.
 READING_TABLE: dict[str, EffectNumber] = {
     "bias": _joint("bias", "bias", _POSITION, -_INF, acts="readings"),
     "late": _joint("late", "delay", ("s", "s"), acts="readings", is_shift=True),

@@ -16,7 +16,7 @@ from easi_jax.model import addresses as language
 from easi_jax.model.effect_numbers import EFFECT_TABLE, EffectEntry
 from easi_jax.model.found_laws import check_law, law_of, public_name
 from easi_jax.model.own_effects_check import check_own_effects
-from easi_jax.model.parameters import Parameter, ParameterSpace
+from easi_jax.model.parameters import Parameter, ParameterSpace, not_of_readings
 
 _STDS = 3.0
 _SHARE = 0.1  # of a value, at least, that it is taken to be uncertain by
@@ -149,6 +149,8 @@ def _renewed(
 
     Where a parameter sets several places, it gets their mean.
     """
+    for address in own:
+        not_of_readings(address, address)
     values = {n: v for a, v in own.items() for n in _numbers(m, (a,))}
     out = []
     for p in space.parameters:

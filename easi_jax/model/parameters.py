@@ -245,6 +245,15 @@ class ParameterSpace:
         )
 
 
+def not_of_readings(what: str, address: str) -> None:
+    """Raises UserError about ``what`` where an address is in the readings."""
+    if address.startswith("effect.bias."):
+        raise UserError(
+            f"{what} is in what is read, not in the machine: train.gap finds it as "
+            "sensor_bias, and --effects takes it out of logs"
+        )
+
+
 def declare(
     mj_model: mujoco.MjModel,
     name: str,
@@ -267,11 +276,7 @@ def declare(
     """
     texts = (addresses,) if isinstance(addresses, str) else tuple(addresses)
     for text in texts:
-        if text.startswith("effect.bias."):
-            raise UserError(
-                f'parameter "{name}": {text} is in what is read, not in the machine: '
-                "train.gap finds it as sensor_bias, and --effects takes it out of logs"
-            )
+        not_of_readings(f'parameter "{name}": {text}', text)
     default_unit, physics = language.describe(mj_model, texts)
     value = language.nominal(mj_model, texts) if nominal is None else float(nominal)
     bounds = physics if bounds is None else bounds

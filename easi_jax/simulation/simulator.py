@@ -15,7 +15,7 @@ from easi_jax.data.sensor_channels import Sensors, only_read
 from easi_jax.devices.runtime import on_cpu
 from easi_jax.errors import UserError
 from easi_jax.model import effects
-from easi_jax.model.addresses import describe
+from easi_jax.model.addresses import describe, resolve
 from easi_jax.model.contact_pairs import Pair
 from easi_jax.model.joint_space import Configuration, tangent_names
 from easi_jax.model.mjx_model import (
@@ -125,6 +125,13 @@ class Simulator:
     def is_timed(self) -> bool:
         """Whether something in it may depend on the time: an owner's effect."""
         return effects.has_own(self.base.effects, self.base.present)
+
+    @property
+    def moves_centers(self) -> bool:
+        """Whether a parameter or a fixed value moves a center of mass, which MuJoCo C
+        may not be able to."""
+        every = (*self.space.addresses, *((a,) for a in self.fixed))
+        return any(w.row.moves_center for w in resolve(self.mj_model, every))
 
     def _longest(self, kind: str) -> float:
         """The largest value that effects of a kind may have [s]; 0 without any."""

@@ -44,7 +44,6 @@ from easi_jax.model.joint_space import FREE_WIDTH, Configuration, given_name, nu
 PathLike = str | os.PathLike[str]
 
 HOLE_STEPS = 3.0
-_SPARSE = 0.6  # of the rows with a number: a column with fewer leaves none in a row
 _HELD_WITHIN = 0.05  # m and rad that a stand may give, and readings be off
 
 
@@ -298,14 +297,18 @@ class _Reader:
         """Which columns are mostly empty, or else what time does; and what to do."""
         names = ("time", *self.columns.qpos, *self.columns.ctrl)
         cells = np.column_stack([raw.time, raw.qpos, raw.ctrl])
-        share = np.isfinite(cells).mean(0)
+        finite = np.isfinite(cells)
+        whole, share = finite.all(1), finite.mean(0)
+        if (whole[1:] & whole[:-1]).any():
+            return (
+                "its time steps differ too much, or each recording of its column "
+                '"run" is a single row: log at a steady rate'
+            )
         empty = [
             f'"{names[i]}" has a number in {share[i]:.0%} of the rows'
             for i in np.argsort(share, kind="stable")[:3]
-            if share[i] < _SPARSE
+            if share[i] < 1.0
         ]
-        if not empty:
-            return "its time steps differ too much: log at a steady rate"
         return (
             f"{', '.join(empty)}: give a command in each row, as it was held; leave "
             "joints that nobody read out (--unmeasured)"
@@ -429,7 +432,7 @@ class _Reader:
                 )
             raise UserError(
                 f"{self.path}: time goes back or stands still from row {a + 1} "
-                f"({raw.time[a]:.13g} s) to row {b + 1}, by {gaps[back[0]]:.3g} s; "
+                f"({raw.time[a]:.13g} s) to row {b + 1}, by {-gaps[back[0]]:.3g} s; "
                 'several recordings in one file need a "run" column, stamps of one '
                 "clock a log that is sorted by them"
             )

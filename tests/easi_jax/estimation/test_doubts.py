@@ -195,6 +195,27 @@ def test_what_is_in_doubt_where_something_is_missing() -> None:
     assert not any("strength" in p.name for p in found.parameters)
 
 
+@pytest.mark.parametrize(
+    ("address", "own"),
+    [
+        ("effect.coulomb.*", "effect.coulomb.j"),
+        ("joint.*.frictionloss", "effect.coulomb.j"),
+        ("effect.strength.*", "effect.strength.a"),
+        ("effect.constant.*", "effect.constant.j"),
+    ],
+)
+def test_what_a_pattern_sets_is_not_in_doubt(address: str, own: str) -> None:
+    m = mujoco.MjModel.from_xml_string(_XML)
+    _, run = _recorded(m, 0, 0, 0)
+    low = 1.0 if "strength" in address else 0.01
+    asked = declare(m, "p", address, nominal=low, initial=(low, 2 * low))
+    space = ParameterSpace((asked,))
+    simulator = Simulator(m, space, _DT, engine="mujoco")
+    found = all_doubts(simulator, space, scales_of(m, [run]))
+    assert found is not None
+    assert (own,) not in [p.addresses for p in found.parameters]
+
+
 def test_values_hold_where_friction_is_missing() -> None:
     """Without doubt they are wrong by many of the standard deviations with it."""
     m = mujoco.MjModel.from_xml_string(_XML)

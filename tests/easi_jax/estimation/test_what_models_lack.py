@@ -133,3 +133,25 @@ def test_error_of_steps_is_what_a_fine_simulation_lacks() -> None:
     np.testing.assert_allclose(
         shifted.next_qpos - pieces.next_qpos, got[..., :2], atol=1e-6
     )
+
+
+def test_a_center_of_mass_that_only_mjx_moves() -> None:
+    """Of a body that floats by itself, whose steps are then compared by MJX."""
+    m = mujoco.MjModel.from_xml_string(
+        """<mujoco><option timestep="0.005"/><worldbody><body name="b"><freejoint
+          name="f"/><geom size=".1 .2 .3" type="box" mass="1"/></body></worldbody>
+        </mujoco>"""
+    )
+    com = declare(m, "c", "effect.com.b.0", nominal=0.01, initial=(0.0, 0.02))
+    space = ParameterSpace((com,))
+    simulator = Simulator(m, space, _DT, engine="mjx")
+    q, v = (
+        np.tile([0.0, 0, 0, 1, 0, 0, 0], (8, 1)),
+        np.tile([0.0, 0, 0, 1, 2, 3], (8, 1)),
+    )
+    piece = cut(q, v, np.zeros((8, 0)), 4, 4)
+    assert piece is not None and simulator.moves_centers
+    pieces = to_device(join([piece]))
+    still = jnp.zeros((pieces.count, 12))
+    error = error_of_steps(simulator, jnp.zeros(1), pieces, still)
+    assert error.shape == (pieces.count, 4, 12) and 0 < np.abs(error).max() < 0.1
