@@ -26,6 +26,7 @@ from benchmarks import (
     gap_summary,
     go2_in_air,
     imitation,
+    lacking,
     lines,
     own_robot,
     paper_claims,
@@ -402,6 +403,7 @@ SECTIONS = (
         _recovery,
     ),
     *coverage_summary.SECTIONS,
+    *lacking.SECTIONS,
     Section(
         "## Transfer: return in a target unlike the model",
         {f"{factor:g}": f"transfer_kp_x{factor:g}*.json" for factor in FACTORS},
