@@ -298,7 +298,7 @@ class _Reader:
         names = ("time", *self.columns.qpos, *self.columns.ctrl)
         cells = np.column_stack([raw.time, raw.qpos, raw.ctrl])
         finite = np.isfinite(cells)
-        whole, share = finite.all(1), finite.mean(0)
+        whole, share = np.asarray(finite.all(1)), finite.mean(0)
         if (whole[1:] & whole[:-1]).any():
             return (
                 "its time steps differ too much, or each recording of its column "
