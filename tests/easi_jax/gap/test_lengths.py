@@ -17,8 +17,10 @@ from easi_jax.gap import effect_search
 from easi_jax.gap.analysis import Analysis
 from easi_jax.gap.batched_least_squares import Bounds
 from easi_jax.gap.candidates import places
+from easi_jax.gap.fitting import steps_error
 from easi_jax.gap.recorded import recorded as recorded_data
 from easi_jax.gap.result import Outcome
+from easi_jax.model.parameter_proposal import own_space
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import engine
 
@@ -132,3 +134,28 @@ def test_a_few_rows_have_no_resolution() -> None:
     bounds = Bounds(*(np.zeros(0) for _ in range(3)))
     given = m, [run], [short], scales, bounds, NO_SENSORS, np.full(1, NOISE), 5
     assert recorded_data(*given).resolution[0] < NOISE
+
+
+def test_steps_of_the_found_model_are_in_doubt() -> None:
+    """In the model as given they do what MuJoCo C says, which the share takes off;
+    with four times the damping something else. Data that have them leave no doubt."""
+    damped = MODEL.replace("0.002", "0.005").format(more='damping="0.1"')
+    m = mujoco.MjModel.from_xml_string(damped)
+    runs = [recorded_of(m, k) for k in (0, 1)]
+    given = m, own_space(m), runs[:1], runs[1:], np.array([NOISE]), 0.2
+    with engine.using("mujoco"):
+        analysis = Analysis(*given, only=[])
+        at = analysis.search.at
+        at.begin(at.neutral)
+        finer, left = analysis._finer(at), []
+        for damping, share in ((1.0, 0.0), (1.0, 1.0), (4.0, 1.0)):
+            x = at.neutral.copy()
+            x[0] *= damping
+            x[-1] = share
+            at.doubt_steps(x, finer)
+            assert at.selector.unseen_steps is not None
+            left.append(np.abs(at.selector.unseen_steps).max())
+    assert at.own_steps > 1.0, "else nothing was fitted of them"
+    whole = np.abs(steps_error(at.predictor, at.data)).max()
+    # The share's is from starts as read, this one from starts that were fitted.
+    assert left[0] == 0.0 and left[1] < 0.4 * whole and left[2] > 2.0 * left[1]
