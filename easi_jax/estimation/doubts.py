@@ -11,7 +11,8 @@ noise, a lag, drives, friction, constant forces, the zeros of joints and a tilte
 are too (`all_doubts`).
 """
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import jax
@@ -111,12 +112,12 @@ def all_doubts(
         ("constant", "a constant force acts on {}", joints, ("constant", "springref")),
         ("bias", "readings of {} have an offset", zeros, ()),
     )
-    found = [*_late(simulator), *_lagging(simulator), *_tilted(simulator)]
+    found = [*_late(simulator), *_lagging(simulator), *_tilted(m, asked)]
     for field, text, sizes, same in kinds:
         free = [
             name
             for name in sizes
-            if not any(_sets(address, name, same) for address in asked)
+            if asked.isdisjoint((name, quantity) for quantity in same)
             and _possible(m, f"effect.{field}.{name}")
         ]
         together = len(free) > _EACH
@@ -129,19 +130,15 @@ def all_doubts(
     return doubted(simulator, space, found)
 
 
-def _asked(simulator: Simulator, space: ParameterSpace) -> set[str]:
-    """Addresses that parameters and fixed values set, one for each place."""
-    m = simulator.mj_model
-    given = {a for p in space.parameters for a in p.addresses} | set(simulator.fixed)
-    out = set(given)
-    for address in given:
+def _asked(simulator: Simulator, space: ParameterSpace) -> set[tuple[str, str]]:
+    """Names and quantities of all places that parameters and fixed values set; no name
+    of the whole model."""
+    m, out = simulator.mj_model, set[tuple[str, str]]()
+    for address in (*itertools.chain(*space.addresses), *simulator.fixed):
         for kind, quantity, i in places(m, address):
-            of = {"effect": NUMBERS[quantity].on} if kind == "effect" else {}
-            at = of.get(kind, kind)
-            if at in ("joint", "actuator", "body"):
-                name = getattr(m, at)(i).name
-                text = f"effect.{quantity}.{name}", f"{kind}.{name}.{quantity}"
-                out.add(text[kind != "effect"])
+            at = NUMBERS[quantity].on if kind == "effect" else kind
+            named = at in ("joint", "actuator", "body")
+            out.add((getattr(m, at)(i).name if named else "", quantity))
     return out
 
 
@@ -169,15 +166,14 @@ def _lagging(simulator: Simulator) -> tuple[Parameter, ...]:
     return (_on_the_way(simulator, "lag", LAG, drives),)
 
 
-def _tilted(simulator: Simulator) -> Iterator[Parameter]:
+def _tilted(
+    m: mujoco.MjModel, asked: Collection[tuple[str, str]]
+) -> Iterator[Parameter]:
     """A base that stands askew; of a machine that floats nobody reads an angle so."""
-    m = simulator.mj_model
-    told = {a for p in simulator.space.parameters for a in p.addresses}
-    told |= set(simulator.fixed)
     floats = (m.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any()
     for i, way in enumerate(("roll", "pitch")):
         address = f"effect.tilt.{i}"
-        if floats or address in told or not _possible(m, address):
+        if floats or ("", f"tilt.{i}") in asked or not _possible(m, address):
             continue
         yield Parameter(
             *(f"the base has a {way}", (address,), 0.0, (0.0, _ASKEW)),
@@ -228,12 +224,6 @@ def _possible(m: mujoco.MjModel, address: str) -> bool:
     except UserError:
         return False
     return True
-
-
-def _sets(address: str, name: str, fields: Sequence[str]) -> bool:
-    """Whether an address is of one of some fields of the place ``name``."""
-    parts = address.split(".")
-    return name in parts and not set(fields).isdisjoint(parts)
 
 
 def followed(hessian: jax.Array, n: int) -> jax.Array:

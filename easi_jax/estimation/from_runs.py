@@ -266,6 +266,11 @@ class _Finish:
         scales = scales_of(m, self.problem.fit)
         return all_doubts(self.simulator, self.search.space, scales)
 
+    @cached_property
+    def error_of_steps(self) -> Callable[[Any, Segments, Any], jax.Array]:
+        """What the model's own physics steps do to predictions of pieces."""
+        return error_of_steps(self.problem.simulator)
+
     def ending(self, doubts: Doubts | None, count: int | None = None) -> Any:
         """The compiled last steps with ``doubts``, on all pieces or ``count`` of
         them."""
@@ -404,8 +409,7 @@ class _Finish:
 
     def of_steps(self, found: Estimate, cov: Any) -> Estimate:
         """What is stated with the model's own physics steps in doubt."""
-        given = self.problem.simulator, found.fit, found.pieces, found.delta
-        error = error_of_steps(*given)
+        error = self.error_of_steps(found.fit, found.pieces, found.delta)
         if not is_visible(found, error):
             return found
         pieces = shift_readings(self.simulator, found.pieces, error)

@@ -10,6 +10,7 @@ of it.
 """
 
 import copy
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -36,14 +37,14 @@ _TOLD = 1.0  # standard deviations of a value, that are worth a note
 
 
 def error_of_steps(
-    simulator: Simulator, unit: jax.Array, pieces: Segments, delta: jax.Array
-) -> jax.Array:
-    """Predictions less those without steps, tangents ``(M, H, 2 nv)``; zero for pieces
-    where either is not finite.
+    simulator: Simulator,
+) -> Callable[[jax.Array, Segments, jax.Array], jax.Array]:
+    """A program that says what the steps of a simulator do to its predictions.
 
-    Args:
-        unit: parameters of ``simulator.space``, unit coordinates, ``(n,)``.
-        delta: corrections of the starts, ``(M, S)``.
+    Returns:
+        Takes parameters of ``simulator.space``, unit coordinates ``(n,)``, pieces, and
+        corrections of their starts ``(M, S)``. Returns predictions less those without
+        steps, tangents ``(M, H, 2 nv)``; zero for pieces where either is not finite.
     """
     m, space = copy.copy(simulator.mj_model), simulator.space
     m.opt.timestep = simulator.dt / simulator.substeps / _FINER
@@ -56,19 +57,17 @@ def error_of_steps(
         for x in (simulator.mj_model, m)
     )
 
-    @jax.jit
     def error(unit: jax.Array, pieces: Segments, delta: jax.Array) -> jax.Array:
         begun = shift_start(coarse, pieces, delta)
         path, right = (
             open_loop.predict(s, s.model(space.to_si(unit)), begun)
             for s in (coarse, fine)
         )
-        return _WHOLE * open_loop.prediction_residuals(coarse, right, path)
+        out = _WHOLE * open_loop.prediction_residuals(coarse, right, path)
+        finite = jnp.isfinite(out).all((1, 2), keepdims=True)
+        return jnp.where(finite, out, 0.0)
 
-    compiled = error.lower(unit, pieces, delta).compile(quick_compile())
-    out = compiled(unit, pieces, delta)
-    finite = jnp.isfinite(out).all((1, 2), keepdims=True)
-    return jnp.where(finite, out, 0.0)
+    return jax.jit(error, compiler_options=quick_compile())
 
 
 def is_visible(found: Estimate, error: jax.Array) -> bool:

@@ -39,6 +39,7 @@ from easi_jax.io.runs.step_cache import Journal, key_of
 from easi_jax.model.found_laws import add_law
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.progress import Progress, Wait, at_once, silent
+from easi_jax.simulation.engine import Engine
 from easi_jax.simulation.logged import Logged
 
 # Windows that fits see [s]: the first part of the second alone, the second, and longer.
@@ -338,7 +339,9 @@ class Analysis:
         if at.own_steps:
             error = steps_error(self.predictor, self.data)
             self.held_out.steps = error[-len(self.held_out.windows) :]
-        noises = at.doubt_steps(c.model.fit.x, self._finer(at))
+        noises = 0.0
+        if at.sticks or len(c.model.fit.active):
+            noises = at.doubt_steps(c.model.fit.x, self._finer(at))
         found = c.base, c.model, c.rivals
         outcome = stated(search, self.held_out, self.space, *found, self.step)
         if not at.sticks or noises < STEPS_SEEN:
@@ -353,23 +356,27 @@ class Analysis:
     def _finer(self, at: Fitting) -> Predictor:
         """Predictions of positions in the windows of ``at``, by native MuJoCo with
         smaller steps."""
-        p, m = self.predictor, copy.copy(self.m)
+        m, windows = copy.copy(self.m), at.predictor.windows
         m.opt.timestep = self.step / FINER
-        windows = at.predictor.windows
         none = {k: getattr(windows, k)[..., :0] for k in ("sensed", "known")}
-        given = m, self.space, p.layout, replace(windows, **none), self.data.dt
-        logged, wait, own = p.simulator.logged, self._more["wait"], p.simulator
+        own = self.predictor.simulator
         engine = own.engine if own.moves_centers else "mujoco"
-        return Predictor(*given, self.fixed, logged, wait, engine=engine)
+        return self._predictor(m, replace(windows, **none), engine)
 
     def native_predictor(self, at: Fitting) -> Predictor:
         """Predictions of the windows of ``at`` by native MuJoCo."""
         if at.predictor.simulator.engine == "mujoco":
             return at.predictor
-        p, wait = self.predictor, self._more["wait"]
-        given = self.m, self.space, p.layout, filled(at.windows), self.data.dt
-        logged = p.simulator.logged
-        return Predictor(*given, self.fixed, logged, wait, engine="mujoco")
+        return self._predictor(self.m, filled(at.windows), "mujoco")
+
+    def _predictor(
+        self, m: mujoco.MjModel, windows: WindowSet, engine: Engine
+    ) -> Predictor:
+        """Predictions of positions by a model like the one that was recorded."""
+        p = self.predictor
+        given = m, self.space, p.layout, windows, self.data.dt, self.fixed
+        logged, wait = p.simulator.logged, self._more["wait"]
+        return Predictor(*given, logged, wait, engine=engine)
 
     def _undone(self, base: Model, stuck: Sequence[int]) -> Model:
         """A refit without some parameters, which are offered as effects instead."""

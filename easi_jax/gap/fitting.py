@@ -231,8 +231,8 @@ class Fitting:
         """
         chosen, nv = self.selector, self.data.m.nv
         given = self.plain(x)[None], chosen.blocks, chosen.moved[None]
-        own = self.predictor.errors(*given)[0, : self.selector.count, :, :nv]
-        right = finer.errors(*given)[0, : self.selector.count]
+        own = self.predictor.errors(*given)[0, : chosen.count, :, :nv]
+        right = finer.errors(*given)[0, : chosen.count]
         error = (own - right)[:, : self.steps + 1].astype(float)
         turns = 2 * np.pi * np.round(error / (2 * np.pi))
         error -= np.where(self.predictor.wrapped, turns, 0.0)

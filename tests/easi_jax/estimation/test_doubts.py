@@ -216,6 +216,21 @@ def test_what_a_pattern_sets_is_not_in_doubt(address: str, own: str) -> None:
     assert (own,) not in [p.addresses for p in found.parameters]
 
 
+def test_names_with_dots_are_names() -> None:
+    """What is asked for at such a joint is not in doubt there."""
+    m = mujoco.MjModel.from_xml_string(_XML.replace('"j"', '"leg.1"'))
+    _, run = _recorded(m, 0, 0, 0)
+    given = {"nominal": 0.01, "initial": (0.01, 0.02)}
+    space = ParameterSpace((declare(m, "p", "joint.leg.1.frictionloss", **given),))
+    found = all_doubts(
+        Simulator(m, space, _DT, engine="mujoco"), space, scales_of(m, [run])
+    )
+    assert found is not None
+    addresses = [a for p in found.parameters for a in p.addresses]
+    assert "effect.coulomb.leg.1" not in addresses
+    assert "effect.constant.leg.1" in addresses
+
+
 def test_values_hold_where_friction_is_missing() -> None:
     """Without doubt they are wrong by many of the standard deviations with it."""
     m = mujoco.MjModel.from_xml_string(_XML)

@@ -121,7 +121,7 @@ def test_error_of_steps_is_what_a_fine_simulation_lacks() -> None:
     pieces = to_device(join([piece]))
     unit = space.to_unit(jnp.asarray(space.nominal))
     still = jnp.zeros((pieces.count, 4))
-    got = np.asarray(error_of_steps(coarse, unit, pieces, still))
+    got = np.asarray(error_of_steps(coarse)(unit, pieces, still))
     both = (
         open_loop.predict(s, s.model(space.to_si(unit)), pieces) for s in (fine, coarse)
     )
@@ -153,5 +153,5 @@ def test_a_center_of_mass_that_only_mjx_moves() -> None:
     assert piece is not None and simulator.moves_centers
     pieces = to_device(join([piece]))
     still = jnp.zeros((pieces.count, 12))
-    error = error_of_steps(simulator, jnp.zeros(1), pieces, still)
+    error = error_of_steps(simulator)(jnp.zeros(1), pieces, still)
     assert error.shape == (pieces.count, 4, 12) and 0 < np.abs(error).max() < 0.1
