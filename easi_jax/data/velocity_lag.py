@@ -200,6 +200,50 @@ class _Found:
         return replace(run, qvel=qvel)
 
 
+def noise_in_starts(
+    runs: Sequence[Run], noise: np.ndarray, rows: int, simulated: float
+) -> np.ndarray:
+    """Noise ``(nv,)`` of measured velocities [m/s, rad/s], as large as lets ``rows``
+    rows of a start say no more than they know: all of them share `error_of_means`.
+
+    Arguments are those of `error_of_means`.
+    """
+    off = error_of_means(runs, noise, rows, simulated)
+    return np.hypot(noise[len(off) :], math.sqrt(rows) * off)
+
+
+def error_of_means(
+    runs: Sequence[Run], noise: np.ndarray, rows: int, simulated: float
+) -> np.ndarray:
+    """What measured velocities are off by over ``rows`` rows beyond noise, ``(nv,)``
+    [m/s, rad/s]: of their means over so many rows, beside the way of the positions.
+
+    The integral of the velocities is by the trapezoidal rule with Gregory's first
+    correction; what is left of that rule's own error counts as theirs.
+
+    Args:
+        noise: of positions, then of velocities, ``(2 nv,)``.
+        simulated: as for `set_right`.
+    """
+    nv, found = len(noise) // 2, []
+    for run in runs:
+        if len(run) < rows + 3:
+            continue
+        moved, read = _steps(run)
+        moved = np.stack([_delayed(x, simulated, run.dt) for x in moved.T], 1)
+        whole = np.cumsum(np.pad(read - moved, [(1, 0), (0, 0)]), 0)
+        mean = (whole[rows - 1 :] - whole[: 1 - rows]) / (rows - 1)
+        turn = np.gradient(run.qvel, axis=0) / 12.0
+        mean -= (turn[rows - 1 :] - turn[: 1 - rows]) / (rows - 1)
+        found.append(mean[1:-1])
+    if not found:
+        return np.full(nv, np.inf)
+    made = 2.0 * (noise[:nv] / (rows - 1) / runs[0].dt) ** 2
+    made += noise[nv:] ** 2 / (rows - 1)
+    square = np.mean(np.concatenate(found) ** 2, 0)
+    return np.sqrt(np.maximum(square - made, 0.0))
+
+
 def of_model(m: mujoco.MjModel, dt: float) -> float:
     """How late velocities of a simulation at a control step ``dt`` are beside its
     positions [s]: half a physics step, since all of MuJoCo's integrators but one move

@@ -4,6 +4,7 @@ same fit (`easi_jax.estimation.starts`)."""
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +14,13 @@ from easi_jax.data import unmeasured
 from easi_jax.data.noise import finest, resolutions
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import to_device
+from easi_jax.data.velocity_lag import noise_in_starts, of_model
 from easi_jax.data.windows import lead_rows
 from easi_jax.devices.mesh import placed
 from easi_jax.devices.runtime import quick_compile
 from easi_jax.estimation.from_runs import spread_of_starts
 from easi_jax.estimation.pieces import segments_from_runs
-from easi_jax.estimation.prediction_error import believed, rms_of_steps
+from easi_jax.estimation.prediction_error import rms_of_steps
 from easi_jax.estimation.problem import Problem
 from easi_jax.estimation.starts import (
     DRAWS,
@@ -57,19 +59,22 @@ class WindowErrors:
         self.lead = lead_rows(simulator.dt)
         every = max(1, problem.steps // 2)
         given = simulator, runs, self.lead + problem.steps, every
-        cut = segments_from_runs(*given, fitted=True)
-        windows = to_device(cut.spread(most) if cut.count > most else cut)
+        cuts = [segments_from_runs(*given, fitted=fitted) for fitted in (False, True)]
+        read, fitted = (c.spread(most) if c.count > most else c for c in cuts)
+        # Starts are by the positions alone, before velocities help to find them.
+        windows = to_device(replace(read, qvel=fitted.qvel))
+        faster = jnp.asarray(fitted.qvel - read.qvel)
+        speeds = bool(problem.measured.any())
         largest = jnp.abs(open_loop.motion(simulator, windows)[..., :nv])
         self.largest = jnp.asarray(np.asarray(largest).max((0, 1)))
-        self.resolution = finest(
-            [resolutions(r) for r in (*problem.fit, *problem.held)]
-        )
 
         def errors(theta: jax.Array, moved: jax.Array) -> jax.Array:
             first = shift_start(simulator, windows, moved)
             model = simulator.model(theta)
             found = open_loop.errors_from(simulator, model, first, windows)
-            return jnp.concatenate([moved[:, None, :nv], -found[..., :nv]], 1)
+            begin = moved[:, : 2 * nv].at[:, nv:].add(faster)
+            off = jnp.concatenate([begin[:, None], -found[..., : 2 * nv]], 1)
+            return off if speeds else off[..., :nv]
 
         still = np.zeros((windows.count, 2 * nv + simulator.mj_model.na), np.float32)
         like = placed((jnp.zeros(space.size), jnp.asarray(still)))
@@ -83,8 +88,11 @@ class WindowErrors:
             return np.stack([jax.device_get(compiled(*both)) for both in asked])
 
         self.still, self.count = still, windows.count
-        self.starts = _starts_of(problem, simulate)
+        shape = windows.count, self.lead + problem.steps + 1
+        self.starts = _starts_of(problem, simulate, shape)
         self.rows = self.starts.noise
+        step = finest([resolutions(r) for r in (*problem.fit, *problem.held)])
+        self.resolution = np.pad(step, (0, self.starts.alone))
 
     def of(self, theta: jax.Array) -> tuple[np.ndarray, int]:
         """At SI parameters ``(n,)``; and how many windows are not finite."""
@@ -96,38 +104,48 @@ class WindowErrors:
         moved, found = self._solved(x)
         rng = np.random.default_rng(0)
         least = floor(self.starts, x, moved, DRAWS, self.resolution, rng)
-        return *self._rms(found), np.sqrt(least[:, self.lead + 1 :].mean((0, 1)))
+        return *self._rms(found), np.sqrt(self.starts.mean_square(least, self.lead + 1))
 
     def _solved(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         starts = self.starts
         starts.noise = self.rows
         moved, found = starts.solve(x, self.still)
-        least = self.resolution / math.sqrt(12.0)
-        starts.noise = believed(starts.measured_noise(found), self.rows, least)
+        starts.believe(found, self.rows, self.resolution / math.sqrt(12.0))
         return moved, found
 
     def _rms(self, found: np.ndarray) -> tuple[np.ndarray, int]:
-        after = found[:, self.lead + 1 :]
+        after = self.starts.counted(found, self.lead + 1)
         lost = len(after) - np.isfinite(after).all((1, 2)).sum()
         return np.asarray(rms_of_steps(jnp.asarray(after), self.largest)), int(lost)
 
 
-def _starts_of(problem: Problem, simulate: Simulate) -> Starts:
-    """Of windows that begin `lead_rows` before they are measured from."""
+def _starts_of(problem: Problem, simulate: Simulate, shape: tuple[int, int]) -> Starts:
+    """Of windows that begin `lead_rows` before they are measured from, ``shape (W,
+    T)``."""
     m, runs = problem.simulator.mj_model, [*problem.fit, *problem.held]
+    nv, dt, read = m.nv, runs[0].dt, None
     moved = [r.configuration.difference(r.qpos[:1], r.qpos) for r in runs]
     size = np.maximum(np.concatenate(moved).std(0), 1e-9)
     given = jnp.asarray(problem.noise), np.zeros(m.nv, bool)
     wide = np.asarray(spread_of_starts(m, runs, *given))
+    noise, speeds = known_noise(problem.noise, size), bool(problem.measured.any())
+    if speeds:
+        rows = 2 * lead_rows(dt) + 1
+        fast = noise_in_starts(problem.fit, problem.noise, rows, of_model(m, dt))
+        noise = np.append(noise, np.where(problem.measured, fast, np.inf))
+        read = np.ones((*shape, 2 * nv))
+        read[:, rows:, nv:] = 0.0
     return starts_about(
         simulate,
-        known_noise(problem.noise, size),
+        noise,
         size,
         np.maximum(wide[m.nv : 2 * m.nv], 1e-9),
         unmeasured.start_spread(m, runs, np.isinf(problem.noise[: m.nv])),
         np.maximum(wide[2 * m.nv :], 1e-9),
-        runs[0].dt,
+        dt,
         start_parts(m),
+        read,
+        speeds,
     )
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from easi_jax.data.windows import lead_rows, slope_noise
+from easi_jax.estimation.prediction_error import believed
 from easi_jax.model.separate_trees import turns
 
 # Takes vectors (B, n) and offsets of starts (B, W, s); returns errors (B, W, T, c).
@@ -53,6 +54,7 @@ class Starts:
             for the others. All where None.
         parts: of the machine that each number of a start belongs to, ``(s,)``, the
             first of them those of the channels; all one where None.
+        alone: so many channels, the last ones, speak of starts only.
         slope: of errors with the start, ``(s, W, T, c)``, of the last `linearize`.
         bent: how far errors are from linear there, in the median window: the second
             differences beside the first.
@@ -66,6 +68,7 @@ class Starts:
     known: np.ndarray
     parts: np.ndarray | None = None
     read: np.ndarray | None = None
+    alone: int = 0
     slope: np.ndarray = field(init=False)
     bent: float = field(init=False, default=0.0)
 
@@ -118,19 +121,45 @@ class Starts:
         return noise if self.read is None else noise * self.read
 
     def counted(self, errors: np.ndarray, first: int) -> np.ndarray:
-        """Errors ``(..., W, T, c)`` from a row on. Rows without a reading have none,
-        and the others are as much larger: mean squares are those of readings."""
-        out = errors[..., first:, :]
+        """Errors ``(..., W, T, c)`` from a row on, of channels that speak of more than
+        starts. Rows without a reading have none, and the others are as much larger:
+        mean squares are those of readings."""
+        out = errors[..., first:, : self.compared]
         if self.read is None:
             return out
         return out / np.sqrt(self.share(first)).astype(errors.dtype)
 
+    def mean_square(self, square: np.ndarray, first: int) -> np.ndarray:
+        """Means of squared errors ``(W, T, c)`` from a row on, of readings that there
+        are, of channels that speak of more than starts."""
+        mean = square[:, first:, : self.compared].mean((0, 1))
+        return mean / self.share(first)
+
+    def believe(self, errors: np.ndarray, told: np.ndarray, least: np.ndarray) -> None:
+        """Takes noise as the errors at fitted starts show it (`believed`).
+
+        That of channels which speak of starts alone is as told: errors that they share
+        in all rows of a start do not show in what a fit leaves.
+
+        Args:
+            errors: of `fit`, ``(W, T, c)``.
+            told: noise by rows alone, ``(c,)``.
+            least: what resolution makes, ``(c,)``.
+        """
+        seen = believed(self.measured_noise(errors), told, least)
+        self.noise = np.where(np.arange(len(told)) < self.compared, seen, told)
+
+    @property
+    def compared(self) -> int:
+        """Channels that speak of more than starts; they are the first."""
+        return len(self.noise) - self.alone
+
     def share(self, first: int) -> np.ndarray:
-        """Of readings that there are from a row of all windows on, above 0, ``(c,)``;
-        all of channels that nobody measured."""
+        """Of readings that there are from a row of all windows on, above 0, of channels
+        that speak of more than starts; all of those that nobody measured."""
         if self.read is None:
-            return np.ones(len(self.noise))
-        read = self.read[:, first:]
+            return np.ones(self.compared)
+        read = self.read[:, first:, : self.compared]
         return np.maximum(read.mean((0, 1)), 1.0 / read[..., 0].size)
 
     def gain(self) -> tuple[np.ndarray, np.ndarray]:
@@ -287,21 +316,24 @@ def starts_about(
     dt: float,
     parts: np.ndarray | None = None,
     read: np.ndarray | None = None,
+    speeds: bool = False,
 ) -> Starts:
     """Starts of windows that begin where a log says, `lead_rows` early.
 
     Args:
         simulate: as for `Starts`.
-        noise: of channels, `known_noise`, positions first; infinite where nobody
-            measured.
+        noise: of channels, `known_noise`, positions first, and with ``speeds``
+            velocities last; infinite where nobody measured.
         position, speed: motion of each degree of freedom, ``(nv,)``.
         free: how far what nobody measured may be off, ``(2 nv,)``; infinite elsewhere.
         act: how far activations may be off, ``(na,)``.
         dt: control step [s].
-        parts, read: as for `Starts`; ``parts`` not where channels are more than
-            positions.
+        parts, read: as for `Starts`; ``parts`` not where there are channels beside
+            positions and ``speeds``.
+        speeds: whether velocities help to find starts.
     """
-    known = np.where(np.isfinite(noise), noise, 0.0)[: len(position)]
+    nv = len(position)
+    known = np.where(np.isfinite(noise), noise, 0.0)[:nv]
     small, part = _DIFFERENCE
     wide = np.maximum(_NOISES * known, _MOTION * position)
     # Nothing but the model speaks of what nobody measured.
@@ -317,8 +349,9 @@ def starts_about(
         2 * lead_rows(dt) + 1,
         np.concatenate([step, part * act]),
         np.concatenate([np.where(np.isfinite(free), free, by_rows), act]),
-        parts if len(noise) == len(position) else None,
+        parts if len(noise) == nv * (1 + speeds) else None,
         read,
+        nv * speeds,
     )
 
 

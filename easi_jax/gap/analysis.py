@@ -30,7 +30,7 @@ from easi_jax.gap.fitting import STEPS_SEEN, Fitting, steps_error
 from easi_jax.gap.held_out import HeldOut
 from easi_jax.gap.law_search import LawSearch, Proposed
 from easi_jax.gap.predictor import BLOCK, Predictor
-from easi_jax.gap.recorded import recorded
+from easi_jax.gap.recorded import recorded, with_speeds
 from easi_jax.gap.result import Outcome, last_figures
 from easi_jax.gap.statements import stated
 from easi_jax.gap.window_set import WindowSet, join, reach, spread, window_set
@@ -99,6 +99,7 @@ class Analysis:
         self._more = {"fixed": fixed, "progress": progress, "wait": wait}
         self.final = self
         self.fixed, self._progress = dict(fixed or {}), progress
+        fit, held, noise = with_speeds(mj_model, fit, held, np.asarray(noise))
         dt, runs = fit[0].dt, [*fit, *held]
         scales = scales_of(mj_model, fit)
         sensors, self._ignored = measured_sensors(mj_model, runs)
@@ -126,6 +127,7 @@ class Analysis:
             Logged.of(runs),
             wait,
             sensors,
+            speeds=len(noise) > mj_model.nv,
         )
         self.data = recorded(
             mj_model,
@@ -134,7 +136,7 @@ class Analysis:
             scales,
             self.bounds,
             self.predictor.sensors,
-            np.asarray(noise)[: mj_model.nv],
+            noise,
             lead_rows(dt),
         )
         self.step = dt / self.predictor.simulator.substeps
@@ -205,7 +207,8 @@ class Analysis:
         """A digest of all that the results depend on, for a `Journal`."""
         sensors = self.data.sensors
         logs = [
-            (run.qpos, run.ctrl, run.time, sensors.read(run)) for run in self.data.runs
+            (run.qpos, run.qvel, run.ctrl, run.time, sensors.read(run))
+            for run in self.data.runs
         ]
         windows = [f.windows for f in self._fitted]
         model = np.zeros(mujoco.mj_sizeModel(self.m), np.uint8)
@@ -228,13 +231,14 @@ class Analysis:
         p, at, nv = self.predictor, self.reported, self.m.nv
         if not p.sensors:
             return []
+        sensed = slice(nv, nv + len(p.sensors))
         found = []
         for early in (False, True):
             p.early[:] = early
             _, errors = at.starts.solve(p.neutral, at.moved)
-            after = errors[:, at.data.lead + 1 :, nv:] / at.data.noise[nv:]
+            after = errors[:, at.data.lead + 1 :, sensed] / at.data.noise[sensed]
             if at.starts.read is not None:
-                there = at.starts.read[:, at.data.lead + 1 :, nv:]
+                there = at.starts.read[:, at.data.lead + 1 :, sensed]
                 after = np.where(there > 0, after, np.nan)
             found.append(after)
         names = read_at_end(p.sensors, *found)
@@ -354,7 +358,7 @@ class Analysis:
         return replace(outcome, notes=[*outcome.notes, note])
 
     def _finer(self, at: Fitting) -> Predictor:
-        """Predictions of positions in the windows of ``at``, by native MuJoCo with
+        """Predictions in the windows of ``at``, but of sensors, by native MuJoCo with
         smaller steps."""
         m, windows = copy.copy(self.m), at.predictor.windows
         m.opt.timestep = self.step / FINER
@@ -372,11 +376,11 @@ class Analysis:
     def _predictor(
         self, m: mujoco.MjModel, windows: WindowSet, engine: Engine
     ) -> Predictor:
-        """Predictions of positions by a model like the one that was recorded."""
+        """Predictions by a model like the one that was recorded, without sensors."""
         p = self.predictor
         given = m, self.space, p.layout, windows, self.data.dt, self.fixed
         logged, wait = p.simulator.logged, self._more["wait"]
-        return Predictor(*given, logged, wait, engine=engine)
+        return Predictor(*given, logged, wait, engine=engine, speeds=p.speeds)
 
     def _undone(self, base: Model, stuck: Sequence[int]) -> Model:
         """A refit without some parameters, which are offered as effects instead."""

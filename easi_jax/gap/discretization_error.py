@@ -24,14 +24,15 @@ _OWN_SHIFT = 0.75  # of a physics step
 
 def error_of_steps(
     mj_model: mujoco.MjModel, windows: WindowSet, dt: float
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Predictions of the model as given less those of an eighth of its step.
 
     Args:
         windows: W of them, each of H control steps of ``dt`` [s].
 
     Returns:
-        Tangents ``(W, H + 1, nv)``, from the start on; zero where either is not finite.
+        Tangents and velocities ``(W, H + 1, nv)``, from the start on; zero where either
+        is not finite.
     """
     m = copy.deepcopy(mj_model)
     parts = physics_steps(dt, m.opt.timestep)
@@ -41,17 +42,22 @@ def error_of_steps(
     state[:, 1 : 1 + m.nq] = windows.start_qpos
     state[:, 1 + m.nq : 1 + m.nq + m.nv] = windows.speed[:, start]
     state[:, 1 + m.nq + m.nv : 1 + m.nq + m.nv + m.na] = windows.start_act
-    configuration, paths = Configuration.of(m), []
+    configuration, paths, speeds = Configuration.of(m), [], []
     # What explodes is left out below; MuJoCo would write a file about it.
     with warnings_to():
         for fine in (FINER * parts, parts):
             m.opt.timestep = dt / fine
             ctrl = np.repeat(windows.ctrl, fine, axis=1)
             states, _ = rollout.rollout(m, mujoco.MjData(m), state, ctrl)
-            qpos = states[:, fine - 1 :: fine, 1 : 1 + m.nq]
+            states = states[:, fine - 1 :: fine, 1 : 1 + m.nq + m.nv]
+            qpos, qvel = np.split(states, [m.nq], -1)
             paths.append(configuration.difference(windows.start_qpos[:, None], qpos))
-    out = np.pad(paths[1] - paths[0], [(0, 0), (1, 0), (0, 0)])
-    return np.where(np.isfinite(out).all((1, 2), keepdims=True), out, 0.0)
+            speeds.append(qvel)
+    out = np.array([x[1] - x[0] for x in (paths, speeds)])
+    out = np.pad(out, [(0, 0), (0, 0), (1, 0), (0, 0)])
+    fine = np.isfinite(out).all((0, 2, 3), keepdims=True)
+    positions, fast = np.where(fine, out, 0.0)
+    return positions, fast
 
 
 def within_a_step(place: Place, value: float, step: float) -> bool:

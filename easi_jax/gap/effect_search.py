@@ -17,7 +17,15 @@ from easi_jax.gap.decisions import DECIDE
 from easi_jax.gap.discretization_error import within_a_step
 from easi_jax.gap.effect_set import Candidate, Model, keys, last
 from easi_jax.gap.fitting import Fitting
-from easi_jax.gap.model_comparison import better, probability, rank, simplest
+from easi_jax.gap.model_comparison import (
+    better,
+    confidence,
+    cost,
+    odds_of,
+    probability,
+    rank,
+    simplest,
+)
 from easi_jax.gap.screening import expanded, screened, shortlist
 from easi_jax.gap.table import Place, covered, does
 from easi_jax.model.effect_catalog import Scales
@@ -285,14 +293,17 @@ class EffectSearch:
         for _ in range(DECIDE.most):
             brief = [p for p in model.places if self._brief(model, p, step)]
             idle = [p for p in model.places if p not in brief and self._idle(model, p)]
-            if not (brief or idle):
+            spare = [] if brief or idle else self._spare(model, rivals)
+            gone = [*brief, *idle, *spare]
+            if not gone:
                 break
-            for place in (*brief, *idle):
-                why = "less than a physics step" if place in brief else "does nothing"
-                self.tell(f"- {place.key}: {why}")
+            self._tell_gone(brief, "less than a physics step")
+            self._tell_gone(idle, "does nothing")
+            self._tell_gone(spare, "nothing is open without it, nor is it probable")
             notes += [_of_a_step(p, step) for p in brief]
+            notes += [_spared(p) for p in spare]
             self.offered.drop(brief)
-            less = self.at.without(model, [*brief, *idle])
+            less = self.at.without(model, gone)
             self.at.whiten(less.fit.x)
             less = self.at.selector.fit(less.places, less.fit.x)
             model, rivals = self.exchanged(less)
@@ -301,6 +312,29 @@ class EffectSearch:
     def _brief(self, model: Model, place: Place, step: float) -> bool:
         first = self.at.selector.columns(place, fitted=False)[0]
         return within_a_step(place, float(model.fit.x[first]), step)
+
+    def _spare(
+        self, model: Model, rivals: Mapping[str, Sequence[Model]]
+    ) -> list[Place]:
+        """The effect that is missed least, where nothing is open without it and its
+        name is not even probable; none else."""
+        without = {p.key: self.at.without(model, [p]) for p in model.places}
+        costs = {key: cost(model, less) for key, less in without.items()}
+        for place in sorted(model.places, key=lambda p: costs[p.key]):
+            odds = odds_of(last(model, place), rivals[place.key][:RIVALS])
+            if confidence(costs[place.key], odds) >= DECIDE.probable:
+                continue
+            less = without[place.key].fit.x
+            self.at.whiten(less)
+            is_open = self.at.is_open(less)
+            self.at.whiten(model.fit.x)
+            if not is_open:
+                return [place]
+        return []
+
+    def _tell_gone(self, places: Sequence[Place], why: str) -> None:
+        for place in places:
+            self.tell(f"- {place.key}: {why}")
 
     def _idle(self, model: Model, place: Place) -> bool:
         """Whether an effect was fitted to nothing: predictions are as without it."""
@@ -344,6 +378,13 @@ def _of_a_step(place: Place, step: float) -> str:
         f"step of {1000 * step:.3g} ms, which shifts commands by half of "
         "itself; not named. With a smaller timestep in the model the data could "
         "tell."
+    )
+
+
+def _spared(place: Place) -> str:
+    return (
+        f"{place.key}: the data are predicted a little better with it, but about as "
+        "well with others, and nothing is open without any; not named"
     )
 
 

@@ -7,7 +7,6 @@ import numpy as np
 
 from easi_jax.errors import UserError
 from easi_jax.estimation.least_squares import AT_BOUND
-from easi_jax.estimation.prediction_error import believed
 from easi_jax.estimation.starts import floor, known_noise
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.batched_least_squares import Bounds, window_weights
@@ -87,7 +86,7 @@ class Fitting:
             data.m,
             [n.removeprefix("qpos.") for n in names],
             data.fit,
-            data.noise,
+            data.noise[: self.starts.compared],
             after,
             data.sensors,
         )
@@ -141,7 +140,7 @@ class Fitting:
                 "or shorten --horizon"
             )
         least = known_noise(data.resolution / math.sqrt(12), data.motion)
-        starts.noise = believed(starts.measured_noise(errors), data.noise, least)
+        starts.believe(errors, data.noise, least)
         self.sticks |= starts.bent > _BENT
         if self.sticks:
             chosen.moved = still
@@ -155,15 +154,30 @@ class Fitting:
         self.gap = r.gap(r.whitened(r.grouped(errors[None]))[0])
         self.floor = chosen.floor = float(np.sqrt(r.floor.mean()))
 
+    @property
+    def noise_as_told(self) -> np.ndarray:
+        """Channels whose errors show no less noise than rows alone tell, ``(c,)``
+        bool."""
+        told = self.starts.noise >= self.data.noise
+        return told[: self.starts.compared]
+
     def closed(self, x: np.ndarray) -> bool:
         """Whether nothing is left to explain, whitened at ``x``."""
+        return self._open(x) <= DECIDE.closed
+
+    def is_open(self, x: np.ndarray) -> bool:
+        """Whether anything is `easi_jax.gap.verdict.Openness.is_open`, whitened at
+        ``x``."""
+        return self._open(x) > DECIDE.open_from
+
+    def _open(self, x: np.ndarray) -> float:
+        """The most that any error surely is, in floors."""
         errors = self.selector.errors(x[None])[0]
         rng, after, moved = np.random.default_rng(1), self.data.lead + 1, self.moved
         noise = floor(self.starts, x, moved, _DRAWS, self.data.resolution, rng)
         square = measure.squares(self.starts.counted(errors, after))
-        due = noise[:, after:].mean((0, 1)) / self.starts.share(after)
-        low = openness(square, due, self.channels.scale).low
-        return bool(np.nanmax(low) <= DECIDE.closed)
+        due = self.starts.mean_square(noise, after)
+        return float(np.nanmax(openness(square, due, self.channels.scale).low))
 
     def closed_by(self, model: Model) -> bool:
         """Whether a model of these windows leaves nothing to explain."""
@@ -178,13 +192,14 @@ class Fitting:
     def moves_in_the_model(self) -> bool:
         """Takes channels in that stand still in the log, but not in the model, and
         sensors whose noise turns out to be small enough for what they read."""
-        nv = self.data.m.nv
-        noise = self.data.noise.copy()
-        noise[nv:] = self.starts.noise[nv:]
+        nv, channels = self.data.m.nv, self.starts.compared
+        noise = self.data.noise[:channels].copy()
+        noise[nv:] = self.starts.noise[nv:channels]
         errors = self.selector.errors(self.neutral[None])[0].astype(float)
+        errors = errors[..., :channels]
         moved = errors[:, -1] - errors[:, self.data.lead]
         if self.starts.read is not None:
-            both = self.starts.read[:, [self.data.lead, -1]].all(1)
+            both = self.starts.read[:, [self.data.lead, -1], :channels].all(1)
             moved = np.where(both, moved, np.nan)
         changed = measure.with_moving(self.channels, moved, noise)
         more = changed is not self.channels
@@ -227,18 +242,19 @@ class Fitting:
         is, in units of the floor.
 
         Args:
-            finer: predictions of the same windows with smaller steps, of positions.
+            finer: predictions of the same windows with smaller steps, but of sensors.
         """
-        chosen, nv = self.selector, self.data.m.nv
+        chosen, p = self.selector, self.predictor
         given = self.plain(x)[None], chosen.blocks, chosen.moved[None]
-        own = self.predictor.errors(*given)[0, : chosen.count, :, :nv]
-        right = finer.errors(*given)[0, : chosen.count]
-        error = (own - right)[:, : self.steps + 1].astype(float)
+        own, right = (
+            each.motion(each.errors(*given)[0, : chosen.count, : self.steps + 1])
+            for each in (p, finer)
+        )
+        error, fast = (a.astype(float) - b for a, b in zip(own, right, strict=True))
         turns = 2 * np.pi * np.round(error / (2 * np.pi))
-        error -= np.where(self.predictor.wrapped, turns, 0.0)
+        error = p.whole(error - np.where(p.wrapped, turns, 0.0), fast)
         finite = np.isfinite(error).all((1, 2), keepdims=True)
         error = np.where(finite, error, 0.0)
-        error = np.pad(error, [(0, 0), (0, 0), (0, len(self.data.sensors))])
         if chosen.steps is not None:
             error = self.share(x) * (error - chosen.steps)
         chosen.unseen_steps = error
@@ -296,4 +312,4 @@ def steps_error(predictor: Predictor, data: Recorded) -> np.ndarray:
     """`easi_jax.gap.discretization_error.error_of_steps` of all its windows,
     ``(W, H + 1, c)``; what sensors read of it is not told apart."""
     error = error_of_steps(data.m, predictor.windows, predictor.simulator.dt)
-    return np.pad(error, [(0, 0), (0, 0), (0, len(data.sensors))])
+    return predictor.whole(*error)

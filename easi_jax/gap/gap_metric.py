@@ -143,14 +143,14 @@ def finite(errors: np.ndarray, largest: np.ndarray) -> tuple[np.ndarray, np.ndar
 
     Args:
         errors: ``(..., W, H, c)``.
-        largest: motion seen in a window, ``(c,)``.
+        largest: motion seen in a window, ``(c,)``; more are left out.
 
     Returns:
         Errors of the same shape, and ``(..., W)`` bool.
     """
     lost = np.asarray(~np.isfinite(errors).all((-2, -1)))
     if lost.any():
-        most = np.asarray(largest, errors.dtype)
+        most = np.asarray(largest, errors.dtype)[: errors.shape[-1]]
         errors = np.where(lost[..., None, None], most, errors)
     return errors, lost
 

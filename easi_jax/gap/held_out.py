@@ -61,7 +61,7 @@ class HeldOut:
 
     def squares(self, x: np.ndarray, share: float = 0.0) -> np.ndarray:
         """Mean squares of each window for vectors ``(B, n)``, ``(B, W, c)``."""
-        out = [np.zeros((0, len(self.windows), self.predictor.channels))]
+        out = [np.zeros((0, len(self.windows), self.starts.compared))]
         for one in x:
             errors = self._fitted(one[None])[1]
             out.append(measure.squares(self._counted(errors, share)[0][0])[None])
@@ -72,8 +72,7 @@ class HeldOut:
         `easi_jax.estimation.starts.floor`."""
         rng = np.random.default_rng(0)
         got = floor(self.starts, x, self._moved, DRAWS, self.resolution, rng)
-        after = self.lead + 1
-        return got[:, after:].mean((0, 1)) / self.starts.share(after)
+        return self.starts.mean_square(got, self.lead + 1)
 
     def _fitted(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         begin = np.broadcast_to(self._moved, (len(x), *self._moved.shape))
@@ -102,5 +101,5 @@ class HeldOut:
             after,
             Conditions(self.m, self.windows, self.runs, rows),
             int(lost.sum()),
-            np.nan_to_num(errors[:, self.lead]),
+            np.nan_to_num(errors[:, self.lead, : self.starts.compared]),
         )

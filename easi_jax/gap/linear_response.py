@@ -40,7 +40,7 @@ class LinearResponse:
     """Changes of the predictions of some windows about one vector.
 
     Args:
-        predictor: predictions by native MuJoCo, of positions alone.
+        predictor: predictions by native MuJoCo, without sensors.
         x: the vector ``(n,)``.
         blocks: blocks of windows ``(nb,)``.
         moved: offsets of the windows' starts ``(W, s)``.
@@ -78,13 +78,14 @@ class LinearResponse:
         return (vectors[:, fixed] == self.x[fixed]).all(1)
 
     def changes(self, vectors: np.ndarray) -> np.ndarray:
-        """Of errors from those of ``x``, ``(B, W, H + 1, nv)``."""
+        """Of errors from those of ``x``, ``(B, W, H + 1, channels)``."""
         torque = (self._speeds(vectors) - self._still).astype(float)  # of one step
         return self._paths(torque, self._torques)
 
     def impulses(self) -> np.ndarray:
         """Changes of errors by 1 N m (1 N at a slide) at each degree of freedom during
-        the rows from one state to the next, one by one, ``(N, nv, W, H + 1, nv)``."""
+        the rows from one state to the next, one by one, ``(N, nv, W, H + 1,
+        channels)``."""
         count, nv = self._torques.shape[1], self.predictor.nv
         each = np.eye(count * nv).reshape(count * nv, 1, count, nv)
         each = np.broadcast_to(each, (len(each), len(self._torques), count, nv))
@@ -95,13 +96,14 @@ class LinearResponse:
         """Changes of errors ``(B, W, H + 1, nv)`` by what ``torque (B, W, N, nv)`` does
         ``by (W, N, s, nv)``."""
         nv = self.predictor.nv
-        path = np.zeros((*torque.shape[:3], nv))
+        path = np.zeros((*torque.shape[:3], 2 * nv))
         state = np.zeros((*torque.shape[:2], self.predictor.size))
         for k in range(torque.shape[2]):
             state = np.einsum("wij,bwj->bwi", self._after[:, k], state)
             state += np.einsum("wij,bwj->bwi", by[:, k], torque[:, :, k])
-            path[:, :, k] = state[..., :nv]
-        return _each_row(path, self.rows)[:, : self.count]
+            path[:, :, k] = state[..., : 2 * nv]
+        each = _each_row(path, self.rows)[:, : self.count]
+        return self.predictor.whole(each[..., :nv], each[..., nv:])
 
     # -- programs --------------------------------------------------------------
 

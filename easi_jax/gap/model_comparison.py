@@ -10,6 +10,7 @@ from easi_jax.gap.effect_set import Model
 from easi_jax.gap.table import Place
 
 _TINY = 1e-300
+_UNLIKELY = 1e-6  # probability of a name beside a rival, that odds are never beyond
 
 
 def advantage(a: np.ndarray, b: np.ndarray) -> float:
@@ -190,6 +191,12 @@ def confidence(
     if lost <= 0:
         return 0.0
     return 1.0 / (1.0 + (even / lost) ** steep) / (1.0 + odds)
+
+
+def odds_of(mine: Model, rivals: Sequence[Model]) -> float:
+    """Of all rivals of a model together, but its twins."""
+    each = [probability(mine, r) for r in rivals if not are_twins(mine, r)]
+    return sum((1 - p) / max(p, _UNLIKELY) for p in each)
 
 
 def are_twins(model: Model, rival: Model) -> bool:

@@ -20,6 +20,7 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
+from easi_jax.data.windows import lead_rows
 from easi_jax.devices.distributed import started
 from easi_jax.devices.mesh import make_mesh, sharded_map
 from easi_jax.devices.runtime import fast_loops, on_cpu, quick_compile
@@ -57,6 +58,7 @@ class Window(NamedTuple):
     past_qvel: jax.Array
     read: jax.Array
     speed: jax.Array
+    read_speed: jax.Array
     led: jax.Array
     sensed: jax.Array
     known: jax.Array
@@ -135,7 +137,9 @@ class Predictor:
             of others why not, by channel.
         early: which of them were read before the command of their row was sent,
             ``(N,)`` bool; the first row of a window is then not compared.
-        channels: numbers that are compared, ``nv + N``.
+        speeds: whether velocities are compared with those of the log in the rows that
+            a start is fitted to; they are the last ``nv`` channels then.
+        channels: numbers that are compared: ``nv + N``, and velocities.
         largest: motion that was measured in a window, ``(channels,)``.
         steps: control steps of a window, those before its start counted.
         data: the windows in blocks, on all devices of ``mesh``.
@@ -155,11 +159,12 @@ class Predictor:
         wait: Wait = at_once,
         sensors: Sensors = NO_SENSORS,
         engine: Engine | None = None,
+        speeds: bool = False,
     ) -> None:
         """``fixed``: what the machine has and MJCF cannot say, by address; ``logged``:
         states of the log that the windows are from; ``wait`` shows what compiles;
         ``sensors``: that ``windows.sensed`` are of."""
-        self._wait = wait
+        self._wait, self.speeds = wait, speeds
         self.simulator = Simulator(
             opened(mj_model), space, dt, fixed=fixed, logged=logged, engine=engine
         )
@@ -179,7 +184,8 @@ class Predictor:
         self.wrapped = np.zeros(nv, bool)
         for j in range(m.njnt):
             self.wrapped[dofs(m, j)] = turns_fully(m, j)
-        self.channels = nv + len(self.sensors)
+        self.channels = nv + len(self.sensors) + nv * speeds
+        self._started = 2 * lead_rows(dt) + 1  # rows that a start is fitted to
         self._scalar = scalar_places(m).T
         self.mesh = make_mesh()
         native = self.simulator.engine == "mujoco"
@@ -211,7 +217,8 @@ class Predictor:
         moved = np.abs(self._unwrapped(windows.read)).max((0, 1))
         moved = np.where(self.wrapped, np.minimum(moved, np.pi), moved)
         span = np.ptp(self._sensors_of(windows.sensed), axis=(0, 1))
-        self.largest = np.concatenate([moved, span])[: self.channels]
+        fastest = np.abs(windows.read_speed).max((0, 1))
+        self.largest = np.concatenate([moved, span, fastest])[: self.channels]
         # By powers of two, so that the program of one log often serves the next.
         self._room = 1 << (self.blocks - 1).bit_length()
         self.data = self._placed(windows)
@@ -221,9 +228,10 @@ class Predictor:
     @property
     def _compared(self) -> np.ndarray:
         """Places of `channels` in what a program returns."""
-        count = len(self.sensors)
+        count, joints = len(self.sensors), np.arange(self.nv)
         sensed = self.nv + np.arange(count) + count * self.early
-        return np.concatenate([np.arange(self.nv), sensed])[: self.channels]
+        fast = self.nv + 2 * count + joints
+        return np.concatenate([joints, sensed, fast])[: self.channels]
 
     def of_positions(self) -> "Predictor":
         """The same predictions, of positions alone."""
@@ -246,6 +254,8 @@ class Predictor:
 
         given = {f: getattr(padded, f) for f in Window._fields}
         given |= {"read": read, "sensed": sensed, "known": known}
+        if not self.speeds:
+            given["read_speed"] = padded.read_speed[..., :0]
         return Window(**{name: blocks(x) for name, x in given.items()})
 
     def _sensors_of(self, each: np.ndarray, planned: float = 0.0) -> np.ndarray:
@@ -261,7 +271,23 @@ class Predictor:
         channels)``."""
         sensed = self._sensors_of(self.windows.known, 1.0)
         motion = np.ones((*sensed.shape[:2], self.nv))
-        return np.concatenate([motion, sensed], 2)[..., : self.channels]
+        fast = motion * (np.arange(self.steps + 1) < self._started)[:, None]
+        return np.concatenate([motion, sensed, fast], 2)[..., : self.channels]
+
+    def motion(self, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of errors ``(..., channels)`` those of positions, and those of velocities,
+        ``(..., nv)``; zero where they are not compared."""
+        positions = errors[..., : self.nv]
+        if self.channels == self.nv + len(self.sensors):
+            return positions, np.zeros_like(positions)
+        return positions, errors[..., -self.nv :]
+
+    def whole(self, positions: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+        """Differences of predictions ``(..., T, nv)``, those of sensors unknown and so
+        zero, as differences of what is compared, ``(..., T, channels)``."""
+        fast = speeds * (np.arange(speeds.shape[-2]) < self._started)[:, None]
+        none = np.zeros((*positions.shape[:-1], len(self.sensors)))
+        return np.concatenate([positions, none, fast], -1)[..., : self.channels]
 
     def _unwrapped(self, read: np.ndarray) -> np.ndarray:
         """``WindowSet.read`` with the turns of hinges without limits counted."""
@@ -376,7 +402,8 @@ class Predictor:
     def _window(self, model: Model, window: Window, moved: jax.Array) -> jax.Array:
         """Readings less measurements at each row, ``(H + 1, nv + 2 N)``: those of
         sensors where a row's step begins, then where the step before it ends; zero in
-        rows in which a sensor was not read.
+        rows in which a sensor was not read. With ``speeds`` then those of velocities,
+        ``nv`` more; zero after the rows that a start is fitted to.
 
         Where readings are late, the simulation begins by the longest delay earlier, so
         that it starts from what was read until the window's start. Each joint is
@@ -386,8 +413,7 @@ class Predictor:
         simulator, e, nv = self.simulator, model.effects, self.nv
         assert e is not None
         q, read, physics, arrived = self.begun(model, window, moved)
-        early = window.led * jnp.max(e.late)
-        start = len(window.speed) // 2  # its row in both
+        early, now = self._when(window, e)
 
         def step(state: Physics, u: jax.Array) -> tuple:
             if not self.sensors:
@@ -413,17 +439,35 @@ class Predictor:
         error = path + e.bias + self._misread(model, window, qs, vs) - read
         turn = 2 * jnp.pi
         near = error - turn * jnp.round(error / turn)
-        error = jnp.where(self.wrapped, near, error)
-        if not self.sensors:
-            return error
-        row = start - early / simulator.dt + jnp.arange(self.steps + 1)
+        out = [jnp.where(self.wrapped, near, error)]
+        if self.sensors:
+            out.append(self._sensor_errors(window, early, readings))
+        if self.speeds:
+            row = jnp.arange(self._started)[:, None]
+            fast = vs[: self._started] - _between(window.read_speed, now + row)
+            out.append(jnp.pad(fast, [(0, len(vs) - len(fast)), (0, 0)]))
+        return jnp.concatenate(out, 1)
+
+    def _when(self, window: Window, e: Effects) -> tuple[jax.Array, jax.Array]:
+        """How much earlier than the window's start a simulation begins [s], and the row
+        of ``window.read`` in which joints read where they are then, ``(nv,)``."""
+        early = window.led * jnp.max(e.late)
+        start = len(window.speed) // 2  # its row in both
+        return early, start - (early - e.late) / self.simulator.dt
+
+    def _sensor_errors(
+        self, window: Window, early: jax.Array, readings: jax.Array
+    ) -> jax.Array:
+        """Of `_window`, those of sensors, ``(H + 1, 2 N)``, from the simulated
+        ``readings (H + 1, 2, N)``."""
+        start = len(window.speed) // 2
+        row = start - early / self.simulator.dt + jnp.arange(self.steps + 1)
         read = jnp.broadcast_to(row[:, None], (len(row), len(self.sensors)))
         read = _between(window.sensed, read)
         readings = self.sensors.reading.alike(readings, read[:, None])
         begins, ends = readings[:, 0] - read, readings[:-1, 1] - read[1:]
         each = jnp.concatenate([begins, jnp.pad(ends, [(1, 0), (0, 0)])], 1)
-        each = jnp.where(jnp.tile(window.known, 2) > 0, each, 0.0)
-        return jnp.concatenate([error, each], 1)
+        return jnp.where(jnp.tile(window.known, 2) > 0, each, 0.0)
 
     def _misread(
         self, model: Model, window: Window, qs: jax.Array, vs: jax.Array
@@ -464,9 +508,7 @@ class Predictor:
         each row after it, ``(H, substeps, nu)``, one row more with sensors."""
         w, simulator, e, nv = window, self.simulator, model.effects, self.nv
         assert e is not None
-        early = w.led * jnp.max(e.late)
-        start = len(w.speed) // 2  # its row in both
-        now = start - (early - e.late) / simulator.dt  # (nv,)
+        early, now = self._when(w, e)
         read = _between(w.read, now + jnp.arange(self.steps + 1)[:, None])
         v = _between(w.speed, now[None])[0]
         q, v = self._true(model, w, simulator.move(w.start_qpos, read[0] - e.bias), v)

@@ -9,14 +9,18 @@ import numpy as np
 from easi_jax.data.noise import finest, pooled, resolutions
 from easi_jax.data.recording import Run
 from easi_jax.data.sensor_channels import Sensors
+from easi_jax.data.velocity_lag import noise_in_starts, of_model, set_right
+from easi_jax.data.windows import lead_rows
 from easi_jax.estimation.starts import known_noise
 from easi_jax.gap.batched_least_squares import Bounds
 from easi_jax.model.effect_catalog import Scales
+from easi_jax.model.joint_space import tangent_names
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """A model with its recordings; c channels are compared, positions first.
+    """A model with its recordings; c channels are compared, positions first, then
+    sensors, then velocities, which speak of starts only.
 
     Attributes:
         m: the model as given.
@@ -28,7 +32,7 @@ class Recorded:
         lead: rows before a start that a window begins.
         motion: of each channel, ``(c,)``.
         noise: of its readings; infinite where nobody measured, ``(c,)``.
-        noise_is_bound: where it may be less, ``(c,)`` bool.
+        noise_is_bound: where it may be less, of positions and sensors, bool.
         resolution: step between two readings, ``(c,)``.
     """
 
@@ -60,11 +64,12 @@ def recorded(
     noise: np.ndarray,
     lead: int,
 ) -> Recorded:
-    """With motion, noise and resolution of all channels; ``noise (nv,)`` is that of
-    positions."""
-    runs = [*fit, *held]
-    motion = np.concatenate([scales.position, np.maximum(sensors.spread(fit), 1e-9)])
+    """With motion, noise and resolution of all channels; ``noise`` is that of positions
+    ``(nv,)``, or also of velocities that are compared ``(2 nv,)``."""
+    runs, nv = [*fit, *held], m.nv
     told, is_bound = sensors.noise(fit)
+    spread, fast = np.maximum(sensors.spread(fit), 1e-9), scales.speed
+    motion = np.concatenate([scales.position, spread, fast[: len(noise) - nv]])
     step = finest([resolutions(run) for run in runs])
     return Recorded(
         m,
@@ -75,7 +80,30 @@ def recorded(
         sensors,
         lead,
         motion,
-        known_noise(np.concatenate([noise, told]), motion),
-        np.concatenate([pooled(fit).is_bound[: m.nv], is_bound]),
-        np.concatenate([step, sensors.finest(runs)]),
+        known_noise(np.concatenate([noise[:nv], told, noise[nv:]]), motion),
+        np.concatenate([pooled(fit).is_bound[:nv], is_bound]),
+        np.concatenate([step, sensors.finest(runs), np.zeros(len(noise) - nv)]),
     )
+
+
+def with_speeds(
+    m: mujoco.MjModel, fit: Sequence[Run], held: Sequence[Run], noise: np.ndarray
+) -> tuple[Sequence[Run], Sequence[Run], np.ndarray]:
+    """Runs whose velocities are set right (`easi_jax.data.velocity_lag`), and the noise
+    of what helps to find starts: of positions, and of velocities where all runs have
+    them.
+
+    Args:
+        noise: of positions and velocities, ``(2 nv,)``, or of positions, ``(nv,)``.
+
+    Returns:
+        Runs to fit, held-out ones, and noise, ``(2 nv,)`` or ``(nv,)``.
+    """
+    nv, runs, dt = m.nv, [*fit, *held], fit[0].dt
+    if len(noise) == nv or not all(run.qvel_measured for run in runs):
+        return fit, held, noise[:nv]
+    late, rows = of_model(m, dt), 2 * lead_rows(dt) + 1
+    right = set_right(runs, tangent_names(m), late)
+    noise = noise * np.append(np.ones(nv), right.noisier)
+    noise[nv:] = noise_in_starts(right.runs, noise, rows, late)
+    return right.runs[: len(fit)], right.runs[len(fit) :], noise

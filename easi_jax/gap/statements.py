@@ -12,12 +12,7 @@ from easi_jax.gap.effect_search import RIVALS, EffectSearch
 from easi_jax.gap.effect_set import Model, last
 from easi_jax.gap.fitting import Fitting
 from easi_jax.gap.held_out import HeldOut
-from easi_jax.gap.model_comparison import (
-    are_twins,
-    confidence,
-    cost,
-    probability,
-)
+from easi_jax.gap.model_comparison import confidence, cost, odds_of
 from easi_jax.gap.result import Figures, Found, Numbers, Outcome, Part
 from easi_jax.gap.table import Place
 from easi_jax.gap.verdict import Openness, openness, surely_better, verdict_of
@@ -108,7 +103,7 @@ def stated(
         after=end.figures,
         floor=float(measure.gap(end.noise, scale)),
         floor_si=np.sqrt(end.noise),
-        floor_is_bound=data.noise_is_bound & (at.starts.noise >= data.noise),
+        floor_is_bound=data.noise_is_bound & at.noise_as_told,
         open_refit=refit.open,
         open_after=end.open,
         channels=held_out.channels,
@@ -181,16 +176,13 @@ class _Judge:
     def _odds(self, mine: Model, rivals: Sequence[Model]) -> tuple[float, list[Place]]:
         """Odds of an effect's rivals but its twins, and those that predict held-out
         data as well."""
-        odds, same = 0.0, []
+        same: list[Place] = []
         for rival in rivals[:RIVALS]:
-            if not are_twins(mine, rival):
-                p = probability(mine, rival)
-                odds += (1 - p) / max(p, 1e-6)
             if self._as_good(self.whole.square, self._fair(rival).square):
                 other = rival.places[-1]
                 singles = self.search.offered.singles(other)
                 same += singles if other.shared else [other]
-        return odds, same
+        return odds_of(mine, rivals[:RIVALS]), same
 
     def _parts(self, x: np.ndarray, place: Place, whole: Figures) -> tuple[Part, ...]:
         """The actuators that a shared effect is seen at: without it at one of them the

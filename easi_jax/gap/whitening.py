@@ -20,11 +20,11 @@ _FIRST = 6  # of the rows that the start is fitted to, at most
 
 @dataclass(frozen=True)
 class Residuals:
-    """Turns errors ``(B, W, T, nv)`` into what fits compare.
+    """Turns errors ``(B, W, T, c)`` into what fits compare.
 
     Attributes:
         groups: averages over rows, ``(K, T)``.
-        scale: of each channel in the gap; infinite for one left out, ``(nv,)``.
+        scale: of each channel in the gap; infinite for one left out, ``(c,)``.
         root: inverse root of each window's error covariance, ``(W, n, n)`` with
             ``n = K nv``.
         plain: errors in units of the gap, starts fitted anew, from whitened ones,
@@ -78,11 +78,14 @@ def make_residuals(
     Args:
         starts: of the windows, linearized.
         lead: rows before the start that the gap is measured from.
-        misfit: errors of the model that are let pass, ``(nv,)``; keeps a fit from
+        misfit: errors of the model that are let pass, ``(c,)``; keeps a fit from
             hanging on what no model would get right.
-        scale: see `Residuals`.
+        scale: see `Residuals`; of channels that speak of more than starts.
     """
     size, count, rows, nv = starts.slope.shape
+    share = np.ones(nv)
+    share[: starts.compared] = starts.share(lead + 1)
+    scale = np.pad(scale, (0, nv - len(scale)), constant_values=np.inf)
     groups = row_groups(rows, starts.rows)
     k = len(groups)
     n = k * nv
@@ -92,11 +95,12 @@ def make_residuals(
     slope = slope.reshape(count, n, size)
     each = np.broadcast_to(starts.noises**2, (count, rows, nv))
     white = np.einsum("kh,whc->wkc", groups**2, each)
+    keep &= (white > 0).any(0).reshape(-1)
     free = slope * starts.spread
     spread = (white + misfit**2).reshape(count, n)
     root, plain = np.zeros((2, count, n, n))
     floor = np.zeros(count)
-    unit = _unit(groups, lead, scale * np.sqrt(starts.share(lead + 1)))
+    unit = _unit(groups, lead, scale * np.sqrt(share))
     near = groups[:, starts.rows :].sum(1) == 0
     weight = np.where(near[:, None] & (white > 0), 1.0 / np.maximum(white, 1e-300), 0.0)
     weight = weight.reshape(count, n)

@@ -40,6 +40,8 @@ class WindowSet:
             L rows late; beyond a run its first or last.
         speed: fitted velocities from ``L + 1`` rows before the start to L after,
             ``(W, 2 L + 2, nv)``; at rest before a run.
+        read_speed: velocities of the log in the rows of ``read``,
+            ``(W, 2 L + 2 + H, nv)``.
         led: whether the run has as many rows before the window as readings can be late.
         sensed: readings of N numbers of sensors in the rows of ``read``,
             ``(W, 2 L + 2 + H, N)``.
@@ -61,6 +63,7 @@ class WindowSet:
     past_qvel: np.ndarray
     read: np.ndarray
     speed: np.ndarray
+    read_speed: np.ndarray
     led: np.ndarray
     sensed: np.ndarray
     known: np.ndarray
@@ -153,6 +156,7 @@ def _windows_of(
         past_qvel=moving(before),
         read=run.configuration.difference(run.qpos[start], run.qpos[inside(seen)]),
         speed=moving(start + np.arange(-late - 1, late + 1)),
+        read_speed=run.qvel[inside(seen)],
         led=w.start_row >= late,
         sensed=sensors.readings(run)[inside(seen)],
         known=1.0 * sensors.known(run)[start + np.arange(steps + 1)],

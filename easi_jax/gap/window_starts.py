@@ -30,8 +30,8 @@ def window_starts(
         m: the model that was recorded.
         runs: that say how far activations may be off.
         scales: of the motion in them.
-        noise: of what is compared, positions first, ``(c,)``, above zero; infinite
-            for those that nobody measured.
+        noise: of what is compared, positions first and velocities last, ``(c,)``,
+            above zero; infinite for those that nobody measured.
         blocks: of the predictor's windows; all where None.
         count: of them that are no fillers; all where None.
         rows: of a window that are compared; all where None.
@@ -39,7 +39,7 @@ def window_starts(
     act = np.zeros(m.na)
     if m.na:
         act = activation_spread(m, runs, [activation_guess(m, run) for run in runs])
-    own, whole = len(predictor.neutral), predictor.windows.known.all()
+    own, read = len(predictor.neutral), predictor.read
     every = np.arange(len(predictor.windows))
     at = (every if blocks is None else windows_in(blocks))[:count]
 
@@ -55,5 +55,6 @@ def window_starts(
         act,
         runs[0].dt,
         start_parts(m),
-        None if whole else predictor.read[at, :rows],
+        None if read.all() else read[at, :rows],
+        predictor.speeds and predictor.channels > m.nv,
     )

@@ -323,7 +323,8 @@ def test_segments_never_cross_runs(simulator):
 
 
 def test_error_of_the_true_model_is_the_noise_floor(simulator):
-    """Motion by MuJoCo C, noise added: errors are what the floor says."""
+    """Motion by MuJoCo C, noise added: errors are what the floor says, which is less
+    where measured velocities help to find starts."""
     model = simulator.mj_model
     rng = np.random.default_rng(3)
     rows, sigma = 1500, 2e-3
@@ -331,24 +332,32 @@ def test_error_of_the_true_model_is_the_noise_floor(simulator):
     def recorded(phase: float) -> Any:
         data = mujoco.MjData(model)
         ctrl = 5 * np.sin(0.03 * np.arange(rows) + phase)
-        qpos = np.empty(rows)
+        qpos, qvel = np.empty((2, rows))
         for t in range(rows):
-            qpos[t], data.ctrl[0] = data.qpos[0], ctrl[t]
+            qpos[t], qvel[t], data.ctrl[0] = data.qpos[0], data.qvel[0], ctrl[t]
             mujoco.mj_step(model, data)
         run = make_run(qpos + sigma * rng.standard_normal(rows))
-        return dataclasses.replace(run, ctrl=ctrl[:, None])
+        qvel += 2e-2 * rng.standard_normal(rows)
+        run = dataclasses.replace(run, ctrl=ctrl[:, None])
+        return run, dataclasses.replace(run, qvel=qvel[:, None], qvel_measured=True)
 
-    fit, held = recorded(0.0), recorded(1.0)
-    asked = fit, held, estimate_noise(fit)
-    problem = Problem(
-        *("cart", simulator, [asked[0]], [asked[1]], "held", asked[2]),
-        *(np.zeros(1, bool), 20, 20, 20 * simulator.dt, []),
+    both = list(zip(recorded(0.0), recorded(1.0), strict=True))
+    problem, faster = (
+        Problem(
+            *("cart", simulator, [fit], [held], "held", estimate_noise(fit)),
+            *(np.full(1, known), 20, 20, 20 * simulator.dt, []),
+        )
+        for known, (fit, held) in zip((False, True), both, strict=True)
     )
     held_out, fitted = ready_errors(problem, simulator.space, several=True)
     assert fitted is not None
     first, lost, least = held_out.with_floor(jnp.asarray(simulator.space.nominal))
     assert not lost
     np.testing.assert_allclose(first, least, rtol=0.1)
+    quick, _ = ready_errors(faster, simulator.space)
+    better, _, less = quick.with_floor(jnp.asarray(simulator.space.nominal))
+    np.testing.assert_allclose(better, less, rtol=0.1)
+    assert less[0] < 0.95 * least[0]
     second, _ = fitted.of(jnp.asarray(simulator.space.nominal))
     np.testing.assert_allclose(second, least, rtol=0.15)
     wrong, _, noise = held_out.with_floor(jnp.asarray([5.0]))

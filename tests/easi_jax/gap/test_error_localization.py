@@ -58,6 +58,7 @@ def simulator() -> tuple[WindowSet, list[Run]]:
         past_qvel=run.qvel[rows][:, None],
         read=np.zeros((len(rows), H + 2, 2)),
         speed=run.qvel[rows][:, None],
+        read_speed=np.repeat(run.qvel[rows][:, None], H + 2, 1),
         led=rows >= 0,
         sensed=np.zeros((len(rows), H + 2, 0)),
         known=np.ones((len(rows), H + 1, 0)),

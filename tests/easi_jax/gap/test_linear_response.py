@@ -26,21 +26,23 @@ _ON_FLOOR = """<mujoco><option timestep="0.002"/><worldbody>
 </mujoco>"""
 
 
-def _about(xml: str, horizon: float) -> tuple[Predictor, LinearResponse]:
+def _about(
+    xml: str, horizon: float, speeds: bool = False
+) -> tuple[Predictor, LinearResponse]:
     m = mujoco.MjModel.from_xml_string(xml)
     run = recorded(m, (0.0,) * m.nv)
     layout = Layout(m, places(m, scales_of(m, [run])))
     windows = window_set(m, [run], horizon, 0.0)
     assert windows is not None
     with engine.using("mujoco"):
-        p = Predictor(m, ParameterSpace(()), layout, windows, DT)
+        p = Predictor(m, ParameterSpace(()), layout, windows, DT, speeds=speeds)
     moved = np.zeros((len(windows), p.size))
     return p, LinearResponse(p, p.neutral, np.arange(p.blocks), moved)
 
 
-@pytest.fixture(scope="module")
-def arm() -> tuple[Predictor, LinearResponse]:
-    return _about(ARM.format(SECOND), 0.2)
+@pytest.fixture(scope="module", params=[False, True], ids=["positions", "speeds"])
+def arm(request: pytest.FixtureRequest) -> tuple[Predictor, LinearResponse]:
+    return _about(ARM.format(SECOND), 0.2, request.param)
 
 
 @pytest.mark.parametrize(
@@ -66,10 +68,12 @@ def test_torques_are_as_simulated(
     vectors[np.arange(len(at)), at] += size
     assert len(at) and linear.covers(vectors).all()
     errors = p.errors(np.concatenate([p.neutral[None], vectors])).astype(float)
-    true = (errors[1:] - errors[0])[:, linear.holds]
-    found = linear.changes(vectors)[:, linear.holds]
-    off, whole = (np.sqrt((x**2).mean((1, 2, 3))) for x in (found - true, true))
-    assert (whole > 1e-7).all() and (off < near * whole).all(), (off / whole).tolist()
+    true = p.motion((errors[1:] - errors[0])[:, linear.holds])
+    found = p.motion(linear.changes(vectors)[:, linear.holds])
+    for a, b in list(zip(found, true, strict=True))[: 1 + p.speeds]:
+        off, whole = (np.sqrt((x**2).mean((1, 2, 3))) for x in (a - b, b))
+        assert (whole > 1e-7).all(), whole
+        assert (off < near * whole).all(), (off / whole).tolist()
 
 
 def test_faults_of_readings_and_limits_are_not_reckoned(

@@ -448,7 +448,7 @@ def test_the_error_of_steps_is_what_smaller_ones_take_away(
 ) -> None:
     windows = window_set(model, runs, 0.2, 0.03)
     assert windows is not None
-    error = error_of_steps(model, windows, DT)
+    error, fast = error_of_steps(model, windows, DT)
     own, fine = copy.deepcopy(model), copy.deepcopy(model)
     parts = physics_steps(DT, model.opt.timestep)
     own.opt.timestep, fine.opt.timestep = DT / parts, DT / (8 * parts)
@@ -463,9 +463,10 @@ def test_the_error_of_steps_is_what_smaller_ones_take_away(
         for u in windows.ctrl[at]:
             d.ctrl = u
             mujoco.mj_step(m, d, round(DT / m.opt.timestep))
-        ends.append(d.qpos.copy())
-    assert np.abs(error[at, -1]).max() > 1e-6
-    np.testing.assert_allclose(error[at, -1], ends[0] - ends[1], atol=1e-12)
+        ends.append(np.array([d.qpos, d.qvel]))
+    assert np.abs(error[at, -1]).max() > 1e-6 and np.abs(fast[at, -1]).max() > 1e-5
+    both = np.array([error[at, -1], fast[at, -1]])
+    np.testing.assert_allclose(both, ends[0] - ends[1], atol=1e-12)
 
 
 def test_shifts_shorter_than_a_physics_step(
