@@ -166,7 +166,8 @@ def evaluate(
         measures[measure] = {}
         for name, runs in logs.items():
             cut = [rows_of(run, first, len(run)) for run in runs]
-            pieces = segments_from_runs(simulator, cut, steps, every, fitted=True)
+            none = np.zeros(mj_model.nv, bool)  # all velocities from the positions
+            pieces = segments_from_runs(simulator, cut, steps, every, none)
             pieces = to_device(pieces)
             nominal, *rest = np.asarray(error(theta, pieces), float)
             middle = np.median(rest, axis=0)

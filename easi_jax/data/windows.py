@@ -83,8 +83,9 @@ def lead_rows(dt: float) -> int:
 
 
 def window_steps(dt: float, horizon_s: float) -> int:
-    """Control steps of a horizon: to the nearest, at least `MIN_STEPS`."""
-    return max(MIN_STEPS, round(horizon_s / dt))
+    """Control steps of a horizon: to the nearest, at least `MIN_STEPS`, and more than
+    follow a start that its state is fitted to."""
+    return max(MIN_STEPS, lead_rows(dt) + 1, round(horizon_s / dt))
 
 
 def make_windows(

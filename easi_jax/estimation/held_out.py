@@ -59,12 +59,14 @@ class WindowErrors:
         self.lead = lead_rows(simulator.dt)
         every = max(1, problem.steps // 2)
         given = simulator, runs, self.lead + problem.steps, every
-        cuts = [segments_from_runs(*given, fitted=fitted) for fitted in (False, True)]
+        none = np.zeros(nv, bool)
+        seen = problem.measured if all(run.qvel_measured for run in runs) else none
+        cuts = [segments_from_runs(*given, trusted) for trusted in (seen, none)]
         read, fitted = (c.spread(most) if c.count > most else c for c in cuts)
         # Starts are by the positions alone, before velocities help to find them.
         windows = to_device(replace(read, qvel=fitted.qvel))
         faster = jnp.asarray(fitted.qvel - read.qvel)
-        speeds = bool(problem.measured.any())
+        begun = np.arange(self.lead + problem.steps + 1) < 2 * self.lead + 1
         largest = jnp.abs(open_loop.motion(simulator, windows)[..., :nv])
         self.largest = jnp.asarray(np.asarray(largest).max((0, 1)))
 
@@ -74,7 +76,8 @@ class WindowErrors:
             found = open_loop.errors_from(simulator, model, first, windows)
             begin = moved[:, : 2 * nv].at[:, nv:].add(faster)
             off = jnp.concatenate([begin[:, None], -found[..., : 2 * nv]], 1)
-            return off if speeds else off[..., :nv]
+            off = off.at[..., nv:].multiply(begun[:, None])
+            return off if seen.any() else off[..., :nv]
 
         still = np.zeros((windows.count, 2 * nv + simulator.mj_model.na), np.float32)
         like = placed((jnp.zeros(space.size), jnp.asarray(still)))
@@ -88,8 +91,11 @@ class WindowErrors:
             return np.stack([jax.device_get(compiled(*both)) for both in asked])
 
         self.still, self.count = still, windows.count
-        shape = windows.count, self.lead + problem.steps + 1
-        self.starts = _starts_of(problem, simulate, shape)
+        self.starts = _starts_of(problem, simulate, runs, seen)
+        if seen.any():
+            read = np.ones((windows.count, len(begun), 2 * nv))
+            read[..., nv:] = begun[:, None]
+            self.starts.read = read
         self.rows = self.starts.noise
         step = finest([resolutions(r) for r in (*problem.fit, *problem.held)])
         self.resolution = np.pad(step, (0, self.starts.alone))
@@ -119,33 +125,33 @@ class WindowErrors:
         return np.asarray(rms_of_steps(jnp.asarray(after), self.largest)), int(lost)
 
 
-def _starts_of(problem: Problem, simulate: Simulate, shape: tuple[int, int]) -> Starts:
-    """Of windows that begin `lead_rows` before they are measured from, ``shape (W,
-    T)``."""
+def _starts_of(
+    problem: Problem, simulate: Simulate, used: Sequence[Run], seen: np.ndarray
+) -> Starts:
+    """Of windows of the runs ``used`` that begin `lead_rows` before they are measured
+    from; velocities that are ``seen (nv,)`` help to find them."""
     m, runs = problem.simulator.mj_model, [*problem.fit, *problem.held]
-    nv, dt, read = m.nv, runs[0].dt, None
+    dt = runs[0].dt
     moved = [r.configuration.difference(r.qpos[:1], r.qpos) for r in runs]
     size = np.maximum(np.concatenate(moved).std(0), 1e-9)
     given = jnp.asarray(problem.noise), np.zeros(m.nv, bool)
     wide = np.asarray(spread_of_starts(m, runs, *given))
-    noise, speeds = known_noise(problem.noise, size), bool(problem.measured.any())
-    if speeds:
-        rows = 2 * lead_rows(dt) + 1
-        fast = noise_in_starts(problem.fit, problem.noise, rows, of_model(m, dt))
-        noise = np.append(noise, np.where(problem.measured, fast, np.inf))
-        read = np.ones((*shape, 2 * nv))
-        read[:, rows:, nv:] = 0.0
+    noise = problem.noise[: m.nv]
+    if seen.any():
+        rows, late = 2 * lead_rows(dt) + 1, of_model(m, dt)
+        fast = noise_in_starts(used, problem.noise, rows, late)
+        noise = np.append(noise, np.where(seen, fast, np.inf))
+    speed = np.concatenate([run.qvel for run in used]).std(0)
     return starts_about(
         simulate,
-        noise,
+        known_noise(noise, np.append(size, np.maximum(speed, 1e-9))[: len(noise)]),
         size,
         np.maximum(wide[m.nv : 2 * m.nv], 1e-9),
         unmeasured.start_spread(m, runs, np.isinf(problem.noise[: m.nv])),
         np.maximum(wide[2 * m.nv :], 1e-9),
         dt,
         start_parts(m),
-        read,
-        speeds,
+        speeds=bool(seen.any()),
     )
 
 

@@ -54,7 +54,7 @@ def segments_from_runs(
     runs: Sequence[Run],
     horizon: int,
     every: int,
-    fitted: bool = False,
+    trusted: np.ndarray | None = None,
     sensors: Sensors = NO_SENSORS,
 ) -> Segments:
     """Segments of ``horizon`` control steps, none across two runs.
@@ -62,17 +62,17 @@ def segments_from_runs(
     Args:
         simulator: its control step is that of the runs.
         every: steps from one start to the next.
-        fitted: take all velocities from the positions, measured ones too, as the
-            error measure of the log format does.
+        trusted: measured velocities that are taken, ``(nv,)`` bool; all others follow
+            from the positions. `easi_jax.data.cleaning.trusted_velocities` where None.
         sensors: whose readings they have.
 
     Raises:
         UserError: no run is longer than ``horizon`` steps.
         ValueError: a run of another control step.
     """
-    parts, none = [], np.zeros(simulator.mj_model.nv, bool)
+    parts = []
     whole = all(sensors.known(run).all() for run in runs)
-    trusted = none if fitted else trusted_velocities(runs)
+    trusted = trusted_velocities(runs) if trusted is None else trusted
     for run in runs:
         if abs(run.dt / simulator.dt - 1) > _STEPS_AGREE:
             raise ValueError(f"{run.name}: control step {run.dt}, not {simulator.dt}")

@@ -99,7 +99,8 @@ class Analysis:
         self._more = {"fixed": fixed, "progress": progress, "wait": wait}
         self.final = self
         self.fixed, self._progress = dict(fixed or {}), progress
-        fit, held, noise = with_speeds(mj_model, fit, held, np.asarray(noise))
+        given = mj_model, fit, held, np.asarray(noise)
+        fit, held, noise, self._notes = with_speeds(*given)
         dt, runs = fit[0].dt, [*fit, *held]
         scales = scales_of(mj_model, fit)
         sensors, self._ignored = measured_sensors(mj_model, runs)
@@ -274,7 +275,7 @@ class Analysis:
         """Finds, names and measures; `final` is then the analysis that did."""
         began = time.perf_counter()
         self.tell("compiling the predictions ...")
-        notes = self._read_early()
+        notes = [*self._notes, *self._read_early()]
         chosen = self._chosen()
         listed = time.perf_counter()
         proposed = proposed_laws(self, chosen.model)

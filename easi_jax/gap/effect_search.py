@@ -302,7 +302,7 @@ class EffectSearch:
             self._tell_gone(spare, "nothing is open without it, nor is it probable")
             notes += [_of_a_step(p, step) for p in brief]
             notes += [_spared(p) for p in spare]
-            self.offered.drop(brief)
+            self.offered.drop([*brief, *spare])
             less = self.at.without(model, gone)
             self.at.whiten(less.fit.x)
             less = self.at.selector.fit(less.places, less.fit.x)
@@ -316,19 +316,15 @@ class EffectSearch:
     def _spare(
         self, model: Model, rivals: Mapping[str, Sequence[Model]]
     ) -> list[Place]:
-        """The effect that is missed least, where nothing is open without it and its
-        name is not even probable; none else."""
+        """The effect that is missed least, where nothing is left beyond what counts as
+        open without it and its name is not even probable; none else."""
         without = {p.key: self.at.without(model, [p]) for p in model.places}
         costs = {key: cost(model, less) for key, less in without.items()}
         for place in sorted(model.places, key=lambda p: costs[p.key]):
             odds = odds_of(last(model, place), rivals[place.key][:RIVALS])
             if confidence(costs[place.key], odds) >= DECIDE.probable:
                 continue
-            less = without[place.key].fit.x
-            self.at.whiten(less)
-            is_open = self.at.is_open(less)
-            self.at.whiten(model.fit.x)
-            if not is_open:
+            if not self.at.misses(model.fit.x, without[place.key].fit.x):
                 return [place]
         return []
 
@@ -383,8 +379,8 @@ def _of_a_step(place: Place, step: float) -> str:
 
 def _spared(place: Place) -> str:
     return (
-        f"{place.key}: the data are predicted a little better with it, but about as "
-        "well with others, and nothing is open without any; not named"
+        f"{place.key}: the data are predicted a little better with it, but nothing is "
+        "open without it, and so little may be of another cause; not named"
     )
 
 

@@ -18,7 +18,7 @@ from easi_jax.gap.gap_metric import Channels
 from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.recorded import Recorded
 from easi_jax.gap.table import Place
-from easi_jax.gap.verdict import openness
+from easi_jax.gap.verdict import Openness, openness
 from easi_jax.gap.whitening import make_residuals
 from easi_jax.gap.window_set import WindowSet
 from easi_jax.gap.window_starts import window_starts
@@ -163,21 +163,24 @@ class Fitting:
 
     def closed(self, x: np.ndarray) -> bool:
         """Whether nothing is left to explain, whitened at ``x``."""
-        return self._open(x) <= DECIDE.closed
+        return float(np.nanmax(self._beside_floor(x, x).low)) <= DECIDE.closed
 
-    def is_open(self, x: np.ndarray) -> bool:
-        """Whether anything is `easi_jax.gap.verdict.Openness.is_open`, whitened at
-        ``x``."""
-        return self._open(x) > DECIDE.open_from
+    def misses(self, x: np.ndarray, less: np.ndarray) -> bool:
+        """Whether anything is beyond `easi_jax.gap.decisions.Decisions.open_from` of
+        the floor at ``x``, whitened there, under a vector ``less`` with starts of its
+        own."""
+        return float(np.nanmax(self._beside_floor(x, less).ratio)) > DECIDE.open_from
 
-    def _open(self, x: np.ndarray) -> float:
-        """The most that any error surely is, in floors."""
-        errors = self.selector.errors(x[None])[0]
+    def _beside_floor(self, x: np.ndarray, other: np.ndarray) -> Openness:
+        """Errors of a vector beside the floor at ``x``, whitened there."""
         rng, after, moved = np.random.default_rng(1), self.data.lead + 1, self.moved
         noise = floor(self.starts, x, moved, _DRAWS, self.data.resolution, rng)
+        if other is not x:
+            moved = self.starts.fit(other[None], moved[None])[0][0]
+        errors = self.selector.errors(other[None], None, moved)[0]
         square = measure.squares(self.starts.counted(errors, after))
         due = self.starts.mean_square(noise, after)
-        return float(np.nanmax(openness(square, due, self.channels.scale).low))
+        return openness(square, due, self.channels.scale)
 
     def closed_by(self, model: Model) -> bool:
         """Whether a model of these windows leaves nothing to explain."""

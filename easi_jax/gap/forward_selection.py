@@ -38,7 +38,7 @@ class Selector:
     Its ``residuals`` have to be set before it fits, and ``floor``, the gap of a perfect
     model, before it chooses. ``journal`` keeps what takes long.
 
-    ``steps``, where set, is an error of all predictions ``(count, T, nv)`` of which a
+    ``steps``, where set, is an error of all predictions ``(count, T, c)`` of which a
     share is nobody's fault. That share is one number more at the end of the vectors.
     ``unseen_steps`` is such an error that does not show, but may move what is fitted.
     ``moved (count, s)`` are offsets of the windows' starts.
@@ -86,15 +86,22 @@ class Selector:
         """Vectors without the share."""
         return x[..., : len(self.predictor.neutral)]
 
-    def errors(self, x: np.ndarray, some: np.ndarray | None = None) -> np.ndarray:
-        """Errors of the fitted windows under vectors ``(B, n)``, ``(B, W, T, nv)``;
-        ``some``: of those in some of the blocks, by their place among them.
+    def errors(
+        self,
+        x: np.ndarray,
+        some: np.ndarray | None = None,
+        moved: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Errors of the fitted windows under vectors ``(B, n)``, ``(B, W, T, c)``;
+        ``some``: of those in some of the blocks, by their place among them; ``moved
+        (count, s)``: other offsets of starts.
 
         Single windows whose prediction is not finite count as the largest motion; of a
         vector that loses most windows they stay as they are, and no fit takes it."""
         every = np.arange(len(self.blocks)) if some is None else some
         at = self.windows_of(every)
-        moved = np.broadcast_to(self.moved[at], (len(x), len(at), self.moved.shape[1]))
+        begun = self.moved if moved is None else moved
+        moved = np.broadcast_to(begun[at], (len(x), len(at), begun.shape[1]))
         found = self.predictor.errors(self.plain(x), self.blocks[every], moved)
         found = found[:, : len(at), : self.rows]
         bounded, lost = finite(found, self.predictor.largest)

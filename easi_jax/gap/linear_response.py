@@ -93,8 +93,8 @@ class LinearResponse:
         return paths.reshape(count, nv, *paths.shape[1:])
 
     def _paths(self, torque: np.ndarray, by: np.ndarray) -> np.ndarray:
-        """Changes of errors ``(B, W, H + 1, nv)`` by what ``torque (B, W, N, nv)`` does
-        ``by (W, N, s, nv)``."""
+        """Changes of errors ``(B, W, H + 1, channels)`` by what a torque ``(B, W, N,
+        nv)`` does ``by (W, N, s, nv)``."""
         nv = self.predictor.nv
         path = np.zeros((*torque.shape[:3], 2 * nv))
         state = np.zeros((*torque.shape[:2], self.predictor.size))
@@ -167,10 +167,10 @@ class LinearResponse:
         ]
         asked = np.concatenate([self.x[None], vectors])
         every = np.broadcast_to(moved, (len(asked), *moved.shape))
-        errors = p.errors(asked, self.blocks, every).astype(float)
+        errors = p.motion(p.errors(asked, self.blocks, every).astype(float))[0]
         true = (errors[1:] - errors[0])[:, : self.count]
         with np.errstate(invalid="ignore", over="ignore"):
-            off = self.changes(vectors) - true
+            off = p.motion(self.changes(vectors))[0] - true
             share = np.sqrt((off**2).sum((2, 3)) / (true**2).sum((2, 3)))
         return (share <= _ALIKE).all(0)
 

@@ -278,7 +278,7 @@ class Predictor:
         """Of errors ``(..., channels)`` those of positions, and those of velocities,
         ``(..., nv)``; zero where they are not compared."""
         positions = errors[..., : self.nv]
-        if self.channels == self.nv + len(self.sensors):
+        if self.channels <= self.nv + len(self.sensors):
             return positions, np.zeros_like(positions)
         return positions, errors[..., -self.nv :]
 
@@ -443,8 +443,10 @@ class Predictor:
         if self.sensors:
             out.append(self._sensor_errors(window, early, readings))
         if self.speeds:
+            begun = slice(self._started)
             row = jnp.arange(self._started)[:, None]
-            fast = vs[: self._started] - _between(window.read_speed, now + row)
+            fast = vs[begun] + self._misread_speed(model, window, qs[begun], vs[begun])
+            fast -= _between(window.read_speed, now + row)
             out.append(jnp.pad(fast, [(0, len(vs) - len(fast)), (0, 0)]))
         return jnp.concatenate(out, 1)
 
@@ -481,6 +483,19 @@ class Predictor:
         time = window.time + dt * jnp.arange(len(qs))
         of_row = partial(reading_offsets, e.own, e.laws)
         return jax.vmap(of_row)(qs, vs, sent, time)
+
+    def _misread_speed(
+        self, model: Model, window: Window, qs: jax.Array, vs: jax.Array
+    ) -> jax.Array:
+        """How fast `_misread` changes, ``(T, nv)``: velocities are read where positions
+        are."""
+        if not effects.has_own(model.effects, model.present):
+            return jnp.zeros_like(vs)
+        at, dof = self._scalar
+        along = jnp.zeros_like(qs).at[:, at].set(vs[:, dof])
+        return jax.jvp(lambda q: self._misread(model, window, q, vs), (qs,), (along,))[
+            1
+        ]
 
     def _true(
         self, model: Model, window: Window, qpos: jax.Array, qvel: jax.Array

@@ -88,7 +88,7 @@ def recorded(
 
 def with_speeds(
     m: mujoco.MjModel, fit: Sequence[Run], held: Sequence[Run], noise: np.ndarray
-) -> tuple[Sequence[Run], Sequence[Run], np.ndarray]:
+) -> tuple[Sequence[Run], Sequence[Run], np.ndarray, list[str]]:
     """Runs whose velocities are set right (`easi_jax.data.velocity_lag`), and the noise
     of what helps to find starts: of positions, and of velocities where all runs have
     them.
@@ -97,13 +97,14 @@ def with_speeds(
         noise: of positions and velocities, ``(2 nv,)``, or of positions, ``(nv,)``.
 
     Returns:
-        Runs to fit, held-out ones, and noise, ``(2 nv,)`` or ``(nv,)``.
+        Runs to fit, held-out ones, noise, ``(2 nv,)`` or ``(nv,)``, and notes.
     """
     nv, runs, dt = m.nv, [*fit, *held], fit[0].dt
     if len(noise) == nv or not all(run.qvel_measured for run in runs):
-        return fit, held, noise[:nv]
+        return fit, held, noise[:nv], []
     late, rows = of_model(m, dt), 2 * lead_rows(dt) + 1
     right = set_right(runs, tangent_names(m), late)
     noise = noise * np.append(np.ones(nv), right.noisier)
-    noise[nv:] = noise_in_starts(right.runs, noise, rows, late)
-    return right.runs[: len(fit)], right.runs[len(fit) :], noise
+    fit, held = right.runs[: len(fit)], right.runs[len(fit) :]
+    noise[nv:] = noise_in_starts(fit, noise, rows, late)
+    return fit, held, noise, right.notes

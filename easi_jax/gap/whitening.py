@@ -25,12 +25,12 @@ class Residuals:
     Attributes:
         groups: averages over rows, ``(K, T)``.
         scale: of each channel in the gap; infinite for one left out, ``(c,)``.
-        root: inverse root of each window's error covariance, ``(W, n, n)`` with
-            ``n = K nv``.
+        root: inverse root of each window's error covariance, ``(W, m, n)`` with
+            ``n = K c`` and m of them that hold a reading in some window.
         plain: errors in units of the gap, starts fitted anew, from whitened ones,
-            ``(W, n, n)``; the mean of their squares is the gap's, squared.
+            ``(W, n, m)``; the mean of their squares is the gap's, squared.
         floor: that mean as noise alone makes it, of each window, ``(W,)``.
-        live: which numbers hold a reading, ``(W, n)`` bool.
+        live: which numbers hold a reading, ``(W, m)`` bool.
     """
 
     groups: np.ndarray
@@ -41,16 +41,16 @@ class Residuals:
     live: np.ndarray
 
     def grouped(self, errors: np.ndarray) -> np.ndarray:
-        """Averages over groups of rows, ``(B, W, K, nv)``."""
+        """Averages over groups of rows, ``(B, W, K, c)``."""
         return np.einsum("kh,bwhc->bwkc", self.groups, errors, optimize=True)
 
     def gap(self, whitened: np.ndarray) -> float:
-        """The gap of whitened errors ``(W, n)``, starts fitted anew."""
+        """The gap of whitened errors ``(W, m)``, starts fitted anew."""
         plain = np.einsum("wij,wj->wi", self.plain, whitened)
         return float(np.sqrt((plain**2).mean()))
 
     def whitened(self, grouped: np.ndarray, at: np.ndarray | None = None) -> np.ndarray:
-        """Independent numbers of size one, ``(B, W, n)``; ``at``: which windows these
+        """Independent numbers of size one, ``(B, W, m)``; ``at``: which windows these
         are, all where not given."""
         b, w = grouped.shape[:2]
         flat = grouped.reshape(b, w, -1).astype(np.float64)
@@ -98,25 +98,26 @@ def make_residuals(
     keep &= (white > 0).any(0).reshape(-1)
     free = slope * starts.spread
     spread = (white + misfit**2).reshape(count, n)
-    root, plain = np.zeros((2, count, n, n))
+    kept = np.flatnonzero(keep)
+    root, plain = np.zeros((count, len(kept), n)), np.zeros((count, n, len(kept)))
     floor = np.zeros(count)
     unit = _unit(groups, lead, scale * np.sqrt(share))
     near = groups[:, starts.rows :].sum(1) == 0
     weight = np.where(near[:, None] & (white > 0), 1.0 / np.maximum(white, 1e-300), 0.0)
     weight = weight.reshape(count, n)
-    some = np.ix_(keep, keep)
+    some = np.ix_(kept, kept)
     for w in range(count):
         total = np.diag(spread[w]) + free[w] @ free[w].T
         total += np.eye(n) * 1e-14 * max(float(np.trace(total)) / n, 1e-20)
         lower = np.linalg.cholesky(total[some])
-        root[w][some] = np.linalg.inv(lower)
+        root[w][:, kept] = np.linalg.inv(lower)
         seen = free[w] * weight[w][:, None]
         normal = free[w].T @ seen + np.eye(size)
         refit = np.eye(n) - free[w] @ np.linalg.solve(normal, seen.T)
         refit = unit[:, None] * refit
-        plain[w][some] = refit[some] @ lower
+        plain[w][kept] = refit[some] @ lower
         floor[w] = ((refit**2) @ white[w].reshape(-1))[keep].sum() / n
-    live = keep & (white.reshape(count, n) > 0)
+    live = white.reshape(count, n)[:, kept] > 0
     return Residuals(groups, scale, root, plain, floor, live)
 
 

@@ -358,6 +358,14 @@ def test_error_of_the_true_model_is_the_noise_floor(simulator):
     better, _, less = quick.with_floor(jnp.asarray(simulator.space.nominal))
     np.testing.assert_allclose(better, less, rtol=0.1)
     assert less[0] < 0.95 * least[0]
+    # Held-out runs without velocities, and velocities that are given as exact.
+    for other in (
+        dataclasses.replace(faster, held=problem.held),
+        dataclasses.replace(faster, noise=faster.noise * np.array([1.0, 0.0])),
+    ):
+        alone, _ = ready_errors(other, simulator.space)
+        off, _, due = alone.with_floor(jnp.asarray(simulator.space.nominal))
+        assert 0.85 < off[0] / due[0] < 1.3, (off, due)
     second, _ = fitted.of(jnp.asarray(simulator.space.nominal))
     np.testing.assert_allclose(second, least, rtol=0.15)
     wrong, _, noise = held_out.with_floor(jnp.asarray([5.0]))

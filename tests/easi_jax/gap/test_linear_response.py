@@ -87,15 +87,16 @@ def test_faults_of_readings_and_limits_are_not_reckoned(
         assert not linear.covers(vector[None]).any(), field
 
 
-def test_windows_in_which_a_foot_begins_to_slip_are_left_out() -> None:
-    p, linear = _about(_ON_FLOOR, 0.1)
+@pytest.mark.parametrize("speeds", [False, True])
+def test_windows_in_which_a_foot_begins_to_slip_are_left_out(speeds: bool) -> None:
+    p, linear = _about(_ON_FLOOR, 0.1, speeds)
     assert 0.1 < linear.holds.mean() < 0.9
     (at,) = [i for i, c in enumerate(p.layout.columns) if c.field == "constant"][:1]
     vector = p.neutral.copy()
     vector[at] += 0.5 * p.layout.columns[at].size
     errors = p.errors(np.stack([p.neutral, vector])).astype(float)
-    true = (errors[1] - errors[0])[: linear.count]
-    found = linear.changes(vector[None])[0]
+    true, _ = p.motion((errors[1] - errors[0])[: linear.count])
+    found, _ = p.motion(linear.changes(vector[None])[0])
     off = np.sqrt(((found - true) ** 2).sum((1, 2)) / (true**2).sum((1, 2)))
     assert off[linear.holds].max() < 0.12 < np.median(off[~linear.holds])
 

@@ -1,0 +1,54 @@
+"""What is not probable, and what nobody would miss, is not named."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from easi_jax.gap import effect_search
+from easi_jax.gap.effect_search import EffectSearch
+
+
+class _Windows:
+    """Fits of sets of effects whose losses are given by what each is worth [nats]."""
+
+    def __init__(self, worth: dict[str, float], missed: set[str]) -> None:
+        self.worth, self.missed = worth, missed
+
+    def model(self, keys: list[str]) -> Any:
+        gone = sum(w for k, w in self.worth.items() if k not in keys)
+        loss = np.full(10, np.exp(2.0 * gone))
+        places = [SimpleNamespace(key=k) for k in keys]
+        return SimpleNamespace(places=places, loss=loss, fit=SimpleNamespace(x=keys))
+
+    def without(self, model: Any, gone: list[Any]) -> Any:
+        left = [p.key for p in model.places if p not in gone]
+        return self.model(left)
+
+    def misses(self, x: list[str], less: list[str]) -> bool:
+        return bool(set(x) - set(less) & self.missed)
+
+
+@pytest.mark.parametrize(
+    ("worth", "missed", "spared"),
+    [
+        ({"friction": 3.0, "gain": 0.2, "tilt": 0.1}, {"friction"}, ["tilt"]),
+        ({"friction": 3.0, "gain": 0.2}, {"friction", "gain"}, []),
+        ({"friction": 3.0, "gain": 2.0}, set(), []),
+        ({"friction": 3.0, "gain": 0.1, "tilt": 0.2}, {"gain"}, ["tilt"]),
+    ],
+    ids=["least first", "missed", "probable", "one of two"],
+)
+def test_what_is_neither_probable_nor_missed_is_spared(
+    worth: dict[str, float],
+    missed: set[str],
+    spared: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    at = _Windows(worth, missed)
+    monkeypatch.setattr(effect_search, "last", lambda model, place: model)
+    search: Any = SimpleNamespace(at=at)
+    model: Any = at.model(list(worth))
+    found = EffectSearch._spare(search, model, {key: [] for key in worth})
+    assert [p.key for p in found] == spared
