@@ -182,7 +182,7 @@ def _recorded(real: Any, trajectories: int, key: Any, truth: Any) -> Any:
 
 def _from_logs(model: Any, space: Any, demos: Any, dt: float, generations: int) -> Any:
     """What the library says of demonstrations ``(B, T, 1, ...)`` as logs; the last one
-    is held out."""
+    of half the length of the longest, at least, is held out."""
     import jax
     import numpy as np
 
@@ -213,7 +213,10 @@ def _from_logs(model: Any, space: Any, demos: Any, dt: float, generations: int) 
                 configuration=Configuration.of(model),
             )
         )
-    log, held = Log(tuple(runs[:-1]), ()), Log(tuple(runs[-1:]), ())
+    longest = max(map(len, runs))
+    kept = max(k for k, run in enumerate(runs) if 2 * len(run) >= longest)
+    log = Log((*runs[:kept], *runs[kept + 1 :]), ())
+    held = Log((runs[kept],), ())
     return estimate_parameters(
         model, space, log, held_out=held, generations=generations
     )

@@ -123,6 +123,7 @@ def least_squares(
     bounds: Bounds,
     weight: np.ndarray,
     rounds: int = _ROUNDS,
+    near: Fitted | None = None,
 ) -> Asks:
     """Steps of `easi_jax.estimation.least_squares` to a best fit, as a generator.
 
@@ -134,6 +135,7 @@ def least_squares(
         starts: vectors to start from, ``(S, n)``; the best is taken.
         chosen: entries to fit.
         rounds: at most.
+        near: a fit of fewer entries, whose slopes serve for the first step.
     """
     active = np.asarray(chosen, int)
     found = yield np.asarray(starts, np.float64)
@@ -143,12 +145,19 @@ def least_squares(
     size = bounds.size[active]
     slope = np.zeros((*residual.shape, len(active)))
     damping, fresh, measured = 1e-2, False, False
+    if near is not None and np.isfinite(cost):
+        old, new = np.isin(active, near.active), ~np.isin(active, near.active)
+        slope[..., old] = near.slope[..., np.isin(near.active, active)]
+        if new.any():
+            moved, step = difference(x, active[new], bounds)
+            got = yield moved
+            slope[..., new] = _between(residual, got, step)
+        slope, fresh = slope * size, True
     for _ in range(rounds if len(active) and np.isfinite(cost) else 0):
         if not fresh:
             moved, step = difference(x, active, bounds)
             got = yield moved
-            slope = np.moveaxis((got - residual) / step[:, None, None], 0, -1)
-            slope = np.where(np.isfinite(slope), slope, 0.0) * size  # per size
+            slope = _between(residual, got, step) * size  # per size
             measured = True
         gain = 0.0
         # One step is enough nearly always; more damped ones are tried together.
@@ -173,6 +182,13 @@ def least_squares(
         # Slopes are measured anew where following them no longer pays.
         fresh, measured = not is_settled(gain, before, 0.0, _PAYS), False
     return Fitted(x, active, residual, slope / size, float(cost))
+
+
+def _between(residual: np.ndarray, others: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Slopes ``(W, m, a)`` to residuals ``(a, W, m)`` steps ``(a,)`` away; zero where
+    they are not finite."""
+    slope = np.moveaxis((others - residual) / step[:, None, None], 0, -1)
+    return np.where(np.isfinite(slope), slope, 0.0)
 
 
 def _steps(

@@ -79,8 +79,8 @@ class Decisions:
     """Effects. The largest of the contract's machines has five."""
 
     probable: float = 0.5
-    """Confidence of an effect, below which it is not named where no error is beyond
-    `open_from` without it. Of 15 effects below that in the 27 cases of
+    """Confidence of an effect, below which it is not named where nothing is open
+    without it. Of 15 effects below that in the 27 cases of
     `benchmarks.gap_confidence` none was right."""
 
     # -- which of several names ------------------------------------------------

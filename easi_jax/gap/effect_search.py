@@ -249,7 +249,7 @@ class EffectSearch:
         others = self.offered.candidates(model.places)
         others = [c for c in others if c.place.key != place.key]
         short = shortlist(screened(chosen, without, others))
-        out = chosen.fitted(without.places, without.fit.x, short)
+        out = chosen.fitted(without.places, without.fit, short)
         return sorted(out, key=lambda m: m.loss.mean())
 
     def exchanged(self, model: Model) -> tuple[Model, dict[str, list[Model]]]:
@@ -316,8 +316,8 @@ class EffectSearch:
     def _spare(
         self, model: Model, rivals: Mapping[str, Sequence[Model]]
     ) -> list[Place]:
-        """The effect that is missed least, where nothing is left beyond what counts as
-        open without it and its name is not even probable; none else."""
+        """The effect that is missed least, where nothing is open without it and its
+        name is not even probable; none else."""
         without = {p.key: self.at.without(model, [p]) for p in model.places}
         costs = {key: cost(model, less) for key, less in without.items()}
         for place in sorted(model.places, key=lambda p: costs[p.key]):

@@ -166,10 +166,9 @@ class Fitting:
         return float(np.nanmax(self._beside_floor(x, x).low)) <= DECIDE.closed
 
     def misses(self, x: np.ndarray, less: np.ndarray) -> bool:
-        """Whether anything is beyond `easi_jax.gap.decisions.Decisions.open_from` of
-        the floor at ``x``, whitened there, under a vector ``less`` with starts of its
-        own."""
-        return float(np.nanmax(self._beside_floor(x, less).ratio)) > DECIDE.open_from
+        """Whether anything is open beside the floor at ``x``, whitened there, under a
+        vector ``less`` with starts of its own."""
+        return bool(self._beside_floor(x, less).is_open.any())
 
     def _beside_floor(self, x: np.ndarray, other: np.ndarray) -> Openness:
         """Errors of a vector beside the floor at ``x``, whitened there."""

@@ -242,16 +242,17 @@ class Selector:
     # -- stages ----------------------------------------------------------------
 
     def fitted(
-        self, places: list[Place], x: np.ndarray, chosen: Sequence[Candidate]
+        self, places: list[Place], base: Fitted, chosen: Sequence[Candidate]
     ) -> list[Model]:
         """Each candidate beside ``places``, the best of its starts, by name; but what
-        no machine can have."""
+        no machine can have. ``base``: a fit of these places, or of more."""
         problems = [
             least_squares(
-                np.array([self.started(x, c), *([c.ends] if c.ends else [])]),
+                np.array([self.started(base.x, c), *([c.ends] if c.ends else [])]),
                 self.active([*places, c.place]),
                 self.bounds,
                 self.weight,
+                near=base,
             )
             for c in chosen
         ]
@@ -271,7 +272,7 @@ class Selector:
             if not more:
                 continue
             kept = [p for p in model.places if p is not place]
-            found = self.fitted(kept, model.fit.x, more)
+            found = self.fitted(kept, model.fit, more)
             if not found:
                 continue
             best = min(found, key=lambda m: m.loss.mean())

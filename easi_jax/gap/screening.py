@@ -223,7 +223,7 @@ def expanded(
     """A model with one effect more, the most promising ones, best first; and the
     names of all by what they promise."""
     tried = screened(selector, base, candidates)
-    models = selector.fitted(base.places, base.fit.x, shortlist(tried))
+    models = selector.fitted(base.places, base.fit, shortlist(tried))
     names = dict.fromkeys(c.place.key for _, c in tried)
     return sorted(models, key=rank), [*names]
 
