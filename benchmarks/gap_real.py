@@ -74,6 +74,17 @@ MACHINES = {
         0.2,
         ("coulomb_friction|stribeck_friction", "actuator_gain|payload_mass|armature"),
     ),
+    # In a stand; its public users report armature and friction of the calves.
+    "go2_in_air": Simulator(
+        "go2_in_air",
+        ("chirp.csv",),
+        (),
+        0.2,
+        (
+            "armature@*_calf_joint",
+            "coulomb_friction@*_calf_joint|stribeck_friction@*_calf_joint",
+        ),
+    ),
     "pendulum_1kg": Simulator(
         "dfki_pendulum", ("energy_1kg.csv",), (), 0.2, ("payload_mass",)
     ),
