@@ -101,6 +101,8 @@ class Config:
     """Which of them."""
     out: Path = Path("results/gap_real")
     """Folder of the runs."""
+    engine: str = "auto"
+    """Which engine simulates: auto, mjx or mujoco."""
 
 
 def check(names: Iterable[str], known: Mapping[str, Simulator], data: Path) -> None:

@@ -17,6 +17,7 @@ from easi_jax.gap.effect_set import Candidate, Model
 from easi_jax.gap.forward_selection import Selector
 from easi_jax.gap.linear_response import LinearResponse
 from easi_jax.gap.model_comparison import contains, rank
+from easi_jax.gap.table import Place
 from easi_jax.io.runs.step_cache import Arrays
 
 _SHORTLIST = 7  # names that are fitted in full at each stage
@@ -229,16 +230,23 @@ def expanded(
 
 
 def shortlist(screened: Sequence[tuple[float, Candidate]]) -> list[Candidate]:
-    """The most promising names with the best starts of each, and the special cases of
-    those names, which promise less but ask for less."""
+    """The most promising names with the best starts of each; and the special cases of
+    those names, and what like places have alike, which promise less but ask for less.
+    """
     chosen = _promising(screened)
     general = [mine[0].place for mine in chosen.values()]
     for _, c in screened:
-        if any(contains(g, c.place) for g in general):
+        if any(contains(g, c.place) or _is_one_of(g, c.place) for g in general):
             mine = chosen.setdefault(c.place.key, [])
             if c not in mine and len(mine) < _STARTS:
                 mine.append(c)
     return [c for mine in chosen.values() for c in mine]
+
+
+def _is_one_of(single: Place, alike: Place) -> bool:
+    """Whether an effect is at one of the places that have it alike."""
+    same = (single.effect, single.kind) == (alike.effect, alike.kind)
+    return same and single.at in alike.tied
 
 
 def _promising(
