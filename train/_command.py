@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn, Protocol, TypeVar
 
 from train import _interrupt
-from train._options import EngineOptions, OwnEffectsOptions
+from train._options import OwnEffectsOptions
 
 _Config = TypeVar("_Config")
 
@@ -131,8 +131,9 @@ def _about(config: Any) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _engine(config: Any) -> Iterator[None]:
-    """Simulators made inside are of the engine that a command was told to take."""
-    if not isinstance(config, EngineOptions):
+    """Simulators made inside are of the engine that a command, or a benchmark, was told
+    to take."""
+    if not hasattr(config, "engine"):
         yield
         return
     from easi_jax.errors import EngineError, UserError

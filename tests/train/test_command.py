@@ -366,3 +366,24 @@ def test_a_reader_that_leaves_early_is_no_error():
         command, shell=True, capture_output=True, text=True, timeout=120, cwd=ROOT
     )
     assert done.stdout.startswith("usage:") and done.stderr == ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulating:
+    """Simulates."""
+
+    engine: Literal["auto", "mjx", "mujoco"] = "auto"
+    """What simulates."""
+
+
+@pytest.mark.parametrize("name", ["auto", "mjx", "mujoco"])
+def test_whatever_has_an_engine_option_runs_on_that_engine(name: str) -> None:
+    """Benchmarks, too, that call commands as functions."""
+    from easi_jax.simulation import engine
+
+    seen: list[str] = []
+    words = "--engine", name
+    main(
+        Simulating, lambda _: seen.append(engine._stack[-1].name), name="t", args=words
+    )
+    assert seen == [name]
