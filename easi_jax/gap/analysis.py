@@ -331,7 +331,7 @@ class Analysis:
             if not stuck:
                 break
             base = self._undone(base, stuck)
-            model = search.select(base)
+            model = search.select(search.beside(base, model))
         if model.places:
             base, model = search.at.again(base), search.at.again(model)
         model, rivals, notes = search.needful(model, self.step)

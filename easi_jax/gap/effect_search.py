@@ -143,7 +143,7 @@ class EffectSearch:
 
     def select(self, start: Model) -> Model:
         """A model of `at`'s windows with the effects that windows of any length show;
-        ``start`` is one of the windows that decide.
+        ``start`` is one of the windows that decide, with or without effects.
 
         Shorter windows come first where the model does not follow longer ones at all:
         what it does there is not linear in what it lacks. Longer ones are asked for
@@ -152,6 +152,7 @@ class EffectSearch:
         self.at, found = self.lengths[self.settles], start
         fitted_to = self.at
         homes: dict[str, Fitting] = {}
+        spared: set[str] = set()  # shown by windows of other lengths
         for k, length in enumerate(self.lengths):
             if k < self.settles and self.at.gap < _LOST:
                 continue
@@ -164,7 +165,8 @@ class EffectSearch:
             seconds = (length.steps - length.data.lead) * length.data.dt
             self.tell(f"windows of {seconds:.3g} s:")
             found = found if length is fitted_to else length.again(found)
-            found, fitted_to = self._added(length, found, known), length
+            found = self._added(length, found, spared)
+            fitted_to, spared = length, {p.key for p in found.places}
             new = {p.key for p in found.places} - known
             homes |= dict.fromkeys(new, length)
             if new and k > self.settles:
@@ -172,6 +174,20 @@ class EffectSearch:
         if fitted_to is not self.at:
             found = self.at.again(found)
         return self._needed_anywhere(found, homes)
+
+    def beside(self, base: Model, model: Model) -> Model:
+        """The effects of a model that ``base`` needs, in the windows that decide; both
+        have the model's own parameters of ``base``."""
+        at = self.lengths[self.settles]
+        if not model.places:
+            return base
+        x, found = base.fit.x.copy(), at.vector(self.at.plain(model.fit.x))
+        for place in model.places:
+            columns = at.selector.columns(place, fitted=False)
+            x[columns] = found[columns]
+        at.whiten(x)
+        kept = at.weighed(at.selector.fit(model.places, x))
+        return at.selector.needed(kept)
 
     def _needed_anywhere(self, found: Model, homes: Mapping[str, Fitting]) -> Model:
         """The model less what neither its windows nor those that found it need."""
