@@ -18,7 +18,7 @@ from scipy.signal import lfilter
 
 from easi_jax.data.cleaning import rows_of, trusted_velocities
 from easi_jax.data.recording import Run, physics_steps
-from easi_jax.data.windows import fitted_velocity
+from easi_jax.data.windows import fitted_velocity, start_rows
 
 _LONGEST = 0.1  # s, of a delay or a time constant
 _GRID = 40  # of them that are looked at, before the best is refined
@@ -201,14 +201,17 @@ class _Found:
 
 
 def noise_in_starts(
-    runs: Sequence[Run], noise: np.ndarray, rows: int, simulated: float
+    m: mujoco.MjModel, runs: Sequence[Run], noise: np.ndarray
 ) -> np.ndarray:
-    """Noise ``(nv,)`` of measured velocities [m/s, rad/s], as large as lets ``rows``
-    rows of a start say no more than they know: all of them share `error_of_means`.
+    """Noise ``(nv,)`` of measured velocities [m/s, rad/s], as large as lets the rows of
+    a start say no more than they know: all of them share `error_of_means`.
 
-    Arguments are those of `error_of_means`.
+    Args:
+        noise: of positions, then of velocities, ``(2 nv,)``.
     """
-    off = error_of_means(runs, noise, rows, simulated)
+    dt = runs[0].dt
+    rows = start_rows(dt)
+    off = error_of_means(runs, noise, rows, of_model(m, dt))
     return np.hypot(noise[len(off) :], math.sqrt(rows) * off)
 
 

@@ -82,6 +82,11 @@ def lead_rows(dt: float) -> int:
     return max(_START_ROWS, round(_START_SECONDS / dt))
 
 
+def start_rows(dt: float) -> int:
+    """Rows that a start is fitted to: `lead_rows` on either side, and its own."""
+    return 2 * lead_rows(dt) + 1
+
+
 def window_steps(dt: float, horizon_s: float) -> int:
     """Control steps of a horizon: to the nearest, at least `MIN_STEPS`, and more than
     follow a start that its state is fitted to."""

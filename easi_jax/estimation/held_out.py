@@ -14,8 +14,8 @@ from easi_jax.data import unmeasured
 from easi_jax.data.noise import finest, resolutions
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import to_device
-from easi_jax.data.velocity_lag import noise_in_starts, of_model
-from easi_jax.data.windows import lead_rows
+from easi_jax.data.velocity_lag import noise_in_starts
+from easi_jax.data.windows import lead_rows, start_rows
 from easi_jax.devices.mesh import placed
 from easi_jax.devices.runtime import quick_compile
 from easi_jax.estimation.from_runs import spread_of_starts
@@ -61,12 +61,14 @@ class WindowErrors:
         given = simulator, runs, self.lead + problem.steps, every
         none = np.zeros(nv, bool)
         seen = problem.measured if all(run.qvel_measured for run in runs) else none
-        cuts = [segments_from_runs(*given, trusted) for trusted in (seen, none)]
+        cuts = [segments_from_runs(*given, none)] * 2
+        if seen.any():
+            cuts[0] = segments_from_runs(*given, seen)
         read, fitted = (c.spread(most) if c.count > most else c for c in cuts)
         # Starts are by the positions alone, before velocities help to find them.
         windows = to_device(replace(read, qvel=fitted.qvel))
         faster = jnp.asarray(fitted.qvel - read.qvel)
-        begun = np.arange(self.lead + problem.steps + 1) < 2 * self.lead + 1
+        begun = np.arange(self.lead + problem.steps + 1) < start_rows(simulator.dt)
         largest = jnp.abs(open_loop.motion(simulator, windows)[..., :nv])
         self.largest = jnp.asarray(np.asarray(largest).max((0, 1)))
 
@@ -131,25 +133,24 @@ def _starts_of(
     """Of windows of the runs ``used`` that begin `lead_rows` before they are measured
     from; velocities that are ``seen (nv,)`` help to find them."""
     m, runs = problem.simulator.mj_model, [*problem.fit, *problem.held]
-    dt = runs[0].dt
     moved = [r.configuration.difference(r.qpos[:1], r.qpos) for r in runs]
     size = np.maximum(np.concatenate(moved).std(0), 1e-9)
     given = jnp.asarray(problem.noise), np.zeros(m.nv, bool)
     wide = np.asarray(spread_of_starts(m, runs, *given))
-    noise = problem.noise[: m.nv]
+    noise, motion = problem.noise[: m.nv], size
     if seen.any():
-        rows, late = 2 * lead_rows(dt) + 1, of_model(m, dt)
-        fast = noise_in_starts(used, problem.noise, rows, late)
+        fast = noise_in_starts(m, used, problem.noise)
         noise = np.append(noise, np.where(seen, fast, np.inf))
-    speed = np.concatenate([run.qvel for run in used]).std(0)
+        speed = np.concatenate([run.qvel for run in used]).std(0)
+        motion = np.append(motion, np.maximum(speed, 1e-9))
     return starts_about(
         simulate,
-        known_noise(noise, np.append(size, np.maximum(speed, 1e-9))[: len(noise)]),
+        known_noise(noise, motion),
         size,
         np.maximum(wide[m.nv : 2 * m.nv], 1e-9),
         unmeasured.start_spread(m, runs, np.isinf(problem.noise[: m.nv])),
         np.maximum(wide[2 * m.nv :], 1e-9),
-        dt,
+        runs[0].dt,
         start_parts(m),
         speeds=bool(seen.any()),
     )

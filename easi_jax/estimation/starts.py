@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from easi_jax.data.windows import lead_rows, slope_noise
+from easi_jax.data.windows import slope_noise, start_rows
 from easi_jax.estimation.prediction_error import believed
 from easi_jax.model.separate_trees import turns
 
@@ -346,7 +346,7 @@ def starts_about(
         simulate,
         noise,
         np.concatenate([spread, act]),
-        2 * lead_rows(dt) + 1,
+        start_rows(dt),
         np.concatenate([step, part * act]),
         np.concatenate([np.where(np.isfinite(free), free, by_rows), act]),
         parts if len(noise) == nv * (1 + speeds) else None,

@@ -146,7 +146,8 @@ def least_squares(
     slope = np.zeros((*residual.shape, len(active)))
     damping, fresh, measured = 1e-2, False, False
     if near is not None and np.isfinite(cost):
-        old, new = np.isin(active, near.active), ~np.isin(active, near.active)
+        old = np.isin(active, near.active)
+        new = ~old
         slope[..., old] = near.slope[..., np.isin(near.active, active)]
         if new.any():
             moved, step = difference(x, active[new], bounds)

@@ -55,8 +55,8 @@ def error_of_steps(
             speeds.append(qvel)
     out = np.array([x[1] - x[0] for x in (paths, speeds)])
     out = np.pad(out, [(0, 0), (0, 0), (1, 0), (0, 0)])
-    fine = np.isfinite(out).all((0, 2, 3), keepdims=True)
-    positions, fast = np.where(fine, out, 0.0)
+    finite = np.isfinite(out).all((0, 2, 3), keepdims=True)
+    positions, fast = np.where(finite, out, 0.0)
     return positions, fast
 
 

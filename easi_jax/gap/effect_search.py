@@ -176,8 +176,8 @@ class EffectSearch:
         return self._needed_anywhere(found, homes)
 
     def beside(self, base: Model, model: Model) -> Model:
-        """The effects of a model that ``base`` needs, in the windows that decide; both
-        have the model's own parameters of ``base``."""
+        """``base`` with those effects of ``model`` that it needs, in the windows that
+        decide."""
         at = self.lengths[self.settles]
         if not model.places:
             return base

@@ -163,20 +163,20 @@ class Fitting:
 
     def closed(self, x: np.ndarray) -> bool:
         """Whether nothing is left to explain, whitened at ``x``."""
-        return float(np.nanmax(self._beside_floor(x, x).low)) <= DECIDE.closed
+        errors = self.selector.errors(x[None])[0]
+        return float(np.nanmax(self._beside_floor(x, errors).low)) <= DECIDE.closed
 
     def misses(self, x: np.ndarray, less: np.ndarray) -> bool:
         """Whether anything is open beside the floor at ``x``, whitened there, under a
         vector ``less`` with starts of its own."""
-        return bool(self._beside_floor(x, less).is_open.any())
+        (moved,), _ = self.starts.fit(less[None], self.moved[None])
+        errors = self.selector.errors(less[None], None, moved)[0]
+        return bool(self._beside_floor(x, errors).is_open.any())
 
-    def _beside_floor(self, x: np.ndarray, other: np.ndarray) -> Openness:
-        """Errors of a vector beside the floor at ``x``, whitened there."""
+    def _beside_floor(self, x: np.ndarray, errors: np.ndarray) -> Openness:
+        """Errors ``(W, T, c)`` beside the floor at ``x``, whitened there."""
         rng, after, moved = np.random.default_rng(1), self.data.lead + 1, self.moved
         noise = floor(self.starts, x, moved, _DRAWS, self.data.resolution, rng)
-        if other is not x:
-            moved = self.starts.fit(other[None], moved[None])[0][0]
-        errors = self.selector.errors(other[None], None, moved)[0]
         square = measure.squares(self.starts.counted(errors, after))
         due = self.starts.mean_square(noise, after)
         return openness(square, due, self.channels.scale)

@@ -20,7 +20,7 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
-from easi_jax.data.windows import lead_rows
+from easi_jax.data.windows import start_rows
 from easi_jax.devices.distributed import started
 from easi_jax.devices.mesh import make_mesh, sharded_map
 from easi_jax.devices.runtime import fast_loops, on_cpu, quick_compile
@@ -185,7 +185,7 @@ class Predictor:
         for j in range(m.njnt):
             self.wrapped[dofs(m, j)] = turns_fully(m, j)
         self.channels = nv + len(self.sensors) + nv * speeds
-        self._started = 2 * lead_rows(dt) + 1  # rows that a start is fitted to
+        self._started = start_rows(dt)
         self._scalar = scalar_places(m).T
         self.mesh = make_mesh()
         native = self.simulator.engine == "mujoco"
@@ -278,9 +278,14 @@ class Predictor:
         """Of errors ``(..., channels)`` those of positions, and those of velocities,
         ``(..., nv)``; zero where they are not compared."""
         positions = errors[..., : self.nv]
-        if self.channels <= self.nv + len(self.sensors):
-            return positions, np.zeros_like(positions)
-        return positions, errors[..., -self.nv :]
+        if self.compares_speeds:
+            return positions, errors[..., -self.nv :]
+        return positions, np.zeros_like(positions)
+
+    @property
+    def compares_speeds(self) -> bool:
+        """Whether velocities are among `channels`."""
+        return self.channels > self.nv + len(self.sensors)
 
     def whole(self, positions: np.ndarray, speeds: np.ndarray) -> np.ndarray:
         """Differences of predictions ``(..., T, nv)``, those of sensors unknown and so
@@ -493,9 +498,11 @@ class Predictor:
             return jnp.zeros_like(vs)
         at, dof = self._scalar
         along = jnp.zeros_like(qs).at[:, at].set(vs[:, dof])
-        return jax.jvp(lambda q: self._misread(model, window, q, vs), (qs,), (along,))[
-            1
-        ]
+
+        def off(q: jax.Array) -> jax.Array:
+            return self._misread(model, window, q, vs)
+
+        return jax.jvp(off, (qs,), (along,))[1]
 
     def _true(
         self, model: Model, window: Window, qpos: jax.Array, qvel: jax.Array

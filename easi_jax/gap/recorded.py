@@ -10,7 +10,6 @@ from easi_jax.data.noise import finest, pooled, resolutions
 from easi_jax.data.recording import Run
 from easi_jax.data.sensor_channels import Sensors
 from easi_jax.data.velocity_lag import noise_in_starts, of_model, set_right
-from easi_jax.data.windows import lead_rows
 from easi_jax.estimation.starts import known_noise
 from easi_jax.gap.batched_least_squares import Bounds
 from easi_jax.model.effect_catalog import Scales
@@ -102,9 +101,8 @@ def with_speeds(
     nv, runs, dt = m.nv, [*fit, *held], fit[0].dt
     if len(noise) == nv or not all(run.qvel_measured for run in runs):
         return fit, held, noise[:nv], []
-    late, rows = of_model(m, dt), 2 * lead_rows(dt) + 1
-    right = set_right(runs, tangent_names(m), late)
+    right = set_right(runs, tangent_names(m), of_model(m, dt))
     noise = noise * np.append(np.ones(nv), right.noisier)
     fit, held = right.runs[: len(fit)], right.runs[len(fit) :]
-    noise[nv:] = noise_in_starts(fit, noise, rows, late)
+    noise[nv:] = noise_in_starts(m, fit, noise)
     return fit, held, noise, right.notes

@@ -56,5 +56,5 @@ def window_starts(
         runs[0].dt,
         start_parts(m),
         None if read.all() else read[at, :rows],
-        predictor.speeds and predictor.channels > m.nv,
+        predictor.compares_speeds,
     )
