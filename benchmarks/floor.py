@@ -20,7 +20,7 @@ import json
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -31,6 +31,7 @@ from benchmarks._page import Section, met, table
 from benchmarks.coverage_summary import judged
 from benchmarks.gap_score import keys_of, wilson
 from train._command import main
+from train._options import EngineOptions
 
 RATES = (50, 100, 250, 500, 1000)  # Hz
 SPEEDS = {"slow": 1.0, "fast": 3.0}  # of commands
@@ -71,15 +72,15 @@ class Case:
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(Share):
+class Config(Share, EngineOptions):
     """Asks train.gap about machines whose model is right, or lacks one effect."""
 
     hidden: bool = False
     """Whether the machines have an effect that the model lacks."""
     seeds: int = 1
     """Of each machine, rate, speed and reading."""
-    engine: str = "mujoco"
-    """Which engine simulates: auto, mjx or mujoco."""
+    engine: Literal["auto", "mjx", "mujoco"] = "mujoco"
+    """Native MuJoCo, since every machine would be compiled anew."""
     out: Path = RESULTS / "floor.jsonl"
     """Where a line for each case is added."""
 

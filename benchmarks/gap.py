@@ -16,13 +16,14 @@ from typing import Any
 
 from benchmarks.gap_score import keys_of
 from train._command import main, say
+from train._options import EngineOptions
 
 RESULTS = Path(__file__).parent / "results"
 LARGE = ("arm3", "leg", "arm3", "leg", "arm6")  # in turns
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(EngineOptions):
     """Runs train.gap on generated cases and grades its names."""
 
     kind: str = "single"
@@ -38,8 +39,6 @@ class Config:
     """The hidden effect, drawn where not given; give --out gap_contacts.jsonl or so."""
     mechanism: str = ""
     """The machine, drawn where not given."""
-    engine: str = "auto"
-    """Which engine simulates: auto, mjx or mujoco."""
     out: Path = RESULTS / "gap_cases.jsonl"
     """Where a line for each case is added."""
 

@@ -14,6 +14,7 @@ from typing import Any
 from benchmarks.gap_real import MACHINES, Simulator, analysed, check
 from benchmarks.gap_score import keys_of
 from train._command import main, say, show_table
+from train._options import EngineOptions
 
 DOUBLE = Simulator(
     "dfki_double_pendulum",
@@ -32,7 +33,7 @@ MADE = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(EngineOptions):
     """Asks train.gap about the same recordings at several horizons."""
 
     data: Path = Path("../shared/data")
@@ -41,8 +42,6 @@ class Config:
     """Which of them."""
     horizons: tuple[float, ...] = (0.2, 0.05, 0.5, 1.0)
     """Of the report [s]."""
-    engine: str = "auto"
-    """Which engine simulates: auto, mjx or mujoco."""
 
 
 def run(config: Config) -> None:

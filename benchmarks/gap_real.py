@@ -14,6 +14,7 @@ from typing import Any
 
 from benchmarks.gap_score import is_among, keys_of
 from train._command import main, say, show_table
+from train._options import EngineOptions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +93,7 @@ MACHINES = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(EngineOptions):
     """Runs train.gap on recordings of real machines."""
 
     data: Path = Path("../shared/data")
@@ -101,8 +102,6 @@ class Config:
     """Which of them."""
     out: Path = Path("results/gap_real")
     """Folder of the runs."""
-    engine: str = "auto"
-    """Which engine simulates: auto, mjx or mujoco."""
 
 
 def check(names: Iterable[str], known: Mapping[str, Simulator], data: Path) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn, Protocol, TypeVar
 
 from train import _interrupt
-from train._options import OwnEffectsOptions
+from train._options import EngineOptions, OwnEffectsOptions
 
 _Config = TypeVar("_Config")
 
@@ -133,7 +133,7 @@ def _about(config: Any) -> Iterator[None]:
 def _engine(config: Any) -> Iterator[None]:
     """Simulators made inside are of the engine that a command, or a benchmark, was told
     to take."""
-    if not hasattr(config, "engine"):
+    if not isinstance(config, EngineOptions):
         yield
         return
     from easi_jax.errors import EngineError, UserError

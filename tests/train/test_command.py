@@ -17,6 +17,7 @@ import pytest
 from easi_jax.errors import UserError
 from train import _command
 from train._command import Meter, duration, main, progress, show_table
+from train._options import EngineOptions
 
 ROOT = Path(__file__).parents[2]
 
@@ -368,22 +369,15 @@ def test_a_reader_that_leaves_early_is_no_error():
     assert done.stdout.startswith("usage:") and done.stderr == ""
 
 
-@dataclasses.dataclass(frozen=True)
-class Simulating:
-    """Simulates."""
-
-    engine: Literal["auto", "mjx", "mujoco"] = "auto"
-    """What simulates."""
-
-
 @pytest.mark.parametrize("name", ["auto", "mjx", "mujoco"])
-def test_whatever_has_an_engine_option_runs_on_that_engine(name: str) -> None:
+def test_what_takes_engine_options_runs_on_that_engine(name: str) -> None:
     """Benchmarks, too, that call commands as functions."""
     from easi_jax.simulation import engine
 
     seen: list[str] = []
-    words = "--engine", name
-    main(
-        Simulating, lambda _: seen.append(engine._stack[-1].name), name="t", args=words
-    )
+
+    def run(_: EngineOptions) -> None:
+        seen.append(engine._stack[-1].name)
+
+    main(EngineOptions, run, name="t", args=("--engine", name))
     assert seen == [name]
