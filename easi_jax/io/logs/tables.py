@@ -181,7 +181,7 @@ def _csv_text(columns: Mapping[str, np.ndarray], digits: int | None) -> str:
 def _read_csv(path: Path) -> tuple[dict[str, list[str]], tuple[str, ...]]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            text = file.read()
+            text = _without_comments(file.read())
         lines = csv.reader(io.StringIO(text, newline=""), delimiter=_delimiter(text))
         rows = [row for row in lines if row]
     except UnicodeDecodeError:
@@ -284,6 +284,21 @@ def _parquet_column(column: pyarrow.ChunkedArray) -> np.ndarray | str:
     elif not (types.is_integer(kind) or types.is_floating(kind)):
         return f"values of type {kind}"
     return column.cast(pyarrow.float64(), safe=False).to_numpy()
+
+
+def _without_comments(text: str) -> str:
+    """``text`` from its header on: lines that begin with ``#`` may come before it. The
+    last of these is the header where as many numbers follow, as NumPy writes it."""
+    last, rest = "", text
+    while rest.startswith("#"):
+        last, _, rest = rest.partition("\n")
+    named = last.lstrip("#").strip()
+    delimiter = _delimiter(named)
+    first = rest.partition("\n")[0].split(delimiter)
+    alike = len(first) == len(named.split(delimiter))
+    if alike and all(map(_is_number, first)):
+        return f"{named}\n{rest}"
+    return rest
 
 
 def _delimiter(text: str) -> str:

@@ -956,6 +956,22 @@ def test_decimal_commas(tmp_path, cart):
     assert 'separate columns by ";"' in failure(path, cart)
 
 
+def test_comments_before_the_header(tmp_path, cart):
+    """As people write them, and as ``np.savetxt(header=...)`` does."""
+    plain = save(tmp_path / "plain.csv", cart_columns())
+    (expected,) = read_logs(plain, cart).runs
+    path, text = tmp_path / "a.csv", plain.read_text()
+    for begins in ("# of Monday, with a new belt\n#\n", "# ", "# rig 2\n# "):
+        path.write_text(begins + text)
+        (run,) = read_logs(path, cart).runs
+        np.testing.assert_array_equal(run.qpos, expected.qpos)
+        np.testing.assert_array_equal(run.ctrl, expected.ctrl)
+    path.write_text("# of Monday\n")
+    assert "is empty" in failure(path, cart)
+    path.write_text("# of Monday\n" + text.partition("\n")[2])
+    assert "the first row must name the columns" in failure(path, cart)
+
+
 @pytest.mark.parametrize("name", ["", "index", "Unnamed: 0"])
 def test_index_columns_are_told(tmp_path, cart, name):
     columns = {name: np.arange(ROWS), **cart_columns()}
