@@ -47,7 +47,9 @@ class Starts:
             where nothing was measured.
         spread: how far starts may be from offsets of zero, ``(s,)``, so wide that the
             rows of the window decide.
-        known: how far they are by the noise of the rows alone, ``(s,)``.
+        known: how far they are by the noise of the rows, and what a local polynomial
+            errs by, ``(s,)``.
+        scatter: how far by that noise alone, ``(s,)``.
         rows: so many first rows of a window decide on its start.
         step: sizes of differences, ``(s,)``.
         read: which readings there are, 1 or 0, ``(W, T, c)``; ``simulate`` returns zero
@@ -66,6 +68,7 @@ class Starts:
     rows: int
     step: np.ndarray
     known: np.ndarray
+    scatter: np.ndarray
     parts: np.ndarray | None = None
     read: np.ndarray | None = None
     alone: int = 0
@@ -341,14 +344,20 @@ def starts_about(
     near = np.maximum(small * position, 3.0 * known)
     near = np.concatenate([near, part * speed])
     step = np.where(np.isfinite(free), part * spread, near)
-    by_rows = np.concatenate([known, _CURVED * slope_noise(dt) * known])
+    by_rows = np.concatenate([known, slope_noise(dt) * known])
+    curved = np.repeat([1.0, _CURVED], nv)
+    by_noise, wider = (
+        np.concatenate([np.where(np.isfinite(free), free, x), act])
+        for x in (by_rows, curved * by_rows)
+    )
     return Starts(
         simulate,
         noise,
         np.concatenate([spread, act]),
         start_rows(dt),
         np.concatenate([step, part * act]),
-        np.concatenate([np.where(np.isfinite(free), free, by_rows), act]),
+        wider,
+        by_noise,
         parts if len(noise) == nv * (1 + speeds) else None,
         read,
         nv * speeds,

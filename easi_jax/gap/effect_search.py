@@ -25,6 +25,7 @@ from easi_jax.gap.model_comparison import (
     probability,
     rank,
     simplest,
+    unlike,
 )
 from easi_jax.gap.screening import expanded, screened, shortlist
 from easi_jax.gap.table import Place, covered, does
@@ -37,7 +38,9 @@ RIVALS = 8  # names in the place of another that are followed up
 _STAGES = 8  # of adding one and taking out what has become needless
 _RIPPLES = [0.75 * k for k in range(3, 27)]  # cycles over the range of a joint
 _BEAM = 3  # sets of effects that are followed
-_LIKELY = 60  # of a larger robot's names, that are tried beside all but the first
+# Names that promised most, of a larger robot, that are tried beside all sets of effects
+# but the first, and as rivals (benchmarks.gap_times).
+_LIKELY = 60
 _LOST = 0.25  # of the motion: errors of a model that does not follow it
 
 Tell = Callable[[str], None]
@@ -140,6 +143,7 @@ class EffectSearch:
         self.lengths, self.settles, self.offered = lengths, settles, offered
         self.tell = tell
         self.at = lengths[settles]
+        self._likely: set[str] = set()  # names that promised most, at any stage
 
     def select(self, start: Model) -> Model:
         """A model of `at`'s windows with the effects that windows of any length show;
@@ -233,6 +237,7 @@ class EffectSearch:
                 ]
                 models, names = expanded(chosen, parent, more)
                 likely = likely or {*names[:most], *(p.key for p in model.places)}
+                self._likely |= likely
                 for m in models:
                     key = keys(m)
                     if key not in found or m.loss.mean() < found[key].loss.mean():
@@ -245,7 +250,7 @@ class EffectSearch:
                 break
             best = simplest(good, model)
             self.tell(f"+ {' + '.join(p.key for p in best.places)}")
-            beam = [best, *[m for m in good if m is not best][: _BEAM - 1]]
+            beam = unlike([best, *[m for m in good if m is not best]][:_BEAM], model)
             model = best
             if len(model.places) > 1:
                 at.whiten(model.fit.x)
@@ -262,8 +267,12 @@ class EffectSearch:
         """Other names refitted in the place of one effect, best first."""
         chosen = self.at.selector
         without = self.at.without(model, [place])
-        others = self.offered.candidates(model.places)
-        others = [c for c in others if c.place.key != place.key]
+        others = [
+            c
+            for c in self.offered.candidates(model.places)
+            if c.place.key != place.key
+            and (not self._likely or c.place.key in self._likely)
+        ]
         short = shortlist(screened(chosen, without, others))
         out = chosen.fitted(without.places, without.fit, short)
         return sorted(out, key=lambda m: m.loss.mean())

@@ -9,7 +9,7 @@ from easi_jax.errors import UserError
 from easi_jax.estimation.least_squares import AT_BOUND
 from easi_jax.estimation.starts import floor, known_noise
 from easi_jax.gap import gap_metric as measure
-from easi_jax.gap.batched_least_squares import Bounds, window_weights
+from easi_jax.gap.batched_least_squares import Bounds, difference, window_weights
 from easi_jax.gap.decisions import BLOCKS, DECIDE
 from easi_jax.gap.discretization_error import error_of_steps
 from easi_jax.gap.effect_set import Model
@@ -25,6 +25,7 @@ from easi_jax.gap.window_starts import window_starts
 from easi_jax.progress import Progress, silent
 
 _DRAWS = 5  # of the noise of each window: its mean over all of them is wanted
+_PAIRS = 5  # of draws, likewise, whose slopes are taken
 STEPS_SEEN = 0.75  # of the floor: less is lost in noise
 _WHOLE = 1.15  # of the error of steps; a finer simulation leaves some of it
 _BENT = 0.1  # second beside first differences of errors with a start: not linear
@@ -261,6 +262,37 @@ class Fitting:
             error = self.share(x) * (error - chosen.steps)
         chosen.unseen_steps = error
         return self._noises(error)
+
+    def pull_of_starts(self, model: Model) -> np.ndarray:
+        """What the score of a fit is on average where its starts are as read and the
+        model is right, by size of a difference of each active entry, ``(a,)``.
+
+        Where feet stick and slip, slopes go with the noise of a start, and what goes
+        with the noise of an error does not average out. Drawn in pairs of opposite
+        noise, in which all that is linear cancels; the median pair, since slopes are
+        steep where something begins to slip.
+        """
+        chosen, starts, rng = self.selector, self.starts, np.random.default_rng(2)
+        f, bounds = model.fit, chosen.bounds
+        if not self.sticks:
+            return np.zeros(len(f.active))
+        weight = chosen.weight * chosen.rows_once()
+        ways, step = difference(f.x, f.active, bounds)
+        vectors = np.concatenate([f.x[None], ways])
+        true = chosen.errors(f.x[None])[0].astype(float)
+        pulls, nv = np.zeros((_PAIRS, len(f.active))), self.data.m.nv
+        for pull in pulls:
+            off = starts.scatter * rng.normal(size=chosen.moved.shape)
+            noise = starts.noises * rng.normal(size=true.shape)
+            noise[:, 0, :nv] = off[:, :nv]  # a start is where its row says
+            for sign in (1.0, -1.0):
+                errors = chosen.errors(vectors, None, chosen.moved + sign * off)
+                left = errors - true - sign * noise
+                r = chosen.residuals.whitened(chosen.residuals.grouped(left))
+                slope = (r[1:] - r[0]) / step[:, None, None]
+                each = np.einsum("w,awm,wm->a", weight, slope, r[0], optimize=True)
+                pull += 0.5 * np.nan_to_num(each) * bounds.size[f.active]
+        return np.median(pulls, 0)
 
     def _noises(self, error: np.ndarray) -> float:
         """An error of predictions ``(W, T, c)`` once starts are fitted, in units of the

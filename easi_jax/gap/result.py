@@ -148,12 +148,13 @@ class Numbers:
     Args:
         selector: that fitted it.
         model: the fit.
+        pull: as `fit_covariance` takes it.
     """
 
-    def __init__(self, selector: Selector, model: Model) -> None:
+    def __init__(self, selector: Selector, model: Model, pull: np.ndarray) -> None:
         self.selector, self.model = selector, model
         active = model.fit.active
-        std = np.sqrt(np.diag(fit_covariance(selector, model))).tolist()
+        std = np.sqrt(np.diag(fit_covariance(selector, model, pull))).tolist()
         self._std = dict(zip(active.tolist(), std, strict=True))
         codes = model.fit.codes(selector.bounds)
         self._codes = dict(zip(active.tolist(), codes.tolist(), strict=True))
@@ -201,12 +202,16 @@ class Numbers:
         ]
 
 
-def fit_covariance(selector: Selector, model: Model) -> np.ndarray:
+def fit_covariance(
+    selector: Selector, model: Model, pull: np.ndarray | float = 0.0
+) -> np.ndarray:
     """Covariance of a fit's active entries ``(a, a)``, by the rules of a fit of
     parameters (`easi_jax.estimation.posterior`): each row counts once, values scatter
     between blocks of windows, and what the model errs by beyond the noise hides a part
     of itself in them. What the data do not determine may be anything within bounds. By
-    how much the model's own steps move a value, it is in doubt."""
+    how much the model's own steps move a value, it is in doubt, and by what the score
+    ``pull (a,)`` does that a right model has on average
+    (`easi_jax.gap.fitting.Fitting.pull_of_starts`)."""
     f, bounds = model.fit, selector.bounds
     size = bounds.size[f.active]
     weight = selector.weight * selector.rows_once()
@@ -222,10 +227,10 @@ def fit_covariance(selector: Selector, model: Model) -> np.ndarray:
     open_ = np.where(np.isfinite(width), width / np.sqrt(12.0), _ANYTHING * size)
     prior = (size / open_) ** 2
     cov = inverted(np.asarray(left), prior, _ALIKE)[0]
+    pulls = [np.broadcast_to(pull, len(f.active))]
     if selector.unseen_steps is not None:
         error = selector.residuals.grouped(selector.unseen_steps[None])
         off = selector.residuals.whitened(error)[0]
-        pull = np.einsum("w,wma,wm->a", weight, j, off, optimize=True)
-        moved = inverted(normal, prior, _ALIKE)[0] @ pull
-        cov += np.outer(moved, moved)
-    return cov * np.outer(size, size)
+        pulls.append(np.einsum("w,wma,wm->a", weight, j, off, optimize=True))
+    moved = inverted(normal, prior, _ALIKE)[0] @ np.transpose(pulls)
+    return (cov + moved @ moved.T) * np.outer(size, size)

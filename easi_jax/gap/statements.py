@@ -63,13 +63,15 @@ def stated(
     # What only makes up for a refit that went wrong is nothing that is missing.
     fine = undone and not given.is_open.any()
     found: list[Found] = []
+    numbers: Numbers | None = None
     if model.places:
         end = _looked(at, held_out, model)
         # With one noise that all tell: the refit beside the better floor.
         refit.open = openness(refit.figures.square, end.noise, scale)
         least = before if undone else refit.figures
         if not fine and surely_better(end.figures.square, least.square, scale):
-            found = _Judge(search, held_out, base, end).found(rivals)
+            judge = _Judge(search, held_out, base, end)
+            found, numbers = judge.found(rivals), judge.numbers
         else:
             notes.append(_not_named(model, fine))
     if undone and not found:
@@ -97,7 +99,7 @@ def stated(
     return Outcome(
         verdict=verdict_of(bool(found), refit.open, end.open),
         found=found,
-        refitted=Numbers(at.selector, end.model).refitted(space),
+        refitted=(numbers or _numbers(at, end.model)).refitted(space),
         before=before,
         refit=refit.figures,
         after=end.figures,
@@ -114,6 +116,10 @@ def stated(
         horizon=steps * data.dt,
         start=data.lead * data.dt,
     )
+
+
+def _numbers(at: Fitting, model: Model) -> Numbers:
+    return Numbers(at.selector, model, at.pull_of_starts(model))
 
 
 def _looked(at: Fitting, held_out: HeldOut, model: Model) -> _Look:
@@ -137,6 +143,7 @@ class _Judge:
         self.search, self.held_out = search, held_out
         self.at, self.model, self.end = search.at, end.model, end
         self.whole, self.base = self._fair(end.model), self._fair(base)
+        self.numbers = _numbers(self.at, self.model)
 
     def _fair(self, model: Model) -> Figures:
         x = model.fit.x
@@ -144,7 +151,7 @@ class _Judge:
 
     def found(self, rivals: Mapping[str, Sequence[Model]]) -> list[Found]:
         """All effects, what it costs most to take out first."""
-        numbers = Numbers(self.at.selector, self.model)
+        numbers = self.numbers
         without = {p.key: self.at.without(self.model, [p]) for p in self.model.places}
         costs = {k: cost(self.model, less) for k, less in without.items()}
         places = sorted(self.model.places, key=lambda p: -costs[p.key])

@@ -33,7 +33,9 @@ def made(seed: int, pull: float = 0.0, step: float = 0.0) -> tuple[Starts, np.nd
         return path(guess + moved) - read
 
     spread = np.array([0.1, 3.0])
-    starts = Starts(simulate, NOISE, spread, ROWS, 1e-3 * spread, 0.1 * spread)
+    starts = Starts(
+        simulate, NOISE, spread, ROWS, 1e-3 * spread, 0.1 * spread, 0.1 * spread
+    )
     return starts, true - guess
 
 
@@ -112,7 +114,7 @@ def test_separate_parts_are_moved_at_once() -> None:
 
     step = np.array([1e-3, 1e-3, 1e-2, 1e-2])
     noise, wide, still = np.repeat(NOISE, 2), np.ones(4), np.zeros((W, 4))
-    given = simulate, noise, wide, ROWS, step, wide
+    given = simulate, noise, wide, ROWS, step, wide, wide
     alone, at_once = Starts(*given), Starts(*given, parts=np.array([0, 1, 0, 1]))
     for starts in (alone, at_once):
         starts.linearize(np.zeros(1), still)
@@ -130,6 +132,7 @@ def test_a_channel_without_readings_has_no_say() -> None:
         ROWS,
         starts.step,
         starts.known,
+        starts.scatter,
     )
     alone, _ = fitted(starts)
     beside, errors = fitted(both)

@@ -26,14 +26,14 @@ ELSEWHERE = {
     "discretization_error": {"FINER", "_OWN_SHIFT"},
     "effect_search": {"RIVALS", "_STAGES", "_BEAM", "_LIKELY", "_LOST"},
     "excitation_coverage": {"_PAST", "_STILL", "_MOST"},
-    "fitting": {"_DRAWS", "STEPS_SEEN", "_WHOLE", "_BENT", "_LET_PASS"},
+    "fitting": {"_DRAWS", "_PAIRS", "STEPS_SEEN", "_WHOLE", "_BENT", "_LET_PASS"},
     "forward_selection": {"_LOST"},
     "gap_metric": {"_DRAWS"},
     "law_search": {"_HOLDS", "_RIDGE", "_STIFF"},
     "linear_response": {
         *("_SPACING", "_MOVED", "_LEAST", "_MOST", "_ALIKE", "_STUCK", "_BATCH"),
     },
-    "model_comparison": {"_TINY", "_UNLIKELY"},
+    "model_comparison": {"_TINY", "_UNLIKELY", "_ALIKE"},
     "offered_terms": {
         *("_WIDTH", "_BENDS", "_LAGS", "_WARMS", "_PAIRED", "_PLAIN", "_TWO"),
         "_THREE",

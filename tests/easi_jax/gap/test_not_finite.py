@@ -50,7 +50,9 @@ def held_out(errors: Any) -> HeldOut:
     """Held-out windows without a compiled program; the first row is the start."""
     spread = np.ones(2 * NV)
     noise = np.full(NV, 1e-3)
-    starts = Starts(lambda x, moved: errors(x), noise, spread, 2, 1e-3 * spread, spread)
+    starts = Starts(
+        lambda x, moved: errors(x), noise, spread, 2, 1e-3 * spread, spread, spread
+    )
     channels = Channels(NAMES, NAMES, ("rad", "m"), np.ones(NV), {})
     given = None, [], predictor(errors), [None] * W, channels, starts
     return HeldOut(*given, lead=0, resolution=np.zeros(NV))  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ import pytest
 
 from easi_jax.gap.batched_least_squares import Bounds, Fitted
 from easi_jax.gap.effect_set import Model
+from easi_jax.gap.fitting import Fitting
 from easi_jax.gap.forward_selection import Selector
 from easi_jax.gap.result import fit_covariance
 
@@ -87,6 +88,49 @@ def test_what_a_model_errs_by_and_its_own_steps_widen() -> None:
     stepped, _ = fitted(noise, unseen_steps=steps)
     moved = fit_covariance(stepped, model) - plain
     np.testing.assert_allclose(moved, np.outer(shift, shift), rtol=1e-3)
+
+
+def test_noise_of_starts_that_slopes_share_widens() -> None:
+    """How far something goes by a speed that is read: noise in what a number is
+    multiplied with draws it towards zero (attenuation)."""
+    rng, noise, time = np.random.default_rng(3), 0.3, np.linspace(0.0, 1.0, M)
+    speed = rng.uniform(0.5, 1.5, W)
+    read = speed + noise * rng.normal(size=W)
+
+    def errors(x: Any, some: Any = None, moved: np.ndarray | None = None) -> np.ndarray:
+        begun = read if moved is None else read + moved[:, 1]
+        ahead = (begun * x[:, :1] - speed)[..., None] * time
+        return np.asarray(ahead)[..., None]
+
+    best = float(read @ speed / (read @ read))
+    slope = (read[:, None] * time)[..., None]
+    residual = errors(np.array([[best]]))[0, ..., 0]
+    fit = Fitted(np.array([best]), np.arange(1), residual, slope, 1.0)
+    model = Model([], fit, np.zeros(1), np.zeros(1))
+    one = np.ones(1)
+    selector, _ = fitted(
+        np.zeros((W, M)),
+        bounds=Bounds(-np.inf * one, np.inf * one, 0.1 * one),
+        errors=errors,
+        moved=np.zeros((W, 2)),
+    )
+    starts = SimpleNamespace(scatter=np.array([0.0, noise]), noises=np.zeros(1))
+    at: Any = SimpleNamespace(
+        selector=selector,
+        starts=starts,
+        sticks=True,
+        data=SimpleNamespace(m=SimpleNamespace(nv=1)),
+    )
+    pull = Fitting.pull_of_starts(at, model)
+    due = best * W * noise**2 * (time**2).sum() * 0.1
+    np.testing.assert_allclose(pull, due, rtol=0.15)
+    plain, wide = (
+        np.sqrt(fit_covariance(selector, model, p)[0, 0]) for p in (0.0, pull)
+    )
+    assert best < 0.95 and abs(best - 1.0) > 2.0 * plain
+    assert abs(best - 1.0) < 1.2 * wide
+    at.sticks = False
+    assert not Fitting.pull_of_starts(at, model).any()
 
 
 def test_numbers_without_a_reading_hide_no_error() -> None:
