@@ -102,6 +102,8 @@ class Config(EngineOptions):
     """Which of them."""
     out: Path = Path("results/gap_real")
     """Folder of the runs."""
+    resume: bool = False
+    """Go on from where these were stopped; the seconds are then those from there."""
 
 
 def check(names: Iterable[str], known: Mapping[str, Simulator], data: Path) -> None:
@@ -122,7 +124,8 @@ def run(config: Config) -> None:
     check(config.machines, MACHINES, config.data)
     for name in config.machines:
         chosen = dataclasses.replace(config, machines=(name,))
-        told = analysed(MACHINES[name], config.data, config.out / name)
+        out = config.out / name
+        told = analysed(MACHINES[name], config.data, out, config.resume)
         path = write_result(
             f"gap_real_{name}",
             command_of("benchmarks.gap_real", chosen),
@@ -137,7 +140,9 @@ def run(config: Config) -> None:
         say(f"written: {path}")
 
 
-def analysed(machine: Simulator, data: Path, out: Path) -> dict[str, Any]:
+def analysed(
+    machine: Simulator, data: Path, out: Path, resume: bool = False
+) -> dict[str, Any]:
     """What train.gap says, and which of the expected names are among it."""
     from train import gap
 
@@ -154,7 +159,8 @@ def analysed(machine: Simulator, data: Path, out: Path) -> dict[str, Any]:
             held_out=held,
             horizon=machine.horizon,
             out=out,
-            overwrite=True,
+            overwrite=not resume,
+            resume=resume,
         )
     )
     told = json.loads((out / "gap.json").read_text())

@@ -38,7 +38,8 @@ class Identifiability:
     Attributes:
         names: parameters.
         std: Cramer-Rao standard deviation of the log ratio (or, for a linear
-            parameter, as a share of its initial range); inf where undetermined.
+            parameter, as a share of its initial range; for a logarithm below its
+            initial range, as a share of the low end); inf where undetermined.
         rank: number of determined directions.
         undetermined: each a dict name -> coefficient: the parameters that can move
             together, in these proportions of their logarithms, unseen.

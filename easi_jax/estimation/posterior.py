@@ -45,7 +45,9 @@ class Estimate:
         distribution: the Gaussian that training samples from.
         search_mean: mean found by the adversarial search, unit coordinates, ``(n,)``.
         search_cov: its covariance, ``(n, n)``.
-        hessian: Fisher information of the data at the final mean, ``(n, n)``.
+        hessian: Fisher information of the data at the fit, logarithms that are below
+            the low end of their initial range raised to it, ``(n, n)``: there it says
+            how far they are known to be below, as a share of that end.
         noise: standard deviations that the information was computed with.
         cost: weighted error after each step of refinement (empty without).
         delta: corrections of the pieces' starts, ``(M, S)``: positions, velocities,
@@ -315,7 +317,7 @@ def _stated(
         distribution=gaussian(paired.space, paired.space.clip(center), spread),
         search_mean=mean,
         search_cov=cov,
-        hessian=fit.hessian,
+        hessian=fit.raised_hessian,
         noise=noise,
         cost=fit.cost,
         delta=fit.delta,

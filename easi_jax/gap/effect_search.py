@@ -25,7 +25,6 @@ from easi_jax.gap.model_comparison import (
     probability,
     rank,
     simplest,
-    unlike,
 )
 from easi_jax.gap.screening import expanded, screened, shortlist
 from easi_jax.gap.table import Place, covered, does
@@ -250,7 +249,7 @@ class EffectSearch:
                 break
             best = simplest(good, model)
             self.tell(f"+ {' + '.join(p.key for p in best.places)}")
-            beam = unlike([best, *[m for m in good if m is not best]][:_BEAM], model)
+            beam = [best, *[m for m in good if m is not best][: _BEAM - 1]]
             model = best
             if len(model.places) > 1:
                 at.whiten(model.fit.x)

@@ -297,4 +297,5 @@ def _some(which: jax.Array, data: tuple[jax.Array, ...]) -> Window:
 
 def _parts(arrived: jax.Array, steps: int, rows: int) -> jax.Array:
     """Commands of the physics steps of every ``rows`` rows, ``(N, k, nu)``."""
-    return arrived[:steps].reshape(steps // rows, -1, arrived.shape[-1])
+    _, each, nu = arrived.shape
+    return arrived[:steps].reshape(steps // rows, rows * each, nu)

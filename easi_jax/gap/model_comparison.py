@@ -10,8 +10,6 @@ from easi_jax.gap.effect_set import Model
 from easi_jax.gap.table import Place
 
 _TINY = 1e-300
-# Of what two sets of effects explain: less apart, they lead to the same (saves time).
-_ALIKE = 0.2
 _UNLIKELY = 1e-6  # probability of a name beside a rival, that odds are never beyond
 
 
@@ -205,18 +203,3 @@ def are_twins(model: Model, rival: Model) -> bool:
     """Whether two models predict the same, so that no such data tell them apart."""
     mine, theirs = model.fit.residual, rival.fit.residual
     return bool(np.sqrt(np.mean((mine - theirs) ** 2)) < DECIDE.twins)
-
-
-def unlike(models: Sequence[Model], base: Model) -> list[Model]:
-    """The first of some models, and those of the others that explain another part of
-    what ``base`` leaves than any before: from models alike searches go on alike."""
-
-    def apart(a: Model, b: Model) -> float:
-        return float(((a.fit.residual - b.fit.residual) ** 2).sum())
-
-    kept: list[Model] = []
-    for m in models:
-        explained = apart(m, base)
-        if all(apart(m, k) > _ALIKE**2 * explained for k in kept):
-            kept.append(m)
-    return kept

@@ -45,6 +45,16 @@ def given_name(m: Any, j: int) -> str:
     return name
 
 
+def carrying_joints(m: Any) -> list[int]:
+    """Free joints of bodies that carry all other joints of their tree."""
+    root = [int(m.body_rootid[b]) for b in m.jnt_bodyid]
+    return [
+        j
+        for j in range(m.njnt)
+        if _kind(m, j) == _Joint.mjJNT_FREE and root.count(root[j]) > 1
+    ]
+
+
 def joint_name(m: Any, j: int) -> str:
     """A joint's name as in `given_name`, or its number."""
     return given_name(m, j) or f"joint{j}"

@@ -259,9 +259,13 @@ def linear_drive(m: Any, a: int) -> bool | None:
     """True for forces along a line, False for torques, None where it is mixed."""
     kind, target = int(m.actuator_trntype[a]), m.actuator_trnid[a, 0]
     if kind == int(mujoco.mjtTrn.mjTRN_TENDON):
-        return True
+        at = int(m.tendon_adr[target]) + np.arange(int(m.tendon_num[target]))
+        if (m.wrap_type[at] != int(mujoco.mjtWrap.mjWRAP_JOINT)).any():
+            return True
+        slides = m.jnt_type[m.wrap_objid[at]] == _Joint.mjJNT_SLIDE
+        return bool(slides[0]) if (slides == slides[0]).all() else None
     joint = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-    if kind in map(int, joint) and is_scalar(m, target):
+    if kind in map(int, joint) and m.jnt_type[target] != _Joint.mjJNT_FREE:
         return bool(m.jnt_type[target] == _Joint.mjJNT_SLIDE)
     return None
 

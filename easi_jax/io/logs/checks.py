@@ -24,7 +24,7 @@ from easi_jax.model.joint_space import (
     turns_fully,
     widths,
 )
-from easi_jax.model.quantities import is_position_servo
+from easi_jax.model.quantities import is_position_servo, linear_drive
 
 _AT_JOINT = (
     int(mujoco.mjtTrn.mjTRN_JOINT),
@@ -413,11 +413,17 @@ def ranges(
         low, high = (float(x) for x in model.actuator_ctrlrange[i])
         slack = 1e-6 * (high - low)
         outside = (ctrl[:, i] < low - slack) | (ctrl[:, i] > high + slack)
-        if outside.any():
-            notes.append(
-                f"actuator {model.actuator(i).name}: {np.sum(outside)} commands beyond "
-                f"its control range of {low:.4g} to {high:.4g}, which MuJoCo clamps"
-            )
+        if not outside.any():
+            continue
+        name = model.actuator(i).name
+        beyond = max(low - ctrl[:, i].min(), ctrl[:, i].max() - high)
+        far = beyond > high - low and is_position_servo(model, i)
+        hinge = linear_drive(model, i) is False
+        unit = f"; {_another_unit(f'ctrl.{name}', ctrl[:, i], hinge)}" if far else ""
+        notes.append(
+            f"actuator {name}: {np.sum(outside)} commands beyond its control range of "
+            f"{low:.4g} to {high:.4g}, which MuJoCo clamps{unit}"
+        )
     return notes
 
 

@@ -12,7 +12,13 @@ from easi_jax.errors import UserError, nearest
 from easi_jax.io.logs.cure import cure
 from easi_jax.io.models.completed import held_joint
 from easi_jax.model.addresses import matching
-from easi_jax.model.joint_space import FREE_WIDTH, given_name, numbered, widths
+from easi_jax.model.joint_space import (
+    FREE_WIDTH,
+    carrying_joints,
+    given_name,
+    numbered,
+    widths,
+)
 
 _CHECKED = ("qpos.", "qvel.", "ctrl.")
 _ALL = "all"  # joints that a log lacks
@@ -33,7 +39,7 @@ class LogColumns:
         ctrl: in the order of ``ctrl``, ``nu`` names.
         positions: each joint's position columns.
         joints: each joint's velocity columns (all of them or none are given).
-        free: names of free joints.
+        bases: names of free joints that carry others.
         held: columns of a held base's free joint, which the model no longer has: the
             pose first.
         sensors: each named sensor's columns.
@@ -45,7 +51,7 @@ class LogColumns:
     positions: tuple[tuple[str, ...], ...]
     joints: tuple[tuple[str, ...], ...]
     sensors: Mapping[str, tuple[str, ...]]
-    free: tuple[str, ...] = ()
+    bases: tuple[str, ...] = ()
     held: tuple[str, ...] = ()
 
     @property
@@ -63,7 +69,6 @@ def log_columns(model: mujoco.MjModel) -> LogColumns:
             one, or a model without joints.
     """
     positions: list[tuple[str, ...]] = []
-    free: list[str] = []
     joints: list[tuple[str, ...]] = []
     for i in range(model.njnt):
         name = given_name(model, i)
@@ -74,8 +79,6 @@ def log_columns(model: mujoco.MjModel) -> LogColumns:
                 "find joints: read the model with easi_jax.read_model, which names it"
             )
         size, dofs = widths(model, i)
-        if size == FREE_WIDTH:
-            free.append(name)
         positions.append(numbered(f"qpos.{name}", size))
         joints.append(numbered(f"qvel.{name}", dofs))
     if not positions:
@@ -103,7 +106,7 @@ def log_columns(model: mujoco.MjModel) -> LogColumns:
         positions=tuple(positions),
         joints=tuple(joints),
         sensors=sensors,
-        free=tuple(free),
+        bases=tuple(given_name(model, j) for j in carrying_joints(model)),
         held=_held(model),
     )
     for name, count in Counter(columns.known).items():
@@ -224,7 +227,7 @@ def check_columns(
             near = f" (it has {shown}; " + (
                 f"{cure(f'columns: {{THEIRS: {missing[0]}}}')} renames one)"
             )
-        for name in columns.free:
+        for name in columns.bases:
             if missing[0].startswith(f"qpos.{name}."):
                 near += (
                     f"; if {name} was held (the base does not move in this log), "

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.errors import UserError
-from easi_jax.model.joint_space import given_name
+from easi_jax.model.joint_space import carrying_joints, given_name
 from easi_jax.model.mjx_model import simulated
 
 _HELD = "held_base"  # custom text and number of a model whose base was held
@@ -23,31 +23,46 @@ _TARGETS = {
 }
 
 
-def new_names(m: mujoco.MjModel) -> tuple[dict[int, str], dict[int, str]]:
-    """Names for the joints and for the actuators of ``m`` that have none, by number.
+def new_names(m: mujoco.MjModel) -> dict[str, dict[int, str]]:
+    """Names for the bodies, joints and actuators of ``m`` that have none, by number.
 
-    A joint is called ``BODY_joint``, a free joint ``BODY``, an actuator
-    ``TARGET_actuator``; a body, tendon or site without a name is called after its kind
-    and number. ``_2``, ``_3`` ... make names unique.
+    A body is called ``bodyNUMBER``, a joint ``BODY_joint``, a free joint ``BODY``, an
+    actuator ``TARGET_actuator``; a tendon or site without a name is called after its
+    kind and number. ``_2``, ``_3`` ... make names unique.
     """
+    bodies = _unique(
+        {b: f"body{b}" for b in range(m.nbody) if not m.body(b).name},
+        {m.body(b).name for b in range(m.nbody)},
+    )
+
+    def body(j: int) -> str:
+        b = int(m.jnt_bodyid[j])
+        return bodies.get(b, m.body(b).name)
+
     joints = _unique(
         {
-            j: given_name(m, j) or f"{_called(m, 'body', int(m.jnt_bodyid[j]))}_joint"
+            j: given_name(m, j) or body(j) + "_joint" * (not _is_free(m, j))
             for j in range(m.njnt)
             if not m.joint(j).name
         },
         {m.joint(j).name for j in range(m.njnt)},
     )
+    of_kind = {"body": bodies, "joint": joints}
     actuators, drives = {}, range(len(m.actuator_trntype))  # not nu: <pid> has several
     for a in drives:
         kind = _TARGETS.get(mujoco.mjtTrn(int(m.actuator_trntype[a])))
         target = int(m.actuator_trnid[a, 0])
         if m.actuator(a).name:
             continue
-        named = joints.get(target) if kind == "joint" else None
+        named = of_kind.get(kind or "", {}).get(target)
         name = named or (_called(m, kind, target) if kind else f"drive{a}")
         actuators[a] = f"{name}_actuator"
-    return joints, _unique(actuators, {m.actuator(a).name for a in drives})
+    taken = {m.actuator(a).name for a in drives}
+    return {**of_kind, "actuator": _unique(actuators, taken)}
+
+
+def _is_free(m: mujoco.MjModel, j: int) -> bool:
+    return m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE
 
 
 def _called(m: mujoco.MjModel, kind: str, i: int) -> str:
@@ -69,22 +84,24 @@ def named(spec: mujoco.MjSpec, m: mujoco.MjModel) -> mujoco.MjModel:
     Returns:
         The model with these names.
     """
-    joints, actuators = new_names(m)
-    if not joints and not actuators:
+    new = new_names(m)
+    if not any(new.values()):
         return m
     spec.compile()  # numbers its elements
-    for elements, names in ((spec.joints, joints), (spec.actuators, actuators)):
-        for element in elements:
+    each = {"body": spec.bodies, "joint": spec.joints, "actuator": spec.actuators}
+    for kind, names in new.items():
+        for element in each[kind]:
             if element.id in names:
                 element.name = names[element.id]
     return spec.compile()
 
 
 def names_note(m: mujoco.MjModel) -> str:
-    """What is told of the names that ``m`` is given; ``""`` where it has all."""
+    """What is told of the names that joints and actuators of ``m`` are given; ``""``
+    where they have all. Those of bodies say themselves what they are."""
     said = []
-    for kind, names in zip(("joint", "actuator"), new_names(m), strict=True):
-        if names:
+    for kind, names in new_names(m).items():
+        if names and kind != "body":
             shown = ", ".join([*names.values()][:_LISTED])
             more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
             plural = "s" if len(names) > 1 else ""
@@ -97,8 +114,8 @@ def names_note(m: mujoco.MjModel) -> str:
 
 
 def as_read(path: Path, like: mujoco.MjModel | None = None) -> mujoco.MjSpec:
-    """The model file ``path`` with a name for every joint and actuator, its base held
-    where it is in ``like``, which was read from it.
+    """The model file ``path`` with a name for every body, joint and actuator, its base
+    held where it is in ``like``, which was read from it.
 
     Raises:
         ValueError: MuJoCo cannot read it.
@@ -119,12 +136,7 @@ def base_joint(m: mujoco.MjModel) -> int:
     Raises:
         UserError: none, or several.
     """
-    root = [int(m.body_rootid[b]) for b in m.jnt_bodyid]
-    free = [
-        j
-        for j in range(m.njnt)
-        if m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE and root.count(root[j]) > 1
-    ]
+    free = carrying_joints(m)
     if len(free) == 1:
         return free[0]
     if not free:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from easi_jax.data.segments import Segments
+from easi_jax.estimation.identifiability import identifiability, seed_result
 from easi_jax.estimation.levenberg_marquardt import RefineResult
 from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.pieces import finish_pieces, finish_rest
@@ -193,6 +194,30 @@ def test_what_is_hardly_known_stays_within_reach() -> None:
         assert (found.distribution.mean >= low).all()
         assert (found.distribution.mean <= high).all()
     assert (mean > high).any() or (mean < low).any()
+
+
+@pytest.mark.parametrize(
+    ("share", "flag"), [(0.1, "determined"), (3.0, "not determined")]
+)
+def test_what_is_surely_far_below_its_range_is_determined(
+    share: float, flag: str
+) -> None:
+    """Of friction that is not there logarithms know nothing; ``share``: its deviation
+    over the low end of its initial range."""
+    p = Parameter("dry", ("joint.a.frictionloss",), 1.0, (0.1, 10.0), (0.0, 1e3))
+    space = ParameterSpace((p,))
+    assert space.log.all()
+    width, unit = float(space.log_width[0]), jnp.full(1, -2.0)
+    low_end = jnp.full((1, 1), (width / share) ** 2)
+    here = low_end * np.exp(2 * width * float(unit[0]))
+    none = {k: jnp.zeros(1) for k in RefineResult.__dataclass_fields__}
+    raised = {"raised": 0.0 * unit, "raised_hessian": low_end}
+    fit = RefineResult(**{**none, "unit": unit, "hessian": here, **raised})
+    paired = PairedFit(cast(Any, None), space, cast(Any, None), jnp.ones(2))
+    found = _stated(paired, fit, unit, jnp.eye(1), unit, 1e-4 * jnp.eye(1))
+    told = seed_result(space, unit, 1e-4 * np.eye(1), found.hessian)
+    assert told.flags == [flag]
+    assert not identifiability(space, np.asarray(here)).determined.any()
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,7 @@ def recorded(m: mujoco.MjModel, late: tuple[float, ...]) -> Run:
     """Angles as sensors tell them that are late by whole physics steps."""
     d, c = mujoco.MjData(m), Configuration.of(m)
     t = DT * np.arange(300)
-    ctrl = np.stack([2 * np.sin(7 * t) + np.sin(3.1 * t)], 1)
+    ctrl = np.stack([2 * np.sin(7 * t) + np.sin(3.1 * t)], 1)[:, : m.nu]
     q = [d.qpos.copy()]
     for u in ctrl:
         d.ctrl[:] = u

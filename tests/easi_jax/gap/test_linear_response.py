@@ -76,6 +76,14 @@ def test_torques_are_as_simulated(
         assert (off < near * whole).all(), (off / whole).tolist()
 
 
+def test_a_machine_that_nothing_drives() -> None:
+    passive = ARM.partition("<actuator>")[0] + "</mujoco>"
+    spring = 'name="a" springref="50" stiffness="3"'
+    p, linear = _about(passive.replace('name="a"', spring).format(SECOND), 0.2)
+    assert p.simulator.mj_model.nu == 0
+    assert linear.holds.mean() > 0.9
+
+
 def test_faults_of_readings_and_limits_are_not_reckoned(
     arm: tuple[Predictor, LinearResponse],
 ) -> None:

@@ -52,3 +52,33 @@ def test_what_is_neither_probable_nor_missed_is_spared(
     model: Any = at.model(list(worth))
     found = EffectSearch._spare(search, model, {key: [] for key in worth})
     assert [p.key for p in found] == spared
+
+
+@pytest.mark.parametrize(
+    ("likely", "tried"), [(set(), ["b", "c"]), ({"a", "c"}, ["c"])]
+)
+def test_rivals_are_looked_for_among_likely_names(
+    likely: set[str], tried: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All are likely where no stage has told which."""
+    asked: list[str] = []
+
+    def screened(chosen: object, base: object, others: list[Any]) -> list[Any]:
+        asked.extend(c.place.key for c in others)
+        return []
+
+    monkeypatch.setattr(effect_search, "screened", screened)
+    at = _Windows({"a": 1.0, "d": 2.0}, set())
+    selector = SimpleNamespace(fitted=lambda *given: [])
+    every = [SimpleNamespace(place=SimpleNamespace(key=k)) for k in "abc"]
+    search: Any = SimpleNamespace(
+        at=SimpleNamespace(selector=selector, without=at.without),
+        offered=SimpleNamespace(candidates=lambda places: every),
+        _likely=likely,
+    )
+    model: Any = at.model(["a", "d"])
+    for place in model.places:
+        place.tied = ()
+    model.fit = SimpleNamespace(x=[], places=[])
+    assert EffectSearch.rivals(search, model, model.places[0]) == []
+    assert asked == tried

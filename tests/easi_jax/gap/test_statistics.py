@@ -35,7 +35,6 @@ from easi_jax.gap.model_comparison import (
     probability,
     rank,
     simplest,
-    unlike,
 )
 from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.screening import as_sine, shortlist
@@ -572,20 +571,6 @@ def test_twins_predict_the_same() -> None:
         other = of_loss(np.ones(10))
         other.fit = replace(other.fit, residual=moved)
         assert are_twins(one, other) == same
-
-
-def test_sets_that_explain_the_same_are_followed_once() -> None:
-    rng = np.random.default_rng(0)
-    base, stiff, dry = (rng.normal(size=(20, 30)) for _ in range(3))
-
-    def left(explained: np.ndarray) -> Model:
-        model = of_loss(np.ones(10))
-        model.fit = replace(model.fit, residual=base - explained)
-        return model
-
-    one, same, other = left(stiff), left(stiff + 0.05 * dry), left(stiff + 0.5 * dry)
-    assert unlike([one, same, other], left(0 * stiff)) == [one, other]
-    assert unlike([same, one], left(0 * stiff)) == [same]
 
 
 def test_the_cost_is_a_difference_of_log_densities() -> None:

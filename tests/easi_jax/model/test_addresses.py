@@ -198,6 +198,38 @@ def test_units_and_bounds(m: mujoco.MjModel) -> None:
     assert describe(m, ["body.base.com_x"])[1] == (-np.inf, np.inf)
 
 
+@pytest.mark.parametrize(
+    ("target", "unit"),
+    [
+        ('joint="ball"', "N m/ctrl"),
+        ('tendon="hinges"', "N m/ctrl"),
+        ('tendon="slides"', "N/ctrl"),
+        ('tendon="both"', "N/ctrl"),
+        ('tendon="cord"', "N/ctrl"),
+    ],
+)
+def test_units_of_drives_that_pull_at_more_than_one_joint(
+    target: str, unit: str
+) -> None:
+    def fixed(name: str, *joints: str) -> str:
+        parts = "".join(f'<joint joint="{j}" coef="1"/>' for j in joints)
+        return f'<fixed name="{name}">{parts}</fixed>'
+
+    bodies = "".join(
+        f'<body><joint name="{name}" type="{kind}"/><geom size=".1"/></body>'
+        for name, kind in (("a", "hinge"), ("b", "hinge"), ("c", "slide"))
+    )
+    m = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><worldbody>{bodies}<site name="p"/><body><joint name="ball"
+        type="ball"/><geom size=".1"/><site name="q" pos="0 0 1"/></body></worldbody>
+        <tendon>{fixed("hinges", "a", "b")}{fixed("slides", "c")}{
+            fixed("both", "a", "c")
+        }<spatial name="cord"><site site="p"/><site site="q"/></spatial></tendon>
+        <actuator><motor name="m" {target}/></actuator></mujoco>"""
+    )
+    assert describe(m, ["actuator.m.gain"])[0] == unit
+
+
 def test_open_gates_copies_and_opens(m: mujoco.MjModel) -> None:
     opened = open_gates(
         m,

@@ -876,10 +876,13 @@ def test_wrong_orders(tmp_path, flyer, orders, words):
 def test_a_free_joint_without_a_name_is_called_after_its_body(tmp_path):
     model = mujoco.MjModel.from_xml_string(
         '<mujoco><option timestep=".01"/><worldbody><body name="trunk"><freejoint/>'
-        '<geom size=".1"/></body></worldbody></mujoco>'
+        '<geom size=".1"/><body><joint name="hip"/><geom size=".1"/></body></body>'
+        "</worldbody></mujoco>"
     )
     names = [f"qpos.trunk.{i}" for i in range(7)]
     columns = {name: np.full(ROWS, float(i == 3)) for i, name in enumerate(names)}
+    columns["qpos.hip"] = np.linspace(0.0, 0.1, ROWS)
+    columns["qpos.trunk.0"] = np.linspace(0.0, 0.1, ROWS)
     columns["time"] = 0.01 * np.arange(ROWS)
     assert len(read_logs(save(tmp_path / "a.csv", columns), model).runs[0]) == ROWS
     text = failure(save(tmp_path / "b.csv", {"time": columns["time"]}), model)
@@ -929,6 +932,37 @@ def test_units_of_speeds_and_targets(tmp_path, column, factor, words, line):
         return
     (note,) = notes
     assert words in note and f"'scale: {{{column}: {line}}}'" in note
+
+
+def test_targets_far_beyond_their_range_may_be_in_degrees(tmp_path):
+    """Of a soft drive, too, whose joint hangs far behind them."""
+    text = TURN.replace('name="drive"', 'name="drive" ctrlrange="-1 1"')
+    model = mujoco.MjModel.from_xml_string(text)
+    time = 0.01 * np.arange(200)
+    columns = {
+        "time": time,
+        "qpos.wrist": 0.1 * np.sin(5 * time),
+        "ctrl.drive": 50.0 * np.cos(5 * time),
+    }
+    log = read_logs(save(tmp_path / "a.npz", columns), model)
+    (note,) = [n for n in log.notes if "control range" in n]
+    assert "if it is in degrees" in note and "'scale: {ctrl.drive: " in note
+    columns["ctrl.drive"] *= 0.03
+    log = read_logs(save(tmp_path / "a.npz", columns), model)
+    (note,) = [n for n in log.notes if "control range" in n]
+    assert note.endswith("which MuJoCo clamps")
+
+
+def test_only_a_base_may_have_been_held(tmp_path):
+    """A load with a free joint carries nothing."""
+    arm = CART.replace(
+        "</worldbody>",
+        '<body name="load"><freejoint/><geom size=".1"/></body></worldbody>',
+    )
+    model = mujoco.MjModel.from_xml_string(arm)
+    refused = failure(save(tmp_path / "a.npz", cart_columns()), model)
+    assert 'no column "qpos.load.0"' in refused
+    assert "--held-base" not in refused and "--unmeasured load" in refused
 
 
 # Files

@@ -191,4 +191,18 @@ def test_an_actuator_of_several_commands_gets_one_name() -> None:
         "</actuator></mujoco>"
     )
     assert m.nu > 1 == len(m.actuator_trntype)
-    assert new_names(m) == ({}, {0: "hinge_actuator"})
+    assert new_names(m) == {"body": {}, "joint": {}, "actuator": {0: "hinge_actuator"}}
+
+
+def test_bodies_without_a_name_get_one(tmp_path: Path) -> None:
+    path, told = tmp_path / "m.xml", []
+    path.write_text(
+        "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body>"
+        "<body name='body1'><joint/><geom size='.1'/><body><joint name='tip'/>"
+        "<geom size='.1'/></body></body></worldbody></mujoco>"
+    )
+    m = read_mjcf(path, tell=told.append)
+    assert [m.body(b).name for b in range(4)] == ["world", "body1_2", "body1", "body3"]
+    assert joints(m) == ["body1_2", "body1_joint", "tip"]
+    (note,) = told
+    assert "2 joints without a name, called body1_2, body1_joint: logs" in note
