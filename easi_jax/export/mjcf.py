@@ -17,6 +17,15 @@ from easi_jax.model.parameters import Parameter, ParameterSpace
 from easi_jax.simulation.mujoco_c import InMujoco
 from easi_jax.simulation.simulator import Simulator
 
+# Numbers of a model's parts, and what MuJoCo calls those whose names are compared.
+_COUNTS = {
+    "nbody": mujoco.mjtObj.mjOBJ_BODY,
+    "njnt": mujoco.mjtObj.mjOBJ_JOINT,
+    "ngeom": mujoco.mjtObj.mjOBJ_GEOM,
+    "nu": mujoco.mjtObj.mjOBJ_ACTUATOR,
+    "nsensor": mujoco.mjtObj.mjOBJ_SENSOR,
+}
+
 
 def identified_model(
     source: Path,
@@ -37,7 +46,7 @@ def identified_model(
     """
     with mujoco_warnings():
         read = as_read(source, simulator.mj_model).compile()
-    if _sizes(read) != _sizes(simulator.mj_model):
+    if not _is_named(read, simulator.mj_model):
         raise UserError(f"{source} is not the model that these parameters are of")
     write = InMujoco(simulator)
     with jax.enable_x64(True):  # a space of its own, as in `InMujoco`
@@ -52,8 +61,16 @@ def identified_model(
     return dataclasses.replace(model, left=[*lost, *model.left])
 
 
-def _sizes(m: mujoco.MjModel) -> tuple[object, ...]:
-    return (m.nq, m.nv, m.nu, m.nbody, m.ngeom, m.names)
+def _is_named(m: mujoco.MjModel, given: mujoco.MjModel) -> bool:
+    """Whether ``m`` is of ``given``'s size, with its names, and perhaps more."""
+    if any(getattr(m, n) != getattr(given, n) for n in ("nq", "nv", *_COUNTS)):
+        return False
+    return all(
+        name in (None, mujoco.mj_id2name(m, kind, i))
+        for n, kind in _COUNTS.items()
+        for i in range(getattr(m, n))
+        for name in [mujoco.mj_id2name(given, kind, i)]
+    )
 
 
 def written_machine(
