@@ -189,6 +189,9 @@ def polished(
         begin = jnp.concatenate([center, jnp.zeros(doubts.count)])
         all_ = polish(wider, begin, doubts.count, starts)
         fit, told = without(all_, doubts.count)
+        # Their deviations, too, are those of a model that errs, at most as before.
+        std = jnp.minimum(told[:, 1] * widened(all_.excess), 1.0)
+        told = told.at[:, 1].set(std)
         found = _of_fit(paired, fit, center, cov, informed, _Whole(wider, all_))
         return replace(found, doubts=told, doubted=doubts.parameters)
     fit = polish(paired, center, starts=starts)

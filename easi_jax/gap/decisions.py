@@ -105,6 +105,10 @@ class Decisions:
     """Of the noise: names whose predictions differ by less, RMS, are twins: 100
     independent rows would tell them apart by one standard error."""
 
+    twins_apart: float = 0.05
+    """Share of the windows in which twins may differ. No test: a command delay and a
+    sensor delay differ where a run begins, and only there."""
+
     even: float = 0.83
     """Nats of cross-validated log density for each number, lost without an effect, at
     which its name is as often wrong as right. Fitted once, by maximum likelihood, to 57

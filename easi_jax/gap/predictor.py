@@ -360,7 +360,8 @@ class Predictor:
         step = np.arange(self.steps + 1)
         readings = (start + late)[:, None] + step[:, None]
         commands = start + step[:-1]
-        return Rows(np.round(readings).astype(int), np.round(commands).astype(int))
+        ahead = np.ceil(readings - 1e-6)  # as readings are compared; but for rounding
+        return Rows(ahead.astype(int), np.round(commands).astype(int))
 
     def _program(self, left_out: tuple[str, ...], batch: int) -> Any:
         """A compiled one. For an arm MJX's take a minute each, so side by side."""
@@ -414,6 +415,8 @@ class Predictor:
         that it starts from what was read until the window's start. Each joint is
         compared with the readings of the times that are simulated: as far from its
         start as without delays. Where a run only begins, all is later by that delay.
+        What is simulated is interpolated at the times of readings, never the readings:
+        between two rows their noise would be less.
         """
         simulator, e, nv = self.simulator, model.effects, self.nv
         assert e is not None
@@ -441,17 +444,19 @@ class Predictor:
         qs = jnp.concatenate([q[None], qs[:count]])
         vs = jnp.concatenate([physics.qvel[None], vs[:count]])
         path = difference(window.start_qpos, zero, qs, zero)[:, :nv]
-        error = path + e.bias + self._misread(model, window, qs, vs) - read
+        after = jnp.ceil(now) - now
+        path = _later(path + self._misread(model, window, qs, vs), after)
+        error = path + e.bias - read
         turn = 2 * jnp.pi
         near = error - turn * jnp.round(error / turn)
         out = [jnp.where(self.wrapped, near, error)]
         if self.sensors:
             out.append(self._sensor_errors(window, early, readings))
         if self.speeds:
-            begun = slice(self._started)
-            row = jnp.arange(self._started)[:, None]
+            begun, row = slice(self._started + 1), jnp.arange(self._started)[:, None]
             fast = vs[begun] + self._misread_speed(model, window, qs[begun], vs[begun])
-            fast -= _between(window.read_speed, now + row)
+            fast = _later(fast, after)[: self._started]
+            fast -= _between(window.read_speed, jnp.ceil(now) + row)
             out.append(jnp.pad(fast, [(0, len(vs) - len(fast)), (0, 0)]))
         return jnp.concatenate(out, 1)
 
@@ -468,10 +473,14 @@ class Predictor:
         """Of `_window`, those of sensors, ``(H + 1, 2 N)``, from the simulated
         ``readings (H + 1, 2, N)``."""
         start = len(window.speed) // 2
-        row = start - early / self.simulator.dt + jnp.arange(self.steps + 1)
+        first = start - early / self.simulator.dt
+        row = jnp.ceil(first) + jnp.arange(self.steps + 1)
         read = jnp.broadcast_to(row[:, None], (len(row), len(self.sensors)))
         read = _between(window.sensed, read)
         readings = self.sensors.reading.alike(readings, read[:, None])
+        after = jnp.broadcast_to(jnp.ceil(first) - first, (2 * len(self.sensors),))
+        flat = _later(readings.reshape(len(readings), -1), after)
+        readings = flat.reshape(readings.shape)
         begins, ends = readings[:, 0] - read, readings[:-1, 1] - read[1:]
         each = jnp.concatenate([begins, jnp.pad(ends, [(1, 0), (0, 0)])], 1)
         return jnp.where(jnp.tile(window.known, 2) > 0, each, 0.0)
@@ -531,9 +540,9 @@ class Predictor:
         w, simulator, e, nv = window, self.simulator, model.effects, self.nv
         assert e is not None
         early, now = self._when(w, e)
-        read = _between(w.read, now + jnp.arange(self.steps + 1)[:, None])
-        v = _between(w.speed, now[None])[0]
-        q, v = self._true(model, w, simulator.move(w.start_qpos, read[0] - e.bias), v)
+        read = _between(w.read, jnp.ceil(now) + jnp.arange(self.steps + 1)[:, None])
+        first, v = (_between(x, now[None])[0] for x in (w.read, w.speed))
+        q, v = self._true(model, w, simulator.move(w.start_qpos, first - e.bias), v)
         q = simulator.move(q, moved[:nv])
         physics = simulator.start(q, v + moved[nv : 2 * nv], model)
         physics = physics.replace(memory=(), act=w.start_act + moved[2 * nv :])
@@ -677,3 +686,10 @@ def _between(x: jax.Array, row: jax.Array) -> jax.Array:
     third = 2 * (b - c) + slope_b + slope_c
     second = 3 * (c - b) - 2 * slope_b - slope_c
     return b + s * (slope_b + s * (second + s * third))
+
+
+def _later(x: jax.Array, rows: jax.Array) -> jax.Array:
+    """Columns of ``x (T, n)`` so many rows later, ``(n,)``, less than one: of what is
+    smooth, as simulations are."""
+    early = jnp.concatenate([2 * x[:1] - x[1:2], x])
+    return _between(early, 1.0 + jnp.arange(len(x))[:, None] + rows)
