@@ -151,7 +151,9 @@ class Numbers:
         pull: as `fit_covariance` takes it.
     """
 
-    def __init__(self, selector: Selector, model: Model, pull: np.ndarray) -> None:
+    def __init__(
+        self, selector: Selector, model: Model, pull: np.ndarray | float = 0.0
+    ) -> None:
         self.selector, self.model = selector, model
         active = model.fit.active
         std = np.sqrt(np.diag(fit_covariance(selector, model, pull))).tolist()

@@ -37,7 +37,7 @@ def new_names(m: mujoco.MjModel) -> dict[str, dict[int, str]]:
 
     def body(j: int) -> str:
         b = int(m.jnt_bodyid[j])
-        return bodies.get(b, m.body(b).name)
+        return bodies[b] if b in bodies else str(m.body(b).name)
 
     joints = _unique(
         {
