@@ -19,11 +19,18 @@ from easi_jax.simulation.simulator import Simulator
 
 # Numbers of a model's parts, and what MuJoCo calls those whose names are compared.
 _COUNTS = {
-    "nbody": mujoco.mjtObj.mjOBJ_BODY,
-    "njnt": mujoco.mjtObj.mjOBJ_JOINT,
-    "ngeom": mujoco.mjtObj.mjOBJ_GEOM,
-    "nu": mujoco.mjtObj.mjOBJ_ACTUATOR,
-    "nsensor": mujoco.mjtObj.mjOBJ_SENSOR,
+    **{"nbody": mujoco.mjtObj.mjOBJ_BODY, "njnt": mujoco.mjtObj.mjOBJ_JOINT},
+    **{"ngeom": mujoco.mjtObj.mjOBJ_GEOM, "nsite": mujoco.mjtObj.mjOBJ_SITE},
+    **{"ncam": mujoco.mjtObj.mjOBJ_CAMERA, "nlight": mujoco.mjtObj.mjOBJ_LIGHT},
+    **{"nmesh": mujoco.mjtObj.mjOBJ_MESH, "nhfield": mujoco.mjtObj.mjOBJ_HFIELD},
+    **{"ntex": mujoco.mjtObj.mjOBJ_TEXTURE, "nmat": mujoco.mjtObj.mjOBJ_MATERIAL},
+    **{"npair": mujoco.mjtObj.mjOBJ_PAIR, "nexclude": mujoco.mjtObj.mjOBJ_EXCLUDE},
+    **{"neq": mujoco.mjtObj.mjOBJ_EQUALITY, "ntendon": mujoco.mjtObj.mjOBJ_TENDON},
+    **{"nu": mujoco.mjtObj.mjOBJ_ACTUATOR, "nsensor": mujoco.mjtObj.mjOBJ_SENSOR},
+    **{"nnumeric": mujoco.mjtObj.mjOBJ_NUMERIC, "ntext": mujoco.mjtObj.mjOBJ_TEXT},
+    **{"ntuple": mujoco.mjtObj.mjOBJ_TUPLE, "nkey": mujoco.mjtObj.mjOBJ_KEY},
+    **{"nflex": mujoco.mjtObj.mjOBJ_FLEX, "nskin": mujoco.mjtObj.mjOBJ_SKIN},
+    "nplugin": mujoco.mjtObj.mjOBJ_PLUGIN,
 }
 
 

@@ -274,7 +274,7 @@ class Fitting:
         """
         chosen, starts, rng = self.selector, self.starts, np.random.default_rng(2)
         f, bounds = model.fit, chosen.bounds
-        if not self.sticks:
+        if not self.sticks or not len(f.active):
             return np.zeros(len(f.active))
         weight = chosen.weight * chosen.rows_once()
         ways, step = difference(f.x, f.active, bounds)

@@ -690,6 +690,12 @@ def _between(x: jax.Array, row: jax.Array) -> jax.Array:
 
 def _later(x: jax.Array, rows: jax.Array) -> jax.Array:
     """Columns of ``x (T, n)`` so many rows later, ``(n,)``, less than one: of what is
-    smooth, as simulations are."""
-    early = jnp.concatenate([2 * x[:1] - x[1:2], x])
-    return _between(early, 1.0 + jnp.arange(len(x))[:, None] + rows)
+    smooth, as simulations are; before and after them it goes on as a parabola."""
+    first, last = x[:3], x[:-4:-1]
+
+    def beyond(near: jax.Array) -> list[jax.Array]:
+        a, b, c = near
+        return [(3 * (a - b) + c)[None], (6 * a - 8 * b + 3 * c)[None]]
+
+    whole = jnp.concatenate([beyond(first)[0], x, *beyond(last)])
+    return _between(whole, 1.0 + jnp.arange(len(x))[:, None] + rows)

@@ -8,7 +8,12 @@ import mujoco
 import numpy as np
 
 from easi_jax.errors import UserError
-from easi_jax.model.joint_space import carrying_joints, given_name
+from easi_jax.model.joint_space import (
+    FREE_WIDTH,
+    carrying_joints,
+    given_name,
+    widths,
+)
 from easi_jax.model.mjx_model import simulated
 
 _HELD = "held_base"  # custom text and number of a model whose base was held
@@ -41,7 +46,7 @@ def new_names(m: mujoco.MjModel) -> dict[str, dict[int, str]]:
 
     joints = _unique(
         {
-            j: given_name(m, j) or body(j) + "_joint" * (not _is_free(m, j))
+            j: given_name(m, j) or body(j) + "_joint" * (widths(m, j)[0] < FREE_WIDTH)
             for j in range(m.njnt)
             if not m.joint(j).name
         },
@@ -59,10 +64,6 @@ def new_names(m: mujoco.MjModel) -> dict[str, dict[int, str]]:
         actuators[a] = f"{name}_actuator"
     taken = {m.actuator(a).name for a in drives}
     return {**of_kind, "actuator": _unique(actuators, taken)}
-
-
-def _is_free(m: mujoco.MjModel, j: int) -> bool:
-    return m.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE
 
 
 def _called(m: mujoco.MjModel, kind: str, i: int) -> str:

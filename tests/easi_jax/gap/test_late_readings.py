@@ -12,7 +12,7 @@ from easi_jax.data.scales import scales_of
 from easi_jax.data.windows import fitted_velocity
 from easi_jax.gap.candidates import places
 from easi_jax.gap.effect_vector import Layout
-from easi_jax.gap.predictor import Predictor
+from easi_jax.gap.predictor import Predictor, _later
 from easi_jax.gap.window_set import window_set
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace
@@ -108,6 +108,15 @@ def test_lateness_buys_no_quieter_readings() -> None:
     # Second differences along rows are of readings alone.
     rough = np.diff(errors[..., 0], 2, axis=-1).std((1, 2)) / np.sqrt(6.0)
     np.testing.assert_allclose(rough, noise, rtol=0.1)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.999])
+def test_what_is_simulated_goes_on_between_rows_and_beyond_them(share: float) -> None:
+    """As a joint does at 8 rad/s, whose acceleration makes 6 mrad in the last row."""
+    row = np.arange(30.0)[:, None]
+    found = _later(np.sin(8 * DT * row), np.array([share]))
+    off = np.abs(np.asarray(found) - np.sin(8 * DT * (row + share)))
+    assert off.max() < 6e-4 and off[1:-2].max() < 3e-5
 
 
 def test_lateness_buys_no_shorter_prediction() -> None:
