@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -114,7 +115,7 @@ def test_lateness_buys_no_quieter_readings() -> None:
 def test_what_is_simulated_goes_on_between_rows_and_beyond_them(share: float) -> None:
     """As a joint does at 8 rad/s, whose acceleration makes 6 mrad in the last row."""
     row = np.arange(30.0)[:, None]
-    found = _later(np.sin(8 * DT * row), np.array([share]))
+    found = _later(jnp.sin(8 * DT * row), jnp.array([share]))
     off = np.abs(np.asarray(found) - np.sin(8 * DT * (row + share)))
     assert off.max() < 6e-4 and off[1:-2].max() < 3e-5
 
