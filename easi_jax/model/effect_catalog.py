@@ -406,7 +406,7 @@ def _contact_softness(field: str) -> Site:
 _ROWS = (
     Effect(
         "payload_mass",
-        'body "{at}" carries {mass} more',
+        'body "{at}" carries {mass} more, at its center of mass',
         {
             "body": Site(
                 (
