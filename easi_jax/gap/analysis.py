@@ -327,6 +327,9 @@ class Analysis:
             base = self._undone(base, stuck)
         model = search.select(base)
         for _ in own:
+            if search.at.stuck(model):
+                # A wrong name moves a parameter to its bound, and a right one back.
+                model, _ = search.exchanged(model)
             stuck = search.at.stuck(model)
             if not stuck:
                 break

@@ -110,10 +110,10 @@ class Decisions:
     sensor delay differ where a run begins, and only there."""
 
     even: float = 0.83
-    """Nats of cross-validated log density for each number, lost without an effect, at
-    which its name is as often wrong as right. Fitted once, by maximum likelihood, to 57
-    names of 37 generated machines that were not kept; `benchmarks.gap_confidence` tests
-    it on others."""
+    """Nats for each number, lost without an effect, at which its name is as often wrong
+    as right: half the logarithm of what is then open, by what is open with it. Fitted
+    once, by maximum likelihood, to 57 names of 37 generated machines that were not
+    kept; `benchmarks.gap_confidence` tests it on others."""
 
     steep: float = 2.6
     """How fast that changes with the logarithm of the loss; likewise."""

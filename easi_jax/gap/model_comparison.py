@@ -165,10 +165,15 @@ def probability(model: Model, rival: Model) -> float:
 
 
 def cost(model: Model, less: Model) -> float:
-    """What a model loses in cross-validated log density without an effect: nats for
-    each independent number that was read, whichever way blocks of time are
-    averaged: what acts seldom shows in few of them."""
-    mine, theirs = (x.loss + _TINY for x in (model, less))
+    """What is left open without an effect, by what is left open with it: half the
+    logarithm, so nats for each independent number that was read.
+
+    Open is what a cross-validated loss exceeds the noise by, whose own is 1 and known
+    as well as `Decisions.closed` says. Blocks of time are averaged before or after the
+    logarithm, whichever is more: what acts seldom shows in few of them.
+    """
+    known = DECIDE.closed**2 - 1.0
+    mine, theirs = (np.maximum(m.loss - 1.0, 0.0) + known for m in (model, less))
     each = np.mean(np.log(theirs / mine))
     return 0.5 * float(max(each, np.log(theirs.mean() / mine.mean())))
 
@@ -180,7 +185,8 @@ def confidence(
 
     What closes little beside what is left may mend a little of what no effect is: so it
     was in generated machines, known effects beside unknown ones among them
-    (`benchmarks.gap_confidence`).
+    (`benchmarks.gap_confidence`). What leaves nothing open is sure however small the
+    gap was.
 
     Args:
         lost: its `cost`.

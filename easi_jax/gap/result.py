@@ -52,8 +52,8 @@ class Found:
         fitted: value of each of the place's columns, by its number among them.
         deviations: standard deviations of those that the fit moved.
         parts: of a shared effect (`Place.shared`), the actuators that it is seen at.
-        cost: of taking it out, in cross-validated log density: nats for each
-            independent number that was read.
+        cost: of taking it out [nats for each independent number that was read]
+            (`easi_jax.gap.model_comparison.cost`).
         outcome: how the fit of its numbers ended.
     """
 

@@ -578,10 +578,19 @@ def test_twins_predict_the_same() -> None:
         assert not are_twins(one, other)
 
 
-def test_the_cost_is_a_difference_of_log_densities() -> None:
-    """Of Gaussian numbers whose spread is twice as wide: log 2 each."""
+def test_the_cost_is_what_is_open_without_an_effect_by_what_is_open_with_it() -> None:
+    """Far beyond the noise a difference of log densities: of Gaussian numbers whose
+    spread is twice as wide, log 2 each."""
     loss = np.random.default_rng(0).uniform(1.0, 2.0, 10)
-    assert cost(of_loss(loss), of_loss(4 * loss)) == pytest.approx(np.log(2))
+    far = 1e4 * loss
+    assert cost(of_loss(far), of_loss(4 * far)) == pytest.approx(np.log(2), rel=1e-3)
+    # The one effect that a gap of three floors lacks is missed as surely as that of a
+    # gap of thirty that it closes as well.
+    small, large = (of_loss(np.full(10, float(x) ** 2)) for x in (3, 30))
+    closed, nearly = of_loss(np.ones(10)), of_loss(np.full(10, 12.5))
+    assert cost(closed, small) == pytest.approx(cost(nearly, large), abs=0.1)
+    assert confidence(cost(closed, small), 0.0) > 0.9
+    assert cost(closed, closed) == 0.0
     # A force limit that one block of ten meets costs as much as that one says.
     met = np.where(np.arange(10) == 3, 1e4, loss)
     assert cost(of_loss(loss), of_loss(met)) > 2.0
