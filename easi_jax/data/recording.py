@@ -27,8 +27,8 @@ class Run:
         time: measured time, s, ``(T,)``.
         qpos: positions, m, rad and unit quaternions (w x y z), ``(T, nq)``.
         qvel: velocities, m/s and rad/s, ``(T, nv)``.
-        qvel_measured: True where every velocity comes from the log, hidden ones
-            aside; else those that are missing are derived from the positions.
+        qvel_measured: True where velocities come from the log, hidden ones aside, but
+            in a few rows; those that are missing are derived from the positions.
         ctrl: command sent from this row to the next, ``(T, nu)``.
         sensors: readings by sensor name, ``(T, dim)``; NaN where there was none.
         configuration: where quaternions lie in ``qpos``.

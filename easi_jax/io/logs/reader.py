@@ -44,6 +44,9 @@ from easi_jax.model.joint_space import FREE_WIDTH, Configuration, given_name, nu
 PathLike = str | os.PathLike[str]
 
 HOLE_STEPS = 3.0
+# Share of the rows with a velocity, from which on a joint's count as measured: what is
+# estimated in the others has less noise, so that the noise told is at most 3 % low.
+_GIVEN = 0.95
 _HELD_WITHIN = 0.05  # m and rad that a stand may give, and readings be off
 
 
@@ -482,8 +485,10 @@ class _Reader:
         hidden = joint_dofs(self.model, self.hidden)
         columns_given = given.any(0)
         lacking = int(np.sum(~given[:, columns_given].all(1)))
+        measured = bool((given[:, ~hidden].mean(0) >= _GIVEN).all())
         if lacking:
-            self.note(f"{name}: velocities missing in {lacking} rows are estimated")
+            so = "" if measured else ", and no velocity counts as measured"
+            self.note(f"{name}: velocities missing in {lacking} rows are estimated{so}")
         run = Run(
             name=name,
             source=str(self.path),
@@ -491,7 +496,7 @@ class _Reader:
             time=rows.time,
             qpos=rows.qpos,
             qvel=np.where(given, rows.qvel, fitted),
-            qvel_measured=bool(given[:, ~hidden].all()),
+            qvel_measured=measured,
             ctrl=rows.ctrl,
             configuration=self.configuration,
             sensors=rows.sensors,

@@ -297,15 +297,21 @@ def test_velocities_of_some_joints(tmp_path, cart, flyer):
     assert '"qvel.base.0" needs "qvel.base.1"' in text
 
 
-def test_missing_velocity_cells_are_estimated_and_counted(tmp_path, cart):
+@pytest.mark.parametrize(("lost", "measured"), [([3, 9], True), ([3, 9, 20], False)])
+def test_missing_velocity_cells_are_estimated_and_counted(
+    tmp_path, cart, lost, measured
+):
+    """A few of them are no reason to leave all velocities aside."""
     columns = cart_columns()
     columns |= {"qvel.slider": np.full(ROWS, 7.0), "qvel.pole": np.full(ROWS, 8.0)}
-    columns["qvel.pole"][[3, 9]] = np.nan
+    columns["qvel.pole"][lost] = np.nan
     log = read_logs(save(tmp_path / "a.csv", columns), cart)
     (run,) = log.runs
     assert len(run) == ROWS
-    assert "2 rows are estimated" in said(log, "velocities missing")
-    assert not run.qvel_measured
+    note = said(log, "velocities missing")
+    assert f"{len(lost)} rows are estimated" in note
+    assert ("no velocity counts as measured" in note) == (not measured)
+    assert run.qvel_measured == measured
     assert abs(run.qvel[3, 1]) < 1.0
     assert run.qvel[4, 1] == 8.0
 
