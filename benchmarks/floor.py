@@ -275,6 +275,7 @@ def solve(case: Case) -> dict[str, Any]:
         "strength": size,
         "verdict": told["verdict"],
         "named": keys_of(told["effects"]),
+        "confidence": [e["confidence"] for e in told["effects"]],
         "gap": told["gap"],
         "ratio": told["gap"]["after"] / told["gap"]["floor"],
         "refit_ratio": told["gap"]["refit"] / told["gap"]["floor"],
