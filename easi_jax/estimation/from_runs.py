@@ -582,7 +582,8 @@ def _contradiction(
     if diverged(alone, space.names):
         return []
     known = identifiability(space, np.asarray(alone.hessian))
-    off = np.asarray(alone.fit - found.fit, float) * known.scale
+    fits = [np.asarray(raised_to_range(space, e.fit), float) for e in (alone, found)]
+    off = (fits[0] - fits[1]) * known.scale
     std = known.std * float(widened(alone.excess))
     far = known.determined & (np.abs(off) > np.maximum(_FAR * std, _DIFFERENT))
     if not far.any():

@@ -329,7 +329,7 @@ class Analysis:
         for _ in own:
             if search.at.stuck(model):
                 # A wrong name moves a parameter to its bound, and a right one back.
-                model, _ = search.exchanged(model)
+                model, _ = search.exchanged(search.at.again(model))
             stuck = search.at.stuck(model)
             if not stuck:
                 break
@@ -391,7 +391,7 @@ class Analysis:
         names = ", ".join(self.space.names[i] for i in stuck)
         self.tell(f"{names}: refitted to a bound, so undone")
         for i in stuck:
-            self.places.offer(self.space.parameters[i].addresses)
+            self.search.offer(self.space.parameters[i].addresses)
         at = self.search.lengths[self.search.settles]
         at.whiten(at.neutral)
         return at.refit([i for i in base.own if i not in stuck])

@@ -105,15 +105,13 @@ class Decisions:
     """Of the noise: names whose predictions differ by less, RMS, are twins: 100
     independent rows would tell them apart by one standard error."""
 
-    twins_apart: float = 0.05
-    """Share of the windows in which twins may differ. No test: a command delay and a
-    sensor delay differ where a run begins, and only there."""
-
     even: float = 0.83
     """Nats for each number, lost without an effect, at which its name is as often wrong
     as right: half the logarithm of what is then open, by what is open with it. Fitted
     once, by maximum likelihood, to 57 names of 37 generated machines that were not
-    kept; `benchmarks.gap_confidence` tests it on others."""
+    kept, whose gaps were tens of floors (what is within `open_from` floors was not
+    reckoned with then, and is next to nothing there); `benchmarks.gap_confidence` tests
+    it on others."""
 
     steep: float = 2.6
     """How fast that changes with the logarithm of the loss; likewise."""

@@ -98,10 +98,12 @@ class Places:
             for s in p.starts[: 1 if p.row.is_sine else None]
         ]
 
-    def offer(self, addresses: Sequence[str]) -> None:
-        """Offers as effects what some of the model's own parameters would do."""
-        for address in addresses:
-            self.offered += [p for p in self.everywhere if does(p, address, self.m)]
+    def offer(self, addresses: Sequence[str]) -> list[Place]:
+        """Offers as effects what some of the model's own parameters would do, and
+        returns these."""
+        each = [p for a in addresses for p in self.everywhere if does(p, a, self.m)]
+        self.offered += each
+        return each
 
     def drop(self, gone: Sequence[Place]) -> None:
         """No longer offers these."""
@@ -142,7 +144,10 @@ class EffectSearch:
         self.lengths, self.settles, self.offered = lengths, settles, offered
         self.tell = tell
         self.at = lengths[settles]
-        self._likely: set[str] = set()  # names that promised most, at any stage
+        # Of a larger robot, names that promised most at any stage, or came in since.
+        self._likely: set[str] | None = (
+            set() if self.at.predictor.simulator.wide else None
+        )
 
     def select(self, start: Model) -> Model:
         """A model of `at`'s windows with the effects that windows of any length show;
@@ -224,7 +229,6 @@ class EffectSearch:
             found: dict[frozenset[str], Model] = {}
             # What was taken out of the best may still be in the others.
             beam = [b for b in beam if len(b.places) <= len(model.places)]
-            most = _LIKELY if at.predictor.simulator.wide else None
             likely: set[str] = set()  # to be tried beside all sets but the first
             for parent in beam:
                 if parent is not beam[0]:
@@ -235,8 +239,10 @@ class EffectSearch:
                     if not likely or c.place.key in likely
                 ]
                 models, names = expanded(chosen, parent, more)
-                likely = likely or {*names[:most], *(p.key for p in model.places)}
-                self._likely |= likely
+                if self._likely is not None:
+                    names = names[:_LIKELY]
+                    self._likely |= {*names, *(p.key for p in model.places)}
+                likely = likely or {*names, *(p.key for p in model.places)}
                 for m in models:
                     key = keys(m)
                     if key not in found or m.loss.mean() < found[key].loss.mean():
@@ -262,6 +268,12 @@ class EffectSearch:
             model = chosen.richer(model, self.offered.candidates(model.places))
         return model
 
+    def offer(self, addresses: Sequence[str]) -> None:
+        """Offers as effects what some of the model's own parameters would do."""
+        new = self.offered.offer(addresses)
+        if self._likely is not None:
+            self._likely |= {p.key for p in new}
+
     def rivals(self, model: Model, place: Place) -> list[Model]:
         """Other names refitted in the place of one effect, best first."""
         chosen = self.at.selector
@@ -270,7 +282,7 @@ class EffectSearch:
             c
             for c in self.offered.candidates(model.places)
             if c.place.key != place.key
-            and (not self._likely or c.place.key in self._likely)
+            and (self._likely is None or c.place.key in self._likely)
         ]
         short = shortlist(screened(chosen, without, others))
         out = chosen.fitted(without.places, without.fit, short)
@@ -345,7 +357,8 @@ class EffectSearch:
         without = {p.key: self.at.without(model, [p]) for p in model.places}
         costs = {key: cost(model, less) for key, less in without.items()}
         for place in sorted(model.places, key=lambda p: costs[p.key]):
-            odds = odds_of(last(model, place), rivals[place.key][:RIVALS])
+            among = rivals[place.key][:RIVALS]
+            odds = odds_of(last(model, place), among, self.at.windows.led)
             if confidence(costs[place.key], odds) >= DECIDE.probable:
                 continue
             if not self.at.misses(model.fit.x, without[place.key].fit.x):

@@ -264,7 +264,7 @@ class Fitting:
         return self._noises(error)
 
     def pull_of_starts(self, model: Model) -> np.ndarray:
-        """What the score of a fit is on average where its starts are as read and the
+        """What the score of a fit is, typically, where its starts are as read and the
         model is right, by size of a difference of each active entry, ``(a,)``.
 
         Where feet stick and slip, slopes go with the noise of a start, and what goes

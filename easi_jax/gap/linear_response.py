@@ -67,6 +67,8 @@ class LinearResponse:
         self._offsets.reshape(-1, p.size)[: len(moved)] = moved
         self.middle: Physics
         self._linearize()
+        index = (blocks[:, None] * BLOCK + np.arange(BLOCK)).reshape(-1)[: self.count]
+        self._later = p.later(x, p.windows.take(np.minimum(index, len(p.windows) - 1)))
         self.holds = self._checked(moved)
 
     def covers(self, vectors: np.ndarray) -> np.ndarray:
@@ -103,6 +105,10 @@ class LinearResponse:
             state += np.einsum("wij,bwj->bwi", by[:, k], torque[:, :, k])
             path[:, :, k] = state[..., : 2 * nv]
         each = _each_row(path, self.rows)[:, : self.count]
+        if self._later.any():
+            ends = 2 * each[:, :, -1:] - each[:, :, -2:-1]
+            ahead = np.diff(np.concatenate([each, ends], 2), axis=2)
+            each += np.tile(self._later, 2)[:, None] * ahead
         return self.predictor.whole(each[..., :nv], each[..., nv:])
 
     # -- programs --------------------------------------------------------------

@@ -168,12 +168,13 @@ def cost(model: Model, less: Model) -> float:
     """What is left open without an effect, by what is left open with it: half the
     logarithm, so nats for each independent number that was read.
 
-    Open is what a cross-validated loss exceeds the noise by, whose own is 1 and known
-    as well as `Decisions.closed` says. Blocks of time are averaged before or after the
+    Open is what a cross-validated loss exceeds the noise by, whose own is 1 or a little
+    less. What is within `Decisions.open_from` times the noise may be of any cause, and
+    counts as left open by both. Blocks of time are averaged before or after the
     logarithm, whichever is more: what acts seldom shows in few of them.
     """
-    known = DECIDE.closed**2 - 1.0
-    mine, theirs = (np.maximum(m.loss - 1.0, 0.0) + known for m in (model, less))
+    anyway = DECIDE.open_from**2 - 1.0
+    mine, theirs = (np.maximum(m.loss - 1.0, 0.0) + anyway for m in (model, less))
     each = np.mean(np.log(theirs / mine))
     return 0.5 * float(max(each, np.log(theirs.mean() / mine.mean())))
 
@@ -185,8 +186,7 @@ def confidence(
 
     What closes little beside what is left may mend a little of what no effect is: so it
     was in generated machines, known effects beside unknown ones among them
-    (`benchmarks.gap_confidence`). What leaves nothing open is sure however small the
-    gap was.
+    (`benchmarks.gap_confidence`).
 
     Args:
         lost: its `cost`.
@@ -199,16 +199,20 @@ def confidence(
     return 1.0 / (1.0 + (even / lost) ** steep) / (1.0 + odds)
 
 
-def odds_of(mine: Model, rivals: Sequence[Model]) -> float:
-    """Of all rivals of a model together, but its twins."""
-    each = [probability(mine, r) for r in rivals if not are_twins(mine, r)]
+def odds_of(mine: Model, rivals: Sequence[Model], led: np.ndarray) -> float:
+    """Of all rivals of a model together, but its twins; ``led`` as in `are_twins`."""
+    each = [probability(mine, r) for r in rivals if not are_twins(mine, r, led)]
     return sum((1 - p) / max(p, _UNLIKELY) for p in each)
 
 
-def are_twins(model: Model, rival: Model) -> bool:
-    """Whether two models predict the same, so that no such data tell them apart; but in
-    few windows, as in those that a run begins with, before which nothing is known."""
+def are_twins(model: Model, rival: Model, led: np.ndarray) -> bool:
+    """Whether two models predict the same, so that no such data tell them apart; but
+    where a run begins, before which nothing is known: there a late command and a late
+    reading differ.
+
+    Args:
+        led: windows with as many rows before them as readings can be late, ``(W,)``.
+    """
     mine, theirs = model.fit.residual, rival.fit.residual
-    each = np.sort(((mine - theirs) ** 2).mean(-1))
-    most = each[: len(each) - int(DECIDE.twins_apart * len(each))]
-    return bool(np.sqrt(most.mean()) < DECIDE.twins)
+    each = ((mine - theirs) ** 2).mean(-1)
+    return bool(np.sqrt(each[led if led.any() else ~led].mean()) < DECIDE.twins)

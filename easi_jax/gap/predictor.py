@@ -71,6 +71,7 @@ _ITEMS = 4  # that a core works on together: many requests ask for few
 _STEPPED = 16  # likewise, where each physics step is a call: most of it is the calling
 _ACCELERATOR_ITEMS = 256
 _ROW = 0.01  # s of it at a time
+_ROUNDED = 1e-5  # rows that a time may be off by rounding in single precision
 _PASSES = 3  # by which a reading is undone: each leaves a tenth of what is left
 
 
@@ -269,7 +270,9 @@ class Predictor:
     def read(self) -> np.ndarray:
         """Which of the numbers that are compared there are, 1 or 0, ``(W, H + 1,
         channels)``."""
-        sensed = self._sensors_of(self.windows.known, 1.0)
+        begin = self.windows.speed.shape[1] // 2  # its row in `WindowSet.known`
+        known = self.windows.known[:, begin : begin + self.steps + 1]
+        sensed = self._sensors_of(known, 1.0)
         motion = np.ones((*sensed.shape[:2], self.nv))
         fast = motion * (np.arange(self.steps + 1) < self._started)[:, None]
         return np.concatenate([motion, sensed, fast], 2)[..., : self.channels]
@@ -353,15 +356,26 @@ class Predictor:
 
         Where readings are late they are those of other times than the window's.
         """
-        e = self.layout.effects(jnp.asarray(x[self.own :], jnp.float32))
-        late = np.asarray(e.late, float) / self.simulator.dt
-        early = windows.led[:, None] * late.max(initial=0.0)  # (W, 1)
-        start = windows.row[:, None] - early
-        step = np.arange(self.steps + 1)
+        late, early = self._late(x, windows)
+        start, step = windows.row[:, None] - early, np.arange(self.steps + 1)
         readings = (start + late)[:, None] + step[:, None]
         commands = start + step[:-1]
-        ahead = np.ceil(readings - 1e-6)  # as readings are compared; but for rounding
+        ahead = np.ceil(readings - _ROUNDED)  # as readings are compared
         return Rows(ahead.astype(int), np.round(commands).astype(int))
+
+    def later(self, x: np.ndarray, windows: WindowSet) -> np.ndarray:
+        """How many rows after what is simulated the rows are that it is compared with,
+        less than one, ``(W, nv)``."""
+        late, early = self._late(x, windows)
+        rows = late - early
+        return np.maximum(np.ceil(rows - _ROUNDED) - rows, 0.0)
+
+    def _late(self, x: np.ndarray, windows: WindowSet) -> tuple[np.ndarray, np.ndarray]:
+        """By how many rows joints read late, ``(nv,)``, and simulations of windows
+        begin early, ``(W, 1)``."""
+        e = self.layout.effects(jnp.asarray(x[self.own :], jnp.float32))
+        late = np.asarray(e.late, float) / self.simulator.dt
+        return late, windows.led[:, None] * late.max(initial=0.0)
 
     def _program(self, left_out: tuple[str, ...], batch: int) -> Any:
         """A compiled one. For an arm MJX's take a minute each, so side by side."""
@@ -444,7 +458,7 @@ class Predictor:
         qs = jnp.concatenate([q[None], qs[:count]])
         vs = jnp.concatenate([physics.qvel[None], vs[:count]])
         path = difference(window.start_qpos, zero, qs, zero)[:, :nv]
-        after = jnp.ceil(now) - now
+        row, after = _ahead(now)
         path = _later(path + self._misread(model, window, qs, vs), after)
         error = path + e.bias - read
         turn = 2 * jnp.pi
@@ -453,10 +467,11 @@ class Predictor:
         if self.sensors:
             out.append(self._sensor_errors(window, early, readings))
         if self.speeds:
-            begun, row = slice(self._started + 1), jnp.arange(self._started)[:, None]
+            begun = slice(self._started + 1)
             fast = vs[begun] + self._misread_speed(model, window, qs[begun], vs[begun])
             fast = _later(fast, after)[: self._started]
-            fast -= _between(window.read_speed, jnp.ceil(now) + row)
+            row += jnp.arange(self._started)[:, None]
+            fast -= _between(window.read_speed, row)
             out.append(jnp.pad(fast, [(0, len(vs) - len(fast)), (0, 0)]))
         return jnp.concatenate(out, 1)
 
@@ -474,16 +489,18 @@ class Predictor:
         ``readings (H + 1, 2, N)``."""
         start = len(window.speed) // 2
         first = start - early / self.simulator.dt
-        row = jnp.ceil(first) + jnp.arange(self.steps + 1)
+        row, after = _ahead(first)
+        row += jnp.arange(self.steps + 1)
         read = jnp.broadcast_to(row[:, None], (len(row), len(self.sensors)))
+        known = _between(window.known, read) > 0
         read = _between(window.sensed, read)
         readings = self.sensors.reading.alike(readings, read[:, None])
-        after = jnp.broadcast_to(jnp.ceil(first) - first, (2 * len(self.sensors),))
-        flat = _later(readings.reshape(len(readings), -1), after)
+        flat = readings.reshape(len(readings), -1)
+        flat = _later(flat, jnp.broadcast_to(after, flat.shape[1:]))
         readings = flat.reshape(readings.shape)
         begins, ends = readings[:, 0] - read, readings[:-1, 1] - read[1:]
         each = jnp.concatenate([begins, jnp.pad(ends, [(1, 0), (0, 0)])], 1)
-        return jnp.where(jnp.tile(window.known, 2) > 0, each, 0.0)
+        return jnp.where(jnp.tile(known, 2), each, 0.0)
 
     def _misread(
         self, model: Model, window: Window, qs: jax.Array, vs: jax.Array
@@ -540,7 +557,8 @@ class Predictor:
         w, simulator, e, nv = window, self.simulator, model.effects, self.nv
         assert e is not None
         early, now = self._when(w, e)
-        read = _between(w.read, jnp.ceil(now) + jnp.arange(self.steps + 1)[:, None])
+        row = _ahead(now)[0] + jnp.arange(self.steps + 1)[:, None]
+        read = _between(w.read, row)
         first, v = (_between(x, now[None])[0] for x in (w.read, w.speed))
         q, v = self._true(model, w, simulator.move(w.start_qpos, first - e.bias), v)
         q = simulator.move(q, moved[:nv])
@@ -686,6 +704,13 @@ def _between(x: jax.Array, row: jax.Array) -> jax.Array:
     third = 2 * (b - c) + slope_b + slope_c
     second = 3 * (c - b) - 2 * slope_b - slope_c
     return b + s * (slope_b + s * (second + s * third))
+
+
+def _ahead(now: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The first row that is not before ``now``, but for rounding, and how many rows
+    later it is, at least none."""
+    row = jnp.ceil(now - _ROUNDED)
+    return row, jnp.maximum(row - now, 0.0)
 
 
 def _later(x: jax.Array, rows: jax.Array) -> jax.Array:

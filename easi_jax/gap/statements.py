@@ -189,7 +189,7 @@ class _Judge:
                 other = rival.places[-1]
                 singles = self.search.offered.singles(other)
                 same += singles if other.shared else [other]
-        return odds_of(mine, rivals[:RIVALS]), same
+        return odds_of(mine, rivals[:RIVALS], self.at.windows.led), same
 
     def _parts(self, x: np.ndarray, place: Place, whole: Figures) -> tuple[Part, ...]:
         """The actuators that a shared effect is seen at: without it at one of them the

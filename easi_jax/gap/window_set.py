@@ -45,8 +45,7 @@ class WindowSet:
         led: whether the run has as many rows before the window as readings can be late.
         sensed: readings of N numbers of sensors in the rows of ``read``,
             ``(W, 2 L + 2 + H, N)``.
-        known: which of these there are, in the rows from the window's begin to its
-            end, ``(W, H + 1, N)``, 1 or 0.
+        known: which of these there are, 1 or 0.
         last: command of the row after the last step, which sensors of forces may read
             there, ``(W, nu)``.
         time: of the row where the window begins, ``(W,)`` [s].
@@ -159,7 +158,7 @@ def _windows_of(
         read_speed=run.qvel[inside(seen)],
         led=w.start_row >= late,
         sensed=sensors.readings(run)[inside(seen)],
-        known=1.0 * sensors.known(run)[start + np.arange(steps + 1)],
+        known=1.0 * sensors.known(run)[inside(seen)],
         last=run.ctrl[w.start_row + steps],
         time=times(run)[w.start_row],
         hidden=law_states(m, run)[w.start_row],

@@ -293,7 +293,10 @@ class _Reader:
             if group[0] not in table.columns and j not in self.hidden
         ]
         if estimated:
-            self.note(f"velocities estimated from positions: {', '.join(estimated)}")
+            some = len(estimated) + len(self.hidden) < len(self.columns.joints)
+            so = "; so no velocity counts as measured" if some else ""
+            names = ", ".join(estimated)
+            self.note(f"velocities estimated from positions: {names}{so}")
         return runs
 
     def _why_no_runs(self, raw: Rows) -> str:
@@ -456,6 +459,9 @@ class _Reader:
         holes = int(np.sum(good[1:] & good[:-1] & ~follows))
         if holes:
             self.note(f"{name}: holes longer than {HOLE_STEPS:.0f} steps: {holes}")
+        hidden = joint_dofs(self.model, self.hidden)
+        given = np.isfinite(raw.qvel[rows[good]][:, ~hidden])
+        measured = bool((given.mean(0) >= _GIVEN).all())
         runs: list[Run] = []
         single = sum(len(piece) < 2 for piece in pieces)
         if single:
@@ -463,12 +469,14 @@ class _Reader:
         for piece in pieces:
             if len(piece) >= 2:
                 suffix = f"#{len(runs) + 1}" if len(pieces) - single > 1 else ""
-                runs.append(self._run(name + suffix, raw.take(rows[piece]), dt))
+                part = raw.take(rows[piece])
+                runs.append(self._run(name + suffix, part, dt, measured))
         if len(runs) > 1:
             self.note(f"{name} split into {len(runs)} runs")
         return runs
 
-    def _run(self, name: str, rows: Rows, dt: float) -> Run:
+    def _run(self, name: str, rows: Rows, dt: float, measured: bool) -> Run:
+        """A run; ``measured``: whether velocities of its recording are."""
         stamps = sent = None
         if not is_even(rows.time, dt):
             stamps, held = rows.time, rows.ctrl
@@ -485,7 +493,6 @@ class _Reader:
         hidden = joint_dofs(self.model, self.hidden)
         columns_given = given.any(0)
         lacking = int(np.sum(~given[:, columns_given].all(1)))
-        measured = bool((given[:, ~hidden].mean(0) >= _GIVEN).all())
         if lacking:
             so = "" if measured else ", and no velocity counts as measured"
             self.note(f"{name}: velocities missing in {lacking} rows are estimated{so}")

@@ -40,6 +40,7 @@ ELSEWHERE = {
     },
     "predictor": {
         *("BLOCK", "_ITEMS", "_STEPPED", "_ACCELERATOR_ITEMS", "_ROW", "_PASSES"),
+        "_ROUNDED",
     },
     "result": {"_ANYTHING", "_ALIKE"},
     "screening": {

@@ -61,7 +61,7 @@ def simulator() -> tuple[WindowSet, list[Run]]:
         read_speed=np.repeat(run.qvel[rows][:, None], H + 2, 1),
         led=rows >= 0,
         sensed=np.zeros((len(rows), H + 2, 0)),
-        known=np.ones((len(rows), H + 1, 0)),
+        known=np.ones((len(rows), H + 2, 0)),
         last=run.ctrl[rows + H],
         time=TIME[rows],
         hidden=np.zeros((len(rows), 0)),

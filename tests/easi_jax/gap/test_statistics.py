@@ -564,18 +564,21 @@ def test_what_costs_much_to_take_out_is_sure() -> None:
 
 def test_twins_predict_the_same() -> None:
     rng = np.random.default_rng(0)
-    one = of_loss(np.ones(10))
+    one, led = of_loss(np.ones(10)), np.arange(20) > 1
     one.fit = replace(one.fit, residual=rng.normal(size=(20, 30)))
     for size, same in ((0.05, True), (0.2, False)):
         moved = one.fit.residual + size * rng.normal(size=(20, 30))
         other = of_loss(np.ones(10))
         other.fit = replace(other.fit, residual=moved)
-        assert are_twins(one, other) == same
-        # A run's first window may tell a late command from a late reading.
-        moved[0] += 1.0
-        assert are_twins(one, other) == same
-        moved[1] += 1.0
-        assert not are_twins(one, other)
+        assert are_twins(one, other, led) == same
+        # Where a run begins, a late command may be told from a late reading.
+        moved[:2] += 1.0
+        assert are_twins(one, other, led) == same
+        # Where all windows begin runs, there are no others to go by.
+        assert not are_twins(one, other, np.zeros(20, bool))
+        # A limit acts in few windows, and is no twin of what does nothing there.
+        moved[2] += 1.0
+        assert not are_twins(one, other, led)
 
 
 def test_the_cost_is_what_is_open_without_an_effect_by_what_is_open_with_it() -> None:
@@ -584,13 +587,13 @@ def test_the_cost_is_what_is_open_without_an_effect_by_what_is_open_with_it() ->
     loss = np.random.default_rng(0).uniform(1.0, 2.0, 10)
     far = 1e4 * loss
     assert cost(of_loss(far), of_loss(4 * far)) == pytest.approx(np.log(2), rel=1e-3)
-    # The one effect that a gap of three floors lacks is missed as surely as that of a
-    # gap of thirty that it closes as well.
-    small, large = (of_loss(np.full(10, float(x) ** 2)) for x in (3, 30))
-    closed, nearly = of_loss(np.ones(10)), of_loss(np.full(10, 12.5))
-    assert cost(closed, small) == pytest.approx(cost(nearly, large), abs=0.1)
-    assert confidence(cost(closed, small), 0.0) > 0.9
-    assert cost(closed, closed) == 0.0
+    # What closes all of a gap of three floors is sure; what is within 1.25 floors may
+    # be of any cause, and a loss of a little less than 1 is that of a right model.
+    right = of_loss(np.full(10, 0.9))
+    costs = [cost(right, of_loss(np.full(10, x**2))) for x in (0.9, 1.0, 1.25, 2, 3)]
+    assert costs == sorted(costs) and costs[:2] == [0.0, 0.0]
+    sure = [confidence(c, 0.0) for c in costs]
+    assert sure[2] < 0.15 and 0.5 < sure[3] < 0.7 and 0.75 < sure[4] < 0.9
     # A force limit that one block of ten meets costs as much as that one says.
     met = np.where(np.arange(10) == 3, 1e4, loss)
     assert cost(of_loss(loss), of_loss(met)) > 2.0
