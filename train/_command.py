@@ -4,6 +4,8 @@ Imports no jax, so that ``--help`` is quick; a command's ``run`` imports what it
 """
 
 import contextlib
+import errno
+import io
 import os
 import re
 import sys
@@ -33,6 +35,11 @@ _PARTED = (
     "error: another process of this run has ended, so this one ends too; start all "
     "again with --resume, and they go on from the last checkpoint"
 )
+# What a user can mend: rights, names, links in circles, full or read-only disks.
+_OF_SYSTEM = {
+    *(errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.EROFS),
+    *(errno.ENOSPC, errno.EDQUOT),
+}
 # What gloo, NCCL and jax's coordination service say of a lost process.
 _GONE = ("Gloo", "gloo", "NCCL", "Connection", "UNAVAILABLE", "DEADLINE", "ABORTED")
 
@@ -84,6 +91,9 @@ def main(
     """
     import tyro
 
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # names of files may be any bytes
+            stream.reconfigure(errors="backslashreplace")
     try:
         config = tyro.cli(config_class, prog=f"python -m {name}", args=args)
     except BrokenPipeError:
@@ -108,12 +118,25 @@ def main(
         told = isinstance(error, KeyboardInterrupt) or _interrupt.asked()
         if not told and _parted(error):
             _stop(_PARTED, 1, args is None)
+        if not told and (reason := _outside(error)):
+            _stop(f"error: {_line(reason)}", USER_ERROR, args is None)
         if not told or isinstance(error, SystemExit):
             _leave_others(error)
             raise
         out = getattr(config, "out", None)
         left = _left(out, hasattr(config, "resume"))
         _stop(f"interrupted{left}", INTERRUPTED, args is None)
+
+
+def _outside(error: BaseException) -> str:
+    """What the system, or MuJoCo, says of a file or a model; empty for what may be this
+    program's own fault."""
+    if isinstance(error, OSError) and error.errno in _OF_SYSTEM:
+        return ": ".join(str(x) for x in (error.filename, error.strerror) if x)
+    engine = sys.modules.get("mujoco")
+    if engine and isinstance(error, engine.FatalError):
+        return f"MuJoCo cannot simulate this model: {error}"
+    return ""
 
 
 @contextlib.contextmanager

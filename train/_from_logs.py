@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from train._command import say, show_table
 from train._effects import read_given
-from train._log_problem import read_problem
+from train._log_problem import files_of, read_problem
 
 if TYPE_CHECKING:
     from easi_jax.estimation.problem import Problem
@@ -26,6 +26,7 @@ def run(config: Any) -> None:
         command="train.easi",
         resume=config.resume,
         overwrite=config.overwrite,
+        files=files_of(config),
     ) as folder:
         from easi_jax.devices.distributed import started
         from easi_jax.estimation.from_runs import ready_finish, search_data

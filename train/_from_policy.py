@@ -30,6 +30,7 @@ def run(config: Any) -> None:
     from easi_jax.pipeline.stages import seed_keys
     from easi_jax.search.unpaired import Simulations
     from train._from_logs import searched, show
+    from train._log_problem import files_of
 
     search, data = problem.search(settings), problem.data()
     simulated = Simulations(search, data)
@@ -41,6 +42,7 @@ def run(config: Any) -> None:
         command="train.easi",
         resume=config.resume,
         overwrite=config.overwrite,
+        files=files_of(config),
     ) as folder:
         states = searched(folder, config, search, data, problem.notes, seeds)
         given = problem, simulated, stand

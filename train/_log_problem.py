@@ -52,12 +52,19 @@ def read_runs(config: Any, mj_model: Any, horizon: float) -> "MeasuredRuns":
     fit_files = [p for p in config.data if os.path.realpath(p) not in kept_out]
     if not fit_files:
         raise UserError("--held-out names all of --data: leave a log to fit")
-    how = config.mapping, config.unmeasured
-    log = read_logs(fit_files, mj_model, *how)
+    how, held_files = (config.mapping, config.unmeasured), list(config.held_out)
+    log = read_logs(fit_files, mj_model, *how, held_files)
     held = None
-    if config.held_out:
-        held = read_logs(list(config.held_out), mj_model, *how)
+    if held_files:
+        held = read_logs(held_files, mj_model, *how, fit_files)
     return measured_runs(mj_model, log, held, horizon)
+
+
+def files_of(config: Any) -> list[Path]:
+    """What a command reads: model, parameters, mapping, logs, the user's effects."""
+    each = (config.model, config.parameters, config.mapping)
+    files = [Path(p) for p in each if p]
+    return [*files, *config.data, *config.held_out, *config.effects_from]
 
 
 def model_and_space(config: Any) -> tuple[str, Any, Any]:

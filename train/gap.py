@@ -28,6 +28,7 @@ def run(config: Config) -> None:
         check_robot(config.retrain, problem.model.mj_model, config.retrain_steps)
     from easi_jax.gap.analysis import Analysis
     from easi_jax.io.runs.step_cache import Journal, key_of
+    from train._log_problem import files_of
 
     analysis = Analysis(
         problem.model.mj_model,
@@ -47,6 +48,7 @@ def run(config: Config) -> None:
         command="train.gap",
         resume=config.resume,
         overwrite=config.overwrite,
+        files=files_of(config),
     ) as folder:
         journal = folder.checkpoints / "analysis"
         if folder.resumed and not journal.exists() and (folder.path / REPORT).exists():

@@ -343,7 +343,8 @@ def _kept_noise(run: Run) -> np.ndarray:
         return np.ones(len(_ORDERS))
     noise = np.random.default_rng(0).normal(size=(_COPIES, len(run.stamps)))
     rows = np.stack([np.interp(run.time, run.stamps, x) for x in noise], 1)
-    return np.median(_by_order(rows, 0, np.median, _MAD), 1)
+    orders = _by_order(rows, 0, np.median, _MAD)
+    return np.median(orders, 1) if len(orders) else np.ones(len(_ORDERS))
 
 
 def resolutions(run: Run) -> np.ndarray:

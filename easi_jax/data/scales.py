@@ -32,6 +32,7 @@ def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
         span = max(1, round(0.02 / run.dt))
         start = np.broadcast_to(m.qpos0, run.qpos.shape)
         moved = run.configuration.difference(start, run.qpos)
+        span = min(span, len(run) - 1)
         for i in range(0, len(run) - span, stride):
             d.qpos[:], d.qvel[:] = run.qpos[i], v[i]
             d.qacc[:] = (v[i + span] - v[i]) / (span * run.dt)

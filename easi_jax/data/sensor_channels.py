@@ -239,10 +239,12 @@ class _NativeReading:
 
 
 def measured_sensors(
-    m: mujoco.MjModel, runs: Sequence[Run]
+    m: mujoco.MjModel, runs: Sequence[Run], fit: Sequence[Run] = ()
 ) -> tuple[Sensors, dict[str, str]]:
-    """Sensors that can be compared with predictions in all of ``runs``, and why others
-    of them are left out, by channel."""
+    """Sensors that can be compared with predictions in all of ``runs``, and have a
+    noise in those to ``fit`` (all where not given); and why others are left out, by
+    channel."""
+    noises = sensor_noise(fit or runs)
     numbers: list[SensorNumber] = []
     ignored: dict[str, str] = {}
     for i in range(m.nsensor):
@@ -250,6 +252,8 @@ def measured_sensors(
         if not any(name in run.sensors for run in runs):
             continue
         why, kind = _why_not(m, i, runs), sensor_kind(m, i)
+        if not why and name not in noises:
+            why = "hardly any readings in the data that are fitted"
         first = sensor_columns(m, i).start
         for k in range(dim):
             channel = f"sensor.{name}" if dim == 1 else f"sensor.{name}.{k}"

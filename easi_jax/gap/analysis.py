@@ -103,7 +103,7 @@ class Analysis:
         fit, held, noise, self._notes = with_speeds(*given)
         dt, runs = fit[0].dt, [*fit, *held]
         scales = scales_of(mj_model, fit)
-        sensors, self._ignored = measured_sensors(mj_model, runs)
+        sensors, self._ignored = measured_sensors(mj_model, runs, fit)
         self.places = Places(mj_model, space, scales, only)
         shown = [*self.places.everywhere, *self.places.ripples]
         layout = Layout(mj_model, shown)

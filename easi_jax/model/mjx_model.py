@@ -176,6 +176,11 @@ def simulated(m: mujoco.MjModel) -> None:
     Raises:
         UserError: what it is, and what to do.
     """
+    if not 0.0 < m.opt.timestep < float("inf"):
+        raise UserError(
+            f"the timestep is {m.opt.timestep:g} s, and has to be positive: write "
+            '<option timestep="0.002"/> in the model file'
+        )
     shared = mujoco.mjtEnableBit.mjENBL_SLEEP | mujoco.mjtEnableBit.mjENBL_IPC
     if m.opt.enableflags & shared:
         raise UserError(

@@ -1,6 +1,7 @@
 import asyncio
 import contextlib
 import dataclasses
+import errno
 import io
 import os
 import signal
@@ -11,6 +12,7 @@ import time
 from pathlib import Path
 from typing import Literal
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -91,6 +93,47 @@ def test_user_error_is_one_line_and_2(capsys):
         "",
         'error: unknown robot "antt"; did you mean "ant"?\n',
     )
+
+
+def test_what_the_system_says_is_one_line_and_2(tmp_path, capsys):
+    place = tmp_path / ("x" * 300)
+    with pytest.raises(SystemExit) as exit_:
+        _call(lambda config: place.read_text(), "--out", "a")
+    assert exit_.value.code == 2
+    said = capsys.readouterr().err.strip()
+    assert said == f"error: {place}: {os.strerror(errno.ENAMETOOLONG)}"
+    with pytest.raises(FileNotFoundError):  # may be our own fault
+        _call(lambda config: (tmp_path / "none").read_text(), "--out", "a")
+
+
+def test_what_mujoco_gives_up_on_is_one_line_and_2(capsys):
+    def run(config):
+        raise mujoco.FatalError("mj_stackAlloc: out of memory (increase <size memory>)")
+
+    with pytest.raises(SystemExit) as exit_:
+        _call(run, "--out", "a")
+    assert exit_.value.code == 2
+    said = capsys.readouterr().err
+    assert "error: MuJoCo cannot simulate this model: mj_stackAlloc" in said
+
+
+def test_names_of_files_may_be_any_bytes():
+    code = (
+        "from pathlib import Path; from dataclasses import dataclass\n"
+        "from train._command import main, say\n"
+        "@dataclass\nclass Config:\n    'Says.'\n    out: Path = Path('a')\n"
+        "main(Config, lambda c: say('note: mess_\\udcfc.csv'), name='train.thing')\n"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONUTF8": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    assert found.stdout.strip() == r"note: mess_\udcfc.csv"
 
 
 def test_programming_errors_are_not_dressed_up():

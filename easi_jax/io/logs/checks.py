@@ -1,7 +1,7 @@
 """What can be wrong with the values of a log."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -31,6 +31,9 @@ _AT_JOINT = (
     int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
 )
 _HUGE = 1e8
+# Readings so many times as far from the median as all others, in so many rows at most,
+# are codes of an error: no shock is a hundred times as strong as the next one.
+_CODE, _FEW_CODES = 100.0, 0.01
 _MOST_STEPS, _MANY_STEPS = 500, 50
 _FEWEST_STEPS, _FEW_STEPS = 0.01, 0.2
 _LATEST = 1e11  # s since 1970: the year 5138
@@ -61,6 +64,7 @@ def check_sizes(
     qpos: np.ndarray,
     qvel: np.ndarray,
     ctrl: np.ndarray,
+    sensors: Mapping[str, np.ndarray],
 ) -> None:
     """Refuses finite values that no machine has and single precision cannot hold.
 
@@ -71,6 +75,7 @@ def check_sizes(
         (columns.qpos, qpos),
         (columns.qvel, qvel),
         (columns.ctrl, ctrl),
+        *((columns.sensors[name], values) for name, values in sensors.items()),
     ):
         huge = np.argwhere(np.isfinite(values) & (np.abs(values) > _HUGE))
         if len(huge):
@@ -79,6 +84,51 @@ def check_sizes(
                 f'{path}: row {row + 1}, column "{names[column]}" holds '
                 f"{values[row, column]:.3g}, beyond any machine (limit {_HUGE:.0e})"
             )
+
+
+def without_codes(
+    sensors: Mapping[str, np.ndarray],
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Readings ``(T, dim)`` of sensors without codes of errors (-9999, 65535), NaN
+    instead, and notes.
+
+    Such a reading stands alone, or beside equal ones; a shock does not.
+    """
+    out, notes = {}, []
+    for name, given in sensors.items():
+        code = np.stack([_codes(x) for x in given.T], 1).any(1)
+        out[name] = np.where(code[:, None], np.nan, given)
+        if code.any():
+            first = int(np.flatnonzero(code)[0])
+            value = max(given[first].tolist(), key=abs)
+            notes.append(
+                f"sensor {name}: {code.sum()} of {len(code)} readings are left out, "
+                f"which look like codes of an error (the first, {value:.6g}, is in row "
+                f"{first + 1})"
+            )
+    return out, notes
+
+
+def _codes(x: np.ndarray) -> np.ndarray:
+    """Which of readings ``(T,)`` are codes of an error, bool."""
+    code = np.zeros(len(x), bool)
+    known = np.flatnonzero(np.isfinite(x))
+    read = x[known]
+    few = int(_FEW_CODES * len(read))
+    if not few:
+        return code
+    far = np.abs(read - np.median(read))
+    order = np.argsort(far)[-few - 1 :]
+    with np.errstate(over="ignore"):
+        jumps = np.flatnonzero(far[order[1:]] > _CODE * far[order[:-1]])
+    if not len(jumps) or not far[order[jumps[0]]]:
+        return code
+    odd = np.zeros(len(read), bool)
+    odd[order[jumps[0] + 1 :]] = True
+    # Beside an odd reading of another value it is no code.
+    pair = odd[1:] & odd[:-1] & (read[1:] != read[:-1])
+    code[known] = odd & ~np.append(pair, False) & ~np.append(False, pair)
+    return code
 
 
 def plausible_times(path: Path, time: np.ndarray) -> tuple[np.ndarray, list[str]]:

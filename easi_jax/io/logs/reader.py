@@ -55,6 +55,7 @@ def read_logs(
     mj_model: mujoco.MjModel,
     mapping: PathLike | None = None,
     unmeasured: Sequence[str] = (),
+    beside: Sequence[PathLike] = (),
 ) -> Log:
     """Reads logs of the machine ``mj_model`` describes.
 
@@ -76,6 +77,7 @@ def read_logs(
         mapping: mapping file for all of ``paths``, for logs in a foreign format.
         unmeasured: joints without a sensor, by name or pattern; ``all``: whatever a
             log lacks. Columns of joints that are named are not read.
+        beside: other files in use: runs of equal file names go by their paths.
 
     Returns:
         At least one run, each of at least two rows; notes on all that a user
@@ -95,7 +97,7 @@ def read_logs(
             raise UserError(f"{path} is given more than once")
     columns = log_columns(mj_model)
     names = LogMapping() if mapping is None else read_mapping(mapping)
-    stems = [path.stem for path in files]
+    stems = [Path(path).stem for path in (*files, *beside)]
     runs: list[Run] = []
     notes: list[str] = []
     for path in files:
@@ -241,7 +243,8 @@ class _Reader:
             raise UserError(f"{self.path} has {rows}; a log needs at least two")
         time, notes = log_checks.plausible_times(self.path, raw.time)
         raw = raw._replace(time=time)
-        log_checks.check_sizes(self.path, self.columns, raw.qpos, raw.qvel, raw.ctrl)
+        motion = raw.qpos, raw.qvel, raw.ctrl
+        log_checks.check_sizes(self.path, self.columns, *motion, raw.sensors)
         good = np.isfinite(raw.time)
         good &= np.isfinite(raw.qpos).all(1) & np.isfinite(raw.ctrl).all(1)
         if not good.all():
@@ -378,6 +381,9 @@ class _Reader:
                 sensors[name] = block(names)
             elif given:
                 self.note(f"sensor {name} ignored: it has {len(names)} columns")
+        sensors, codes = log_checks.without_codes(sensors)
+        for text in codes:
+            self.note(text)
         time, qpos = column("time"), block(self.columns.qpos)
         for j in self.hidden:  # a guess follows, row by row
             at = int(self.model.jnt_qposadr[j])
@@ -464,13 +470,17 @@ class _Reader:
         measured = bool((given.mean(0) >= _GIVEN).all())
         runs: list[Run] = []
         single = sum(len(piece) < 2 for piece in pieces)
-        if single:
-            self.note(f"{name}: rows left out because alone between holes: {single}")
         for piece in pieces:
             if len(piece) >= 2:
                 suffix = f"#{len(runs) + 1}" if len(pieces) - single > 1 else ""
                 part = raw.take(rows[piece])
-                runs.append(self._run(name + suffix, part, dt, measured))
+                run = self._run(name + suffix, part, dt, measured)
+                if len(run) < 2:  # rows closer than a step
+                    single += 1
+                else:
+                    runs.append(run)
+        if single:
+            self.note(f"{name}: rows left out because alone between holes: {single}")
         if len(runs) > 1:
             self.note(f"{name} split into {len(runs)} runs")
         return runs

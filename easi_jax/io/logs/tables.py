@@ -3,6 +3,7 @@
 import csv
 import io
 import os
+import re
 import zipfile
 from collections import Counter
 from collections.abc import Mapping
@@ -16,6 +17,8 @@ import pyarrow.parquet
 from easi_jax.errors import UserError
 from easi_jax.io.files import atomic_write, os_reason, regular_file
 from easi_jax.io.logs.cure import cure
+
+_SEPARATOR = re.compile(r"\Asep=.\r?\n", re.IGNORECASE)
 
 # The cells of a CSV, a 1-D array, or why the column cannot be used.
 Cells = list[str] | np.ndarray | str
@@ -112,7 +115,7 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     """
     path = Path(path)
     extension = path.suffix.lower()
-    if path.is_dir():
+    if os.path.isdir(path):  # Path.is_dir raises where a folder may not be entered
         raise UserError(f"{path} is a folder; give the log files in it")
     if extension not in EXTENSIONS:
         raise UserError(f"{path}: a log ends in {', '.join(EXTENSIONS)}")
@@ -287,9 +290,10 @@ def _parquet_column(column: pyarrow.ChunkedArray) -> np.ndarray | str:
 
 
 def _without_comments(text: str) -> str:
-    """``text`` from its header on: lines that begin with ``#`` may come before it. The
-    last of these is the header where as many numbers follow, as NumPy writes it."""
-    last, rest = "", text
+    """``text`` from its header on: lines that begin with ``#`` may come before it, and
+    the line by which a spreadsheet names its separator (``sep=;``). The last comment is
+    the header where as many numbers follow, as NumPy writes it."""
+    last, rest = "", _SEPARATOR.sub("", text, count=1)
     while rest.startswith("#"):
         last, _, rest = rest.partition("\n")
     named = last.lstrip("#").strip()

@@ -69,6 +69,7 @@ def read_mjcf(
     with mujoco_warnings() as said:
         try:
             model = mujoco.MjModel.from_xml_path(str(path))
+            model.names.decode()
             simulated(model)
             note = names_note(model)
             if note or held:
@@ -78,6 +79,10 @@ def read_mjcf(
                     model = hold(spec, model, held(model))
         except UserError as error:
             raise UserError(f"{path}: {error}") from None
+        except UnicodeDecodeError:
+            raise UserError(
+                f"{path}: a name in it is not UTF-8 text; save the file as UTF-8"
+            ) from None
         except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
             reason = " ".join(f"{error} {' '.join(said)}".split())
             raise UserError(
@@ -108,8 +113,8 @@ def check_assets(path: Path, allowed: Sequence[Path] = ()) -> None:
         UserError: such a file, a folder or a device in place of a file, a file that
             includes itself, or no XML.
     """
-    if not path.is_file():
-        raise UserError(f"{path}: no such model file")
+    if not os.path.isfile(path):  # Path.is_file raises in folders that may not be read
+        raise UserError(f"{path}: no such model file, or not to be read")
     roots = [path.parent.resolve(), *(place.resolve() for place in allowed)]
     folders, below, named = {path.parent}, {""}, set[tuple[Path | None, str]]()
     todo, seen, tried = [path], {path.resolve()}, set[tuple[Path | None, Path]]()

@@ -5,7 +5,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -30,6 +30,7 @@ VOLATILE = ("out", "resume", "overwrite", "distributed", "allow_assets")
 
 _CONFIG = "config.json"
 _ENGINE = "engine.json"
+_FILES = "files.json"  # digests of what the run reads
 _LOCK = ".lock"
 
 
@@ -65,6 +66,7 @@ class RunFolder:
         command: str = "",
         resume: bool = False,
         overwrite: bool = False,
+        files: Iterable[Path] = (),
     ) -> Self:
         """Starts a run in ``path``, or goes on with the one that is there.
 
@@ -79,11 +81,13 @@ class RunFolder:
             command: such as ``train.easi``; a run of another command is refused.
             resume: go on with the run that is there.
             overwrite: delete the run that is there.
+            files: that the run reads: it does not go on with others in their places.
 
         Raises:
             UserError: the folder is in use, not writable, holds something else, a
                 run and no word what to do with it, or a run of another
-                configuration. Nothing is changed then.
+                configuration, or of files that have changed since. Nothing is changed
+                then.
         """
         if resume and overwrite:
             raise UserError("--resume and --overwrite exclude each other: choose one")
@@ -92,7 +96,9 @@ class RunFolder:
         opened: list[Self] = []
 
         def begin() -> bool:
-            opened.append(cls._begun(folder, plain, command, resume, overwrite))
+            read = {os.fspath(p): _digest(p) for p in files if os.path.isfile(p)}
+            begun = cls._begun(folder, plain, command, resume, overwrite, read)
+            opened.append(begun)
             return opened[0].resumed
 
         resumed = distributed.from_leader(begin)
@@ -106,6 +112,7 @@ class RunFolder:
         command: str,
         resume: bool,
         overwrite: bool,
+        files: dict[str, str],
     ) -> Self:
         _refuse_foreign(folder)
         lock = _acquire(folder)
@@ -117,7 +124,7 @@ class RunFolder:
                     "--overwrite deletes it, or choose another --out"
                 )
             if known and resume:
-                _check_same(folder, command, plain)
+                _check_same(folder, command, plain, files)
             elif known:
                 _clear(folder)
             resumed = known and resume
@@ -125,6 +132,8 @@ class RunFolder:
             if not resumed:
                 head = {"format": FORMAT, "command": command, "config": plain}
                 run.write_json(_CONFIG, head)  # first: from now on it holds a run
+                if files:
+                    run.write_json(_FILES, files)
             if not (folder / "versions.json").exists():
                 run.write_json("versions.json", versions())
             if not (folder / _ENGINE).exists():
@@ -236,7 +245,14 @@ def _read_head(folder: Path) -> dict[str, Any]:
     return checked(head, CONFIG, f"{path} is not a run's configuration")
 
 
-def _check_same(folder: Path, command: str, config: dict[str, Any]) -> None:
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _check_same(
+    folder: Path, command: str, config: dict[str, Any], files: dict[str, str]
+) -> None:
     head = _read_head(folder)
     if head["command"] != command:
         raise UserError(
@@ -251,6 +267,16 @@ def _check_same(folder: Path, command: str, config: dict[str, Any]) -> None:
         raise UserError(
             f"{folder} holds a run with {_differs(name, old, config)}{more}: resume "
             "with the same settings, or choose another --out"
+        )
+    was = folder / _FILES
+    begun = checked(read_json(was), {"*": str}, str(was)) if was.exists() else {}
+    changed = [
+        name for name, digest in files.items() if begun.get(name, digest) != digest
+    ]
+    if changed:
+        raise UserError(
+            f"{changed[0]} has changed since {folder} was begun: put the file back, or "
+            "start anew with --overwrite or another --out"
         )
 
 

@@ -1,5 +1,7 @@
 """Runs and rows that are kept out of fits."""
 
+import time
+
 import mujoco
 import numpy as np
 import pytest
@@ -87,3 +89,15 @@ def test_a_run_with_no_room_for_a_prediction_is_refused():
     split_held_out(SLIDE, [make_run(np.zeros(87))], 0.2)
     with pytest.raises(UserError, match="needs 87: record more"):
         split_held_out(SLIDE, [make_run(np.zeros(86))], 0.2)
+
+
+def test_hundreds_of_runs_are_parted_at_once():
+    """As holes every few rows make them of one log."""
+    sizes = 2.0 + np.sin(np.arange(400))
+    runs = [make_run(np.zeros(20), f"r{i}", size=c) for i, c in enumerate(sizes)]
+    began = time.perf_counter()
+    fit, held, _ = split_held_out(SLIDE, runs, 0.2)
+    assert time.perf_counter() - began < 20.0
+    assert 100 <= len(held) <= 108 and len(fit) + len(held) == 400
+    top = [max(r.ctrl.max() for r in part) for part in (fit, held)]
+    assert top == pytest.approx([3.0, 3.0], rel=0.01)

@@ -152,3 +152,13 @@ def test_jumps_of_commands_are_no_noise_of_torques() -> None:
     torque = np.stack([5.0 * ctrl[:, 0] + slow, -2.0 * before + slow], 1) + white
     found = sensor_noise([_with(run, torque=torque)])["torque"]
     np.testing.assert_allclose(found.std, 0.01, rtol=0.1)
+
+
+@pytest.mark.parametrize("rows", [2, 3, 4, 8])
+def test_a_short_run_whose_rows_were_interpolated_has_a_noise(rows: int) -> None:
+    whole = _run(100, "smooth", 1e-3, 0.1)
+    cut = {k: getattr(whole, k)[:rows] for k in ("time", "qpos", "qvel", "ctrl")}
+    stamps = cut["time"] + 1e-3 * np.sin(np.arange(rows))
+    run = replace(whole, **cut, stamps=stamps, qvel_measured=False)
+    assert np.all(noise_of(run).std >= 0)
+    assert np.all(pooled([whole, run]).std > 0)

@@ -1358,3 +1358,58 @@ def test_mapping_numbers_beyond_float(tmp_path, cart):
     mapping = tmp_path / "m.yaml"
     mapping.write_text("scale: {time: 0x" + "f" * 400 + "}")
     assert "not a number" in failure(path, cart, mapping=mapping)
+
+
+def test_rows_closer_than_a_step_between_holes_are_no_run(tmp_path, cart):
+    columns = cart_columns(200)
+    columns["time"] += 1e-3 * np.sin(7 * np.arange(200))
+    columns["time"][100] = columns["time"][99] + 1e-3
+    columns["qpos.pole"][[98, 101]] = np.nan
+    log = read_logs(save(tmp_path / "a.csv", columns), cart)
+    assert [len(run) for run in log.runs] == [98, 98]
+    assert "alone between holes: 1" in said(log, "alone")
+
+
+def test_runs_of_one_file_name_in_two_folders_are_told_apart(tmp_path, cart):
+    for day in ("one", "two"):
+        (tmp_path / day).mkdir()
+        save(tmp_path / day / "run.csv", cart_columns())
+    first, other = tmp_path / "one/run.csv", tmp_path / "two/run.csv"
+    (run,) = read_logs(first, cart, beside=[other]).runs
+    assert run.name == first.as_posix()
+    (run,) = read_logs(first, cart, beside=[tmp_path / "two/held.csv"]).runs
+    assert run.name == "run"
+
+
+def test_codes_of_errors_are_no_readings(tmp_path, cart):
+    rows = 400
+    read = np.sin(0.1 * np.arange(rows))
+    shaken = np.stack([read, 0.5 * read, 9.81 + read])
+    shaken[2, 200] = 60.0  # a shock is a reading
+    columns = cart_columns(rows) | {f"sensor.imu.{i}": shaken[i] for i in range(3)}
+    columns |= {"sensor.encoder": read.copy()}
+    columns["sensor.encoder"][[7, 50, 51]] = -9999.0, 65535.0, 65535.0
+    log = read_logs(save(tmp_path / "a.csv", columns), cart)
+    (run,) = log.runs
+    gone = np.flatnonzero(~np.isfinite(run.sensors["encoder"][:, 0]))
+    assert gone.tolist() == [7, 50, 51]
+    assert np.isfinite(run.sensors["imu"]).all()
+    note = said(log, "encoder")
+    assert "3 of 400 readings" in note and "-9999, is in row 8" in note
+    assert "imu" not in note
+    # Two odd values beside each other are a shock.
+    columns["sensor.encoder"][[7, 50, 51]] = 0.0, 400.0, 300.0
+    (run,) = read_logs(save(tmp_path / "b.csv", columns), cart).runs
+    assert np.isfinite(run.sensors["encoder"]).all()
+    columns["sensor.encoder"][:] = 1e20
+    assert '"sensor.encoder" holds 1e+20' in failure(
+        save(tmp_path / "c.csv", columns), cart
+    )
+
+
+def test_a_spreadsheets_line_on_its_separator(tmp_path, cart):
+    path = save(tmp_path / "a.csv", cart_columns())
+    lines = path.read_text().replace(",", ";")
+    path.write_bytes(b"\xef\xbb\xbfsep=;\r\n" + lines.encode())
+    (run,) = read_logs(path, cart).runs
+    assert len(run) == ROWS

@@ -182,3 +182,17 @@ def test_mujocos_warnings_leave_no_file(
     with pytest.raises(UserError, match="MuJoCo cannot read this model"):
         read_mjcf(model(robot, MESH.format("noend")))
     assert sorted(robot.parent.iterdir()) == before
+
+
+def test_names_that_are_no_utf8(robot: Path) -> None:
+    path = robot / "model.xml"
+    path.write_bytes(f'<mujoco model="Pr\xfcfstand">{BODY}</mujoco>'.encode("latin-1"))
+    with pytest.raises(UserError, match="save the file as UTF-8"):
+        read_mjcf(path)
+
+
+@pytest.mark.parametrize("step", ["0", "-0.002"])
+def test_a_timestep_has_to_be_positive(robot: Path, step: str) -> None:
+    path = model(robot, f'<option timestep="{step}"/>' + BODY)
+    with pytest.raises(UserError, match="has to be positive"):
+        read_mjcf(path)

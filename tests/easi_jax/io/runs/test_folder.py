@@ -304,3 +304,20 @@ def _fails(reason):
         raise OSError(reason, os.strerror(reason))
 
     return fails
+
+
+@pytest.mark.fault("a file that a run reads has changed before --resume")
+def test_a_run_does_not_go_on_with_another_file(tmp_path):
+    log, missing = tmp_path / "log.csv", tmp_path / "none.csv"
+    log.write_text("1")
+    out, files = tmp_path / "run", [log, missing]
+    RunFolder.open(out, {"data": str(log)}, files=files).close()
+    with RunFolder.open(out, {"data": str(log)}, files=files, resume=True) as run:
+        assert run.resumed
+    log.write_text("2")
+    before = _contents(out)
+    with pytest.raises(UserError, match=r"log\.csv has changed since"):
+        RunFolder.open(out, {"data": str(log)}, files=files, resume=True)
+    assert _contents(out) == before
+    (out / "files.json").unlink()  # a run of an older version
+    RunFolder.open(out, {"data": str(log)}, files=files, resume=True).close()
