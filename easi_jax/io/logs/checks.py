@@ -96,7 +96,7 @@ def without_codes(
     """
     out, notes = {}, []
     for name, given in sensors.items():
-        code = np.stack([_codes(x) for x in given.T], 1).any(1)
+        code = np.any([_codes(x) for x in given.T], 0)
         out[name] = np.where(code[:, None], np.nan, given)
         if code.any():
             first = int(np.flatnonzero(code)[0])

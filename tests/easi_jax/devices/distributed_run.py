@@ -75,8 +75,13 @@ def run(config: Config) -> None:
         return step(state, n)
 
     given = dataclasses.replace(config, slow=0.0)
-    how = {"resume": config.resume, "overwrite": config.overwrite}
-    with RunFolder.open(config.out, given, command="walk", **how) as folder:
+    with RunFolder.open(
+        config.out,
+        given,
+        command="walk",
+        resume=config.resume,
+        overwrite=config.overwrite,
+    ) as folder:
         ready = started(lambda: jnp.ones(3) * 2)
         notes: list[str] = []
         state = run_stage(
