@@ -52,6 +52,8 @@ class Fitting:
         sticks: whether errors bend with starts: see `whiten`.
         gap, floor: of the windows where they were last whitened.
         own_steps: error of the model's own steps, in floors; 0 where it does not show.
+        unseen_steps: of predictions ``(W, T, c)``, that does not show but may move what
+            is fitted; None where there is none.
 
     Raises:
         UserError: nothing moves.
@@ -79,6 +81,7 @@ class Fitting:
         self.channels = self._channels(ignored)
         self.sticks = self._begun = False
         self.gap = self.floor = self.own_steps = 0.0
+        self.unseen_steps: np.ndarray | None = None
 
     def _channels(self, ignored: Mapping[str, str]) -> Channels:
         data, after = self.data, self.steps - self.data.lead
@@ -228,11 +231,11 @@ class Fitting:
             return
         error = steps_error(self.predictor, self.data)
         error = error[: len(self.windows), : self.steps + 1]
-        self.selector.unseen_steps = error
+        self.unseen_steps = error
         noises = self._noises(error)
         if noises < STEPS_SEEN:
             return
-        self.selector.steps, self.selector.unseen_steps = error, None
+        self.selector.steps, self.unseen_steps = error, None
         b = self.selector.bounds
         self.selector.bounds = Bounds(
             np.r_[b.low, 0.0], np.r_[b.high, _WHOLE], np.r_[b.size, 0.1]
@@ -260,7 +263,7 @@ class Fitting:
         error = np.where(finite, error, 0.0)
         if chosen.steps is not None:
             error = self.share(x) * (error - chosen.steps)
-        chosen.unseen_steps = error
+        self.unseen_steps = error
         return self._noises(error)
 
     def pull_of_starts(self, model: Model) -> np.ndarray:

@@ -40,7 +40,6 @@ class Selector:
 
     ``steps``, where set, is an error of all predictions ``(count, T, c)`` of which a
     share is nobody's fault. That share is one number more at the end of the vectors.
-    ``unseen_steps`` is such an error that does not show, but may move what is fitted.
     ``moved (count, s)`` are offsets of the windows' starts.
 
     Args:
@@ -73,7 +72,6 @@ class Selector:
         self.group, self.own = group, tuple(own)
         self.weight = np.ones(count)
         self.steps: np.ndarray | None = None
-        self.unseen_steps: np.ndarray | None = None
         self.moved = np.zeros((count, predictor.size))
 
     @property

@@ -1,5 +1,6 @@
 """What the gap workflow found, as values."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import jax
@@ -148,15 +149,15 @@ class Numbers:
     Args:
         selector: that fitted it.
         model: the fit.
-        pull: as `fit_covariance` takes it.
+        pulls: as `fit_covariance` takes them.
     """
 
     def __init__(
-        self, selector: Selector, model: Model, pull: np.ndarray | float = 0.0
+        self, selector: Selector, model: Model, pulls: Sequence[np.ndarray] = ()
     ) -> None:
         self.selector, self.model = selector, model
         active = model.fit.active
-        std = np.sqrt(np.diag(fit_covariance(selector, model, pull))).tolist()
+        std = np.sqrt(np.diag(fit_covariance(selector, model, pulls))).tolist()
         self._std = dict(zip(active.tolist(), std, strict=True))
         codes = model.fit.codes(selector.bounds)
         self._codes = dict(zip(active.tolist(), codes.tolist(), strict=True))
@@ -205,15 +206,18 @@ class Numbers:
 
 
 def fit_covariance(
-    selector: Selector, model: Model, pull: np.ndarray | float = 0.0
+    selector: Selector, model: Model, pulls: Sequence[np.ndarray] = ()
 ) -> np.ndarray:
     """Covariance of a fit's active entries ``(a, a)``, by the rules of a fit of
     parameters (`easi_jax.estimation.posterior`): each row counts once, values scatter
     between blocks of windows, and what the model errs by beyond the noise hides a part
-    of itself in them. What the data do not determine may be anything within bounds. By
-    how much the model's own steps move a value, it is in doubt, and by what the score
-    ``pull (a,)`` does that a right model has on average
-    (`easi_jax.gap.fitting.Fitting.pull_of_starts`)."""
+    of itself in them. What the data do not determine may be anything within bounds.
+
+    Args:
+        pulls: scores, by size of a difference of each active entry, ``(a,)`` each, that
+            are there though the model is right: by what they move values, these are in
+            doubt.
+    """
     f, bounds = model.fit, selector.bounds
     size = bounds.size[f.active]
     weight = selector.weight * selector.rows_once()
@@ -229,10 +233,14 @@ def fit_covariance(
     open_ = np.where(np.isfinite(width), width / np.sqrt(12.0), _ANYTHING * size)
     prior = (size / open_) ** 2
     cov = inverted(np.asarray(left), prior, _ALIKE)[0]
-    pulls = [np.broadcast_to(pull, len(f.active))]
-    if selector.unseen_steps is not None:
-        error = selector.residuals.grouped(selector.unseen_steps[None])
-        off = selector.residuals.whitened(error)[0]
-        pulls.append(np.einsum("w,wma,wm->a", weight, j, off, optimize=True))
-    moved = inverted(normal, prior, _ALIKE)[0] @ np.transpose(pulls)
+    moved = inverted(normal, prior, _ALIKE)[0] @ np.reshape(pulls, (-1, len(size))).T
     return (cov + moved @ moved.T) * np.outer(size, size)
+
+
+def score_of(selector: Selector, model: Model, error: np.ndarray) -> np.ndarray:
+    """What an error of all predictions ``(W, T, c)`` adds to the score of a fit, by
+    size of a difference of each active entry, ``(a,)``."""
+    weight, residuals = selector.weight * selector.rows_once(), selector.residuals
+    off = residuals.whitened(residuals.grouped(error[None]))[0]
+    score = np.einsum("w,wma,wm->a", weight, model.fit.slope, off, optimize=True)
+    return score * selector.bounds.size[model.fit.active]

@@ -13,7 +13,7 @@ from easi_jax.gap.effect_set import Model, last
 from easi_jax.gap.fitting import Fitting
 from easi_jax.gap.held_out import HeldOut
 from easi_jax.gap.model_comparison import confidence, cost, odds_of
-from easi_jax.gap.result import Figures, Found, Numbers, Outcome, Part
+from easi_jax.gap.result import Figures, Found, Numbers, Outcome, Part, score_of
 from easi_jax.gap.table import Place
 from easi_jax.gap.verdict import Openness, openness, surely_better, verdict_of
 from easi_jax.model.parameters import ParameterSpace
@@ -119,7 +119,10 @@ def stated(
 
 
 def _numbers(at: Fitting, model: Model) -> Numbers:
-    return Numbers(at.selector, model, at.pull_of_starts(model))
+    pulls = [at.pull_of_starts(model)]
+    if at.unseen_steps is not None:
+        pulls.append(score_of(at.selector, model, at.unseen_steps))
+    return Numbers(at.selector, model, pulls)
 
 
 def _looked(at: Fitting, held_out: HeldOut, model: Model) -> _Look:

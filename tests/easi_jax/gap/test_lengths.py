@@ -153,8 +153,8 @@ def test_steps_of_the_found_model_are_in_doubt() -> None:
             x[0] *= damping
             x[-1] = share
             at.doubt_steps(x, finer)
-            assert at.selector.unseen_steps is not None
-            left.append(np.abs(at.selector.unseen_steps).max())
+            assert at.unseen_steps is not None
+            left.append(np.abs(at.unseen_steps).max())
     assert at.own_steps > 1.0, "else nothing was fitted of them"
     whole = np.abs(steps_error(at.predictor, at.data)).max()
     # The share's is from starts as read, this one from starts that were fitted.

@@ -10,7 +10,7 @@ from easi_jax.gap.batched_least_squares import Bounds, Fitted
 from easi_jax.gap.effect_set import Model
 from easi_jax.gap.fitting import Fitting
 from easi_jax.gap.forward_selection import Selector
-from easi_jax.gap.result import fit_covariance
+from easi_jax.gap.result import fit_covariance, score_of
 
 W, M = 200, 12  # windows, numbers of each
 SIZE = np.array([0.1, 2.0])
@@ -42,7 +42,6 @@ def fitted(noise: np.ndarray, **more: Any) -> tuple[Any, Any]:
         "weight": np.ones(W),
         "rows_once": lambda: np.ones(W),
         "residuals": Plain(),
-        "unseen_steps": None,
     }
     return SimpleNamespace(**{**chosen, **more}), Model([], fit, zero, zero)
 
@@ -85,8 +84,8 @@ def test_what_a_model_errs_by_and_its_own_steps_widen() -> None:
     assert (scatter > 6.0).all() and (scatter < 12.0).all(), scatter
     shift = np.array([0.3, -4.0])
     steps = (model.fit.slope @ shift)[..., None]
-    stepped, _ = fitted(noise, unseen_steps=steps)
-    moved = fit_covariance(stepped, model) - plain
+    pulls = [score_of(selector, model, steps)]
+    moved = fit_covariance(selector, model, pulls) - plain
     np.testing.assert_allclose(moved, np.outer(shift, shift), rtol=1e-3)
 
 
@@ -125,7 +124,7 @@ def test_noise_of_starts_that_slopes_share_widens() -> None:
     due = best * W * noise**2 * (time**2).sum() * 0.1
     np.testing.assert_allclose(pull, due, rtol=0.15)
     plain, wide = (
-        np.sqrt(fit_covariance(selector, model, p)[0, 0]) for p in (0.0, pull)
+        np.sqrt(fit_covariance(selector, model, p)[0, 0]) for p in ([], [pull])
     )
     assert best < 0.95 and abs(best - 1.0) > 2.0 * plain
     assert abs(best - 1.0) < 1.2 * wide
