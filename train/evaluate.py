@@ -98,7 +98,8 @@ def run(config: Config) -> None:
         say(f"written: {config.out}")
     if config.render is not None:
         every = max(1, round(1 / (_FPS * env.dt)))
-        frames = render(env.mj_model, motion[0][::every])
+        shown = motion[0][::every]
+        frames = render(env.mj_model, shown, tell=lambda text: say(f"note: {text}"))
         write_video(config.render, frames, 1 / (every * env.dt))
         say(f"written: {config.render}")
 

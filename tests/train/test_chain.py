@@ -15,8 +15,6 @@ import pytest
 import yaml
 from PIL import Image, ImageSequence
 
-from easi_jax.errors import UserError
-from easi_jax.io.report.video import render
 from easi_jax.io.runs import checkpoints
 from easi_jax.pipeline.stages import Pipeline, PipelineConfig, seed_keys
 from easi_jax.rl.networks import act
@@ -156,7 +154,7 @@ def test_folder_of_easi(chain: Path) -> None:
 def test_report_needs_no_network(chain: Path) -> None:
     text = (chain / "easi" / "report.html").read_text()
     assert "<svg" in text and "gear" in text
-    assert "An episode" in text or "no frames of the motion" in text
+    assert "An episode" in text
     assert not re.search(r'(src|href)="https?:', text)
 
 
@@ -182,10 +180,6 @@ def test_evaluate_tests_any_policy_in_any_target(chain: Path, tmp_path, capsys) 
 
 
 def test_evaluate_draws_an_episode(chain: Path, tmp_path: Path) -> None:
-    try:
-        render(Tiny().mj_model, np.zeros((1, 2)), 16, 16)
-    except UserError as error:
-        pytest.skip(str(error))
     out = tmp_path / "run.gif"
     run = ("--env", ENV, "--run", chain / "easi")
     command(evaluate, *run, "--episodes", 2, "--render", out)

@@ -6,7 +6,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from easi_jax.errors import UserError
 from easi_jax.io.report.figures import returns_by_method, returns_by_step
 from easi_jax.io.report.html import Picture, Report, Table
 from easi_jax.io.report.numbers import number
@@ -149,17 +148,13 @@ def _pictures(transfer: Transfer, by_generation: str, seed: int) -> list[Picture
 def motion_strip(
     model: mujoco.MjModel, dt: float, qpos: np.ndarray, method: str, notes: list[str]
 ) -> list[Picture]:
-    """An episode ``qpos (T + 1, nq)`` as a strip of frames; where nothing can be drawn,
-    a note and no picture. ``dt`` [s] lies between positions."""
+    """An episode ``qpos (T + 1, nq)`` as a strip of frames; ``notes`` say where they
+    are drawn without OpenGL. ``dt`` [s] lies between positions."""
     qpos = np.asarray(qpos)
     moving = np.flatnonzero(np.any(np.diff(qpos, axis=0) != 0, axis=1))
     end = int(moving[-1]) + 1 if moving.size else 0
     chosen = np.linspace(0, end, FRAMES).round().astype(int)
-    try:
-        frames = render(model, qpos[chosen], 300, 200, limit=60)
-    except UserError as error:
-        notes.append(f"no frames of the motion: {error}")
-        return []
+    frames = render(model, qpos[chosen], 300, 200, limit=60, tell=notes.append)
     return [
         Picture(
             "An episode",

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
@@ -16,6 +17,7 @@ from PIL import Image
 
 from easi_jax.errors import UserError
 from easi_jax.io.files import os_reason
+from easi_jax.io.report.drawing import drawn
 
 FRAMES = 6  # of a strip
 _ROW = 3
@@ -29,15 +31,14 @@ def render(
     width: int = 480,
     height: int = 320,
     limit: float = _LIMIT,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> np.ndarray:
     """Frames ``(T, height, width, 3)`` uint8 of positions ``qpos (T, nq)``.
 
     Through the model's first camera, or from outside where it has none. The way to
     OpenGL is ``MUJOCO_GL``'s, or the first of EGL, OSMesa and GLFW that works within
-    ``limit`` seconds.
-
-    Raises:
-        UserError: none works here.
+    ``limit`` seconds. Where none does, frames are plain drawings
+    (`easi_jax.io.report.drawing`), and ``tell`` is told so.
     """
     ways = [os.environ["MUJOCO_GL"]] if os.environ.get("MUJOCO_GL") else _WAYS
     eye = m.camera(0).name if m.ncam else "-1"
@@ -64,10 +65,11 @@ def render(
                 return np.load(files[2])
             last = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
             reasons.append(f"{way}: {last}")
-    raise UserError(
-        "nothing can be drawn here, for MuJoCo's renderer needs EGL or OSMesa (on "
+    tell(
+        "frames are plain drawings, for MuJoCo's renderer needs EGL or OSMesa (on "
         f"Debian: libegl1 or libosmesa6): {'; '.join(reasons)}"
     )
+    return drawn(m, np.asarray(qpos, float), width, height)
 
 
 def check_video(path: Path) -> None:
