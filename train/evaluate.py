@@ -1,8 +1,10 @@
 """``python -m train.evaluate``: test a trained policy in any target."""
 
 import dataclasses
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from train._command import compiled, main, say, show_table
 from train._options import EngineOptions, OwnEffectsOptions
@@ -33,75 +35,129 @@ class Config(EngineOptions, OwnEffectsOptions):
     """Episodes for each seed."""
     seed: int = 0
     """Seed of resets."""
+    beside: Path | None = None
+    """Another run of the same robot: its policy is tested in the same target from the
+    same resets, and the video shows it on the right."""
     out: Path | None = None
     """JSON file to write; nothing is written where not given."""
     render: Path | None = None
-    """Video of one episode of the first seed to write, .gif or .mp4 (with ffmpeg)."""
+    """Motion in one episode of the first seed to write: a video, .gif or .mp4 (with
+    ffmpeg), or six moments of it, .svg."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Played:
+    """What a policy did: its run, as `train._robots.load_policies` gives it, the
+    target, returns ``(S, episodes)``, and positions of an episode ``(T + 1, nq)``."""
+
+    saved: dict[str, Any]
+    target: Any
+    returns: Any
+    motion: Any
 
 
 def run(config: Config) -> None:
     """Evaluates and prints."""
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-
     from easi_jax.errors import UserError
     from easi_jax.io.files import atomic_write, to_json
-    from easi_jax.io.report.video import check_video, render, write_video
-    from easi_jax.pipeline.stages import Pipeline, PipelineConfig, target_parameters
-    from easi_jax.simulation.compile_time import expected
-    from train._effects import effect_notes, read_given
-    from train._robots import check_seeds, load_policies
+    from easi_jax.io.report.video import check_video
+    from train._effects import effect_notes
+    from train._robots import check_seeds
 
     check_seeds((config.seed,))
     if config.episodes < 1:
         raise UserError(f"--episodes is {config.episodes}: give at least 1")
     if config.render is not None:
         check_video(config.render)
-    given = read_given(config)
-    saved = load_policies(config.run, config.policy, config.env, given)
+    every = [_played(config, config.run, config.policy)]
+    if config.beside is not None:
+        every.append(_played(config, config.beside, None))
+        names = [p.saved["env"].name for p in every]
+        if names[0] != names[1]:
+            raise UserError(
+                f"{config.beside} is of {names[1]}, and {config.run} of {names[0]}: "
+                "only runs of one robot can be shown beside each other"
+            )
+    for played in every:
+        saved = played.saved
+        rows = [
+            (s, f"{r.mean():.1f}", f"{r.std():.1f}", f"{r.min():.1f}")
+            for s, r in zip(saved["seeds"], played.returns, strict=True)
+        ]
+        show_table(
+            f"{saved['method']} policy on {saved['env'].name}, target "
+            f"{', '.join(config.target) or 'nominal'}",
+            ("seed", "mean return", "std of episodes", "worst episode"),
+            rows,
+        )
+        for note in effect_notes(saved["given"]):
+            say(note)
+    if config.out is not None:
+        result = _result(every[0])
+        if len(every) > 1:
+            result["beside"] = _result(every[1])
+        atomic_write(config.out, to_json(result))
+        say(f"written: {config.out}")
+    if config.render is not None:
+        _render(config.render, every)
+        say(f"written: {config.render}")
+
+
+def _played(config: Config, folder: Path, policy: str | None) -> _Played:
+    """Plays the policies of a run."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from easi_jax.pipeline.stages import Pipeline, PipelineConfig, target_parameters
+    from easi_jax.simulation.compile_time import expected
+    from train._effects import read_given
+    from train._robots import load_policies
+
+    saved = load_policies(folder, policy, config.env, read_given(config))
     env = saved["env"]
     theta = target_parameters(env.space, config.target)
     pipe = Pipeline(
         env, PipelineConfig(training=saved["training"], eval_episodes=config.episodes)
     )
-    key = jax.random.key(config.seed)
-    keys = jax.random.split(key, len(saved["seeds"]))
+    keys = jax.random.split(jax.random.key(config.seed), len(saved["seeds"]))
     target = jnp.asarray(theta, jnp.float32)
     play = partial(jax.jit(pipe.play), saved["policies"], target, keys)
     returns, motion = map(
         np.asarray, compiled("physics", play, expected(pipe.simulator))
     )
-    rows = [
-        (s, f"{r.mean():.1f}", f"{r.std():.1f}", f"{r.min():.1f}")
-        for s, r in zip(saved["seeds"], returns, strict=True)
-    ]
-    show_table(
-        f"{saved['method']} policy on {env.name}, target "
-        f"{', '.join(config.target) or 'nominal'}",
-        ("seed", "mean return", "std of episodes", "worst episode"),
-        rows,
-    )
-    for note in effect_notes(saved["given"]):
-        say(note)
-    if config.out is not None:
-        result = {
-            "robot": env.name,
-            "method": saved["method"],
-            "target": dict(zip(env.space.names, theta.tolist(), strict=True)),
-            "returns": {
-                str(s): r.tolist() for s, r in zip(saved["seeds"], returns, strict=True)
-            },
-            **saved["given"].results(),
-        }
-        atomic_write(config.out, to_json(result))
-        say(f"written: {config.out}")
-    if config.render is not None:
-        every = max(1, round(1 / (_FPS * env.dt)))
-        shown = motion[0][::every]
+    return _Played(saved, theta, returns, motion[0])
+
+
+def _result(played: _Played) -> dict[str, Any]:
+    saved = played.saved
+    env, seeds = saved["env"], zip(saved["seeds"], played.returns, strict=True)
+    return {
+        "robot": env.name,
+        "method": saved["method"],
+        "target": dict(zip(env.space.names, played.target.tolist(), strict=True)),
+        "returns": {str(s): r.tolist() for s, r in seeds},
+        **saved["given"].results(),
+    }
+
+
+def _render(path: Path, every: Sequence[_Played]) -> None:
+    """Draws what was played, side by side, each with the name of its policy."""
+    import numpy as np
+
+    from easi_jax.io.report.video import captioned, render, write_video
+
+    env = every[0].saved["env"]
+    skip = max(1, round(1 / (_FPS * env.dt)))
+    rows = min(len(p.motion) for p in every)
+    parts = []
+    for played in every:
+        shown = played.motion[:rows:skip]
         frames = render(env.mj_model, shown, tell=lambda text: say(f"note: {text}"))
-        write_video(config.render, frames, 1 / (every * env.dt))
-        say(f"written: {config.render}")
+        if len(every) > 1:
+            frames = captioned(frames, played.saved["method"])
+        parts.append(frames)
+    write_video(path, np.concatenate(parts, 2), 1 / (skip * env.dt))
 
 
 if __name__ == "__main__":

@@ -185,6 +185,17 @@ def test_evaluate_draws_an_episode(chain: Path, tmp_path: Path) -> None:
     command(evaluate, *run, "--episodes", 2, "--render", out)
     with Image.open(out) as image:
         assert len([*ImageSequence.Iterator(image)]) > 10
+        width = image.size[0]
+    both, told = tmp_path / "both.gif", tmp_path / "both.json"
+    first = (*run, "--policy", "UDR", "--beside", chain / "easi", "--episodes", 2)
+    command(evaluate, *first, "--render", both, "--out", told)
+    with Image.open(both) as image:
+        assert image.size[0] == 2 * width
+    result = json.loads(told.read_text())
+    assert (result["method"], result["beside"]["method"]) == ("UDR", "EASI")
+    assert result["target"] == result["beside"]["target"]
+    command(evaluate, *first, "--render", tmp_path / "both.svg")
+    assert "data:image/jpeg" in (tmp_path / "both.svg").read_text()
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from easi_jax.errors import UserError
 from easi_jax.io.files import os_reason
@@ -21,6 +21,7 @@ from easi_jax.io.report.drawing import drawn
 
 FRAMES = 6  # of a strip
 _ROW = 3
+_INK = 40, 40, 40
 _LIMIT = 300  # s
 _WAYS = ("egl", "osmesa", "glfw")
 
@@ -74,15 +75,16 @@ def render(
 
 def check_video(path: Path) -> None:
     """Raises UserError where `write_video` could not write ``path``: another ending
-    than ``.gif`` and ``.mp4``, or no ffmpeg for an MP4."""
-    if path.suffix not in (".gif", ".mp4"):
-        raise UserError(f"{path}: a video ends in .gif or .mp4")
+    than ``.gif``, ``.mp4`` and ``.svg``, or no ffmpeg for an MP4."""
+    if path.suffix not in (".gif", ".mp4", ".svg"):
+        raise UserError(f"{path}: a video ends in .gif or .mp4, a strip in .svg")
     if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
         raise UserError(f"{path}: an MP4 needs ffmpeg, which is not here; give .gif")
 
 
 def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
-    """Writes ``frames (T, H, W, 3)`` as ``.gif``, or as ``.mp4`` with ffmpeg.
+    """Writes ``frames (T, H, W, 3)`` as ``.gif``, as ``.mp4`` with ffmpeg, or a few of
+    them as ``.svg`` (`strip`).
 
     Raises:
         UserError: see `check_video`; ffmpeg failed, or the file cannot be written;
@@ -106,7 +108,9 @@ def write_video(path: Path, frames: np.ndarray, fps: float) -> None:
 
 def _encode(path: Path, part: Path, frames: np.ndarray, fps: float) -> None:
     """Writes ``part``; ``path`` is named in messages."""
-    if path.suffix == ".gif":
+    if path.suffix == ".svg":
+        part.write_text(strip(frames))
+    elif path.suffix == ".gif":
         images = [Image.fromarray(f) for f in frames]
         images[0].save(
             part,
@@ -141,6 +145,19 @@ def _encode(path: Path, part: Path, frames: np.ndarray, fps: float) -> None:
         if done.returncode:
             said = done.stderr.decode(errors="replace").strip().splitlines()
             raise UserError(f"{path}: ffmpeg failed: {said[-1] if said else ''}")
+
+
+def captioned(frames: np.ndarray, text: str) -> np.ndarray:
+    """``frames (T, H, W, 3)`` with a text at the top, on the left."""
+    size = max(12, frames.shape[1] // 16)
+    out = []
+    for frame in frames:
+        image = Image.fromarray(frame)
+        ImageDraw.Draw(image).text(
+            (size // 2, size // 2), text, fill=_INK, font=ImageFont.load_default(size)
+        )
+        out.append(np.asarray(image))
+    return np.array(out, np.uint8)
 
 
 def strip(frames: np.ndarray, count: int = FRAMES) -> str:
