@@ -93,8 +93,23 @@ def window_steps(dt: float, horizon_s: float) -> int:
     return max(MIN_STEPS, lead_rows(dt) + 1, round(horizon_s / dt))
 
 
-def make_windows(
+def window_rows(
     run: Run, horizon_s: float, every_s: float | None = None, lead: int = 0
+) -> np.ndarray:
+    """Rows in which the windows of ``run`` begin, ``(W,)``; as `make_windows`."""
+    if horizon_s <= 0 or (every_s is not None and every_s <= 0):
+        raise ValueError("horizon and spacing of windows must be positive")
+    steps = window_steps(run.dt, horizon_s)
+    spacing = steps / 2 if every_s is None else every_s / run.dt
+    return np.arange(0, max(len(run) - steps - lead, 0), max(1, round(spacing)))
+
+
+def make_windows(
+    run: Run,
+    horizon_s: float,
+    every_s: float | None = None,
+    lead: int = 0,
+    rows: np.ndarray | None = None,
 ) -> Windows:
     """Windows of ``run`` for open-loop prediction.
 
@@ -103,6 +118,7 @@ def make_windows(
         horizon_s: length of a window, s; rounded to control steps, at least 10.
         every_s: time from one start to the next, s; half a horizon by default.
         lead: so many rows earlier a window begins, which is as much longer for it.
+        rows: of `window_rows`, in which those begin that are wanted; all if not given.
 
     Returns:
         Windows that lie wholly inside the run, the first at its first row; none
@@ -111,13 +127,8 @@ def make_windows(
     Raises:
         ValueError: a length that is not positive.
     """
-    if horizon_s <= 0 or (every_s is not None and every_s <= 0):
-        raise ValueError("horizon and spacing of windows must be positive")
-    steps = window_steps(run.dt, horizon_s)
-    spacing = steps / 2 if every_s is None else every_s / run.dt
-    stride = max(1, round(spacing))
-    steps += lead
-    start = np.arange(0, max(len(run) - steps, 0), stride)
+    start = window_rows(run, horizon_s, every_s, lead) if rows is None else rows
+    steps = window_steps(run.dt, horizon_s) + lead
     row = start[:, None] + np.arange(steps)
     velocity = fitted_velocity(run.qpos, run.dt, run.configuration)
     return Windows(

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.data.recording import Run
-from easi_jax.data.windows import lead_rows
+from easi_jax.data.windows import lead_rows, window_rows
 from easi_jax.estimation.starts import Starts, known_noise
 from easi_jax.excite.separation import Design
 from easi_jax.gap import gap_metric as measure
@@ -40,12 +40,13 @@ def windows_of(
     """
     out = []
     for i, run in enumerate(runs):
-        every = window_set(m, [run], horizon, longest, i)
-        if every is None:
-            raise ValueError(f"{run.name} is shorter than a window")
-        count = len(every)
+        rows = window_rows(run, horizon, lead=lead_rows(run.dt))
+        count = len(rows)
         pick = np.linspace(0, count - 1, min(most, count)).round().astype(int)
-        out.append(every.take(pick))
+        found = window_set(m, [run], horizon, longest, i, rows=[rows[pick]])
+        if found is None:
+            raise ValueError(f"{run.name} is shorter than a window")
+        out.append(found)
     return out
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from easi_jax.data.recording import Run, physics_steps
 from easi_jax.data.scales import scales_of
 from easi_jax.data.sensor_channels import Sensors, measured_sensors, read_at_end
-from easi_jax.data.windows import lead_rows, window_steps
+from easi_jax.data.windows import lead_rows, window_rows, window_steps
 from easi_jax.errors import UserError
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.batched_least_squares import bounds_of
@@ -441,9 +441,16 @@ class WindowsOf:
         self, runs: Sequence[Run], seconds: float, least: int = _FITTED[0]
     ) -> WindowSet | None:
         """As many windows of a length as fits see; None where no run is that long."""
-        found = self.all(runs, seconds)
-        if found is None:
+        lead = lead_rows(runs[0].dt)
+        every = [window_rows(run, seconds, lead=lead) for run in runs]
+        begin = np.concatenate(every)
+        of = np.repeat(np.arange(len(runs)), [len(rows) for rows in every])
+        if not len(begin):
             return None
-        steps = found.ctrl.shape[1] * physics_steps(runs[0].dt, self.m.opt.timestep)
+        rows = window_steps(runs[0].dt, seconds) + lead
+        steps = rows * physics_steps(runs[0].dt, self.m.opt.timestep)
         most = min(max(_STEPS // steps, least), _FITTED[1])
-        return found.take(spread(found, most, reach(self.m, runs, found)))
+        few = spread(most, reach(self.m, runs, every, rows))
+        chosen = [begin[few[of[few] == i]] for i in range(len(runs))]
+        given = self.m, runs, seconds, self.longest, 0, self.sensors
+        return window_set(*given, chosen)

@@ -105,6 +105,7 @@ def window_set(
     longest: float,
     first_run: int = 0,
     sensors: Sensors = NO_SENSORS,
+    rows: Sequence[np.ndarray] | None = None,
 ) -> WindowSet | None:
     """Windows every half horizon, each inside one run; None where there are none.
 
@@ -113,9 +114,13 @@ def window_set(
         longest: delay of commands and readings that predictions allow for [s].
         first_run: index of the first of ``runs``.
         sensors: whose readings all of ``runs`` have.
+        rows: of each run, in which those begin that are wanted; all if not given.
     """
     sets = [
-        _windows_of(m, run, first_run + i, horizon_s, longest, sensors)
+        _windows_of(
+            *(m, run, first_run + i, horizon_s, longest, sensors),
+            None if rows is None else rows[i],
+        )
         for i, run in enumerate(runs)
     ]
     sets = [s for s in sets if len(s)]
@@ -129,10 +134,11 @@ def _windows_of(
     horizon_s: float,
     longest: float,
     sensors: Sensors,
+    rows: np.ndarray | None,
 ) -> WindowSet:
     late = math.ceil(longest / run.dt - 1e-9)
     past = math.ceil(max(2 * longest, _BEFORE) / run.dt) + 2
-    w = make_windows(run, horizon_s, lead=lead_rows(run.dt))
+    w = make_windows(run, horizon_s, lead=lead_rows(run.dt), rows=rows)
     velocity = fitted_velocity(run.qpos, run.dt, run.configuration)
     start, steps = w.start_row[:, None], w.ctrl.shape[1]
 
@@ -165,18 +171,23 @@ def _windows_of(
     )
 
 
-def reach(m: mujoco.MjModel, runs: Sequence[Run], windows: WindowSet) -> np.ndarray:
-    """Largest drive forces and speeds in each window, ``(W, nu + nv)``."""
-    steps = windows.ctrl.shape[1]
-    sizes = [exertion(m, run) for run in runs]
-    parts = zip(windows.run, windows.row, strict=True)
-    return np.array([sizes[r][row : row + steps + 1].max(0) for r, row in parts])
+def reach(
+    m: mujoco.MjModel, runs: Sequence[Run], rows: Sequence[np.ndarray], steps: int
+) -> np.ndarray:
+    """Largest drive forces and speeds in windows of so many steps that begin in some
+    ``rows`` of each run, ``(W, nu + nv)``."""
+    out = []
+    for run, begin in zip(runs, rows, strict=True):
+        size = exertion(m, run)
+        out += [size[row : row + steps + 1].max(0) for row in begin]
+    return np.array(out)
 
 
-def spread(windows: WindowSet, most: int, reach: np.ndarray) -> np.ndarray:
+def spread(most: int, reach: np.ndarray) -> np.ndarray:
     """Indices of ``most`` windows at even distances, and of some more with the largest
-    forces and speeds, where limits show; all where there are no more."""
-    count = len(windows)
+    forces and speeds ``reach (W, nu + nv)``, where limits show; all where there are no
+    more."""
+    count = len(reach)
     if count <= most:
         return np.arange(count)
     chosen = set(np.linspace(0, count - 1, most).round().astype(int).tolist())

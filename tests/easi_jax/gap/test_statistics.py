@@ -7,12 +7,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from easi_jax.data.cleaning import true_readings
+from easi_jax.data.cleaning import rows_of, true_readings
 from easi_jax.data.recording import Run, physics_steps
 from easi_jax.data.scales import scales_of
+from easi_jax.data.sensor_channels import Sensors
 from easi_jax.data.windows import fitted_velocity, lead_rows
 from easi_jax.estimation.starts import Starts, floor
 from easi_jax.gap import gap_metric as measure
+from easi_jax.gap.analysis import WindowsOf
 from easi_jax.gap.batched_least_squares import (
     Bounds,
     Fitted,
@@ -548,6 +550,22 @@ def test_a_bias_may_be_as_large_as_the_motion(
         if p.effect == "sensor_bias":
             (column,) = p.columns
             assert column.high == -column.low >= s.position[column.index[0]]
+
+
+def test_of_many_windows_those_that_are_wanted_are_cut(
+    model: mujoco.MjModel, runs: list[Run]
+) -> None:
+    """An hour of logs would fill the memory otherwise."""
+    cut = WindowsOf(model, 0.1, Sensors())
+    few, every = cut.some(runs, 0.2), cut.all(runs, 0.2)
+    assert few is not None and every is not None and len(few) < len(every)
+    begins = list(zip(every.run, every.row, strict=True))
+    same = [begins.index(of) for of in zip(few.run, few.row, strict=True)]
+    assert {0, len(every) - 1} <= set(same)
+    for name in few.__dataclass_fields__:
+        wanted = getattr(every, name)[same]
+        np.testing.assert_array_equal(getattr(few, name), wanted)
+    assert cut.some([rows_of(run, 0, 15) for run in runs], 0.2) is None
 
 
 def of_loss(loss: np.ndarray) -> Model:
