@@ -326,10 +326,10 @@ class Analysis:
         if stuck:
             base = self._undone(base, stuck)
         model = search.select(base)
+        if search.at.stuck(model):
+            # A wrong name moves a parameter to its bound, and a right one back.
+            model, _ = search.exchanged(search.at.again(model))
         for _ in own:
-            if search.at.stuck(model):
-                # A wrong name moves a parameter to its bound, and a right one back.
-                model, _ = search.exchanged(search.at.again(model))
             stuck = search.at.stuck(model)
             if not stuck:
                 break
