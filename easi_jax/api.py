@@ -324,7 +324,7 @@ def _estimated(
         undetermined=tuple(u.meaning for u in result.undetermined),
         no_region=result.no_region,
         held_out=held_out_errors(problem, space, [unit], ready_errors(problem, space)),
-        notes=(*problem.notes, *notes),
+        notes=(*problem.notes, *notes(0)),
         space=space,
         distribution=found.distribution,
         simulator=problem.simulator,

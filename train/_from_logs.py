@@ -41,12 +41,13 @@ def run(config: Any) -> None:
         states = searched(folder, config, search, data, problem.notes, seeds)
         several = len(seeds) > 1
         errors = started(lambda: ready_errors(problem, search.space, several))
-        estimates, outliers = finish()(states.result_mean, states.result_cov)
+        estimates, notes_of = finish()(states.result_mean, states.result_cov)
         good, lost = sound(seeds, estimates, search.space.names)
-        problem.notes.extend(outliers)
+        places = [seeds.index(seed) for seed in good]
         report = write(
             *(folder, problem, search.space, search.config.generations),
             *(list(good.values()), list(good), errors(), lost),
+            lambda best: notes_of(places[best]),
         )
     show(problem.name, report, problem.notes, config.out)
 

@@ -1,6 +1,6 @@
 """What an identification from logs leaves in its folder."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -53,11 +53,13 @@ def write(
     seeds: Sequence[int],
     ready: tuple["WindowErrors", "WindowErrors | None"],
     diverged: Mapping[int, str],
+    notes_of: Callable[[int], list[str]],
 ) -> "Report":
     """Writes distribution.json, figures and report.html; returns the report.
 
     ``ready`` is of `easi_jax.estimation.held_out.ready_errors`; ``diverged`` are seeds
-    without a result, and why.
+    without a result, and why; ``notes_of`` says what is to be said of one of
+    ``estimates``, and is asked of the best.
     """
     import numpy as np
 
@@ -67,6 +69,7 @@ def write(
     results = seed_results(problem.sensing, space, estimates)
     means = [found.distribution.mean for found in estimates]
     errors = held_out_errors(problem, space, means, ready)
+    problem.notes.extend(notes_of(errors.best))
     learned = np.asarray(estimates[errors.best].noise, float)[: len(problem.noise)]
     scatter = np.minimum(problem.noise, learned)
     seen = np.flatnonzero(np.isfinite(scatter))

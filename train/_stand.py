@@ -68,7 +68,7 @@ def known_from_stand(
     settings = replayed(problem, preset("default", log_scale=log_scale))
     search = Search(problem.simulator, settings)
     finish = ready_finish(problem, search, tell=lambda text: say(f"stand: {text}"))
-    estimates, more = finish(means, covs)
+    estimates, notes_of = finish(means, covs)
     known = []
     for found in estimates:
         why = diverged(found, search.space.names)
@@ -77,5 +77,5 @@ def known_from_stand(
         center = np.asarray(found.distribution.mean, float)
         information = np.linalg.inv(covariance(found.distribution))
         known.append(Known(center, information))
-    notes += [f"in the stand: {text}" for text in (*problem.notes, *more)]
+    notes += [f"in the stand: {text}" for text in (*problem.notes, *notes_of(0))]
     return known

@@ -18,6 +18,7 @@ from easi_jax.data.recording import Run
 from easi_jax.data.scales import scales_of
 from easi_jax.data.segments import Segments, to_device
 from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
+from easi_jax.data.velocity_lag import noise_in_starts
 from easi_jax.devices import distributed
 from easi_jax.devices.mesh import placed
 from easi_jax.devices.runtime import quick_compile
@@ -52,6 +53,7 @@ from easi_jax.search.easi import Search, SearchData
 from easi_jax.simulation.slopes import shift_readings
 
 Tell = Callable[[str], None]
+Notes = Callable[[int], list[str]]
 
 _HELD_WINDOWS, _FIT_WINDOWS = 200, 96  # that errors are measured on, at most
 # Pieces of a generation at least, and physics steps that are worth their time; a piece
@@ -63,6 +65,7 @@ _PASSES, _ENDINGS = 3, 2
 _ALIKE = 0.1  # of what readings count: to less than that it is learned already
 _ROBUST = 12  # rounds of the first pass; later ones know which pieces fit badly
 _LACKING = 1.5  # times wider spreads, that are worth a note
+_LEFT = 0.1  # of the rows, that may be in runs shorter than a piece
 _FINISH = 0.5  # s, of pieces in the least-squares finish
 # Quarters of a second that it begins with for larger robots, which are slow: enough to
 # find the valley, for the last steps take all.
@@ -104,9 +107,20 @@ def _with_start_spread(problem: Problem) -> jax.Array:
 
 
 def start_spread(problem: Problem, noise: jax.Array) -> jax.Array:
-    """What the problem's logs know of starts, ``(2 nv + na,)``: `spread_of_starts`."""
-    m = problem.simulator.mj_model
-    return spread_of_starts(m, problem.fit, noise, problem.measured)
+    """What the problem's logs know of starts, ``(2 nv + na,)``: `spread_of_starts`, of
+    measured velocities what they are off by beside the positions as well
+    (`easi_jax.data.velocity_lag.noise_in_starts`): an error of their gain is no
+    noise."""
+    m, runs = problem.simulator.mj_model, problem.fit
+    spread = spread_of_starts(m, runs, noise, problem.measured)
+    if not problem.measured.any():
+        return spread
+    speeds = slice(m.nv, 2 * m.nv)
+    off = noise_in_starts(m, runs, np.asarray(spread[: 2 * m.nv], float))
+    # Of runs too short to tell, anything that occurs.
+    off = np.where(np.isfinite(off), off, _rms_speed(runs))
+    read = np.maximum(np.asarray(spread[speeds]), off)
+    return spread.at[speeds].set(jnp.where(problem.measured, read, spread[speeds]))
 
 
 def spread_of_starts(
@@ -121,7 +135,7 @@ def spread_of_starts(
     (`easi_jax.data.activations.activation_spread`). ``measured (nv,)`` says which
     velocities were.
     """
-    moving = np.sqrt(np.mean(np.concatenate([r.qvel for r in runs]) ** 2, 0))
+    moving = _rms_speed(runs)
     hidden = np.isinf(np.asarray(noise))
     wide = unmeasured.start_spread(m, runs, hidden[: m.nv])
     position, velocity = np.split(np.where(hidden, wide, np.asarray(noise)), 2)
@@ -137,13 +151,17 @@ def spread_of_starts(
     )
 
 
+def _rms_speed(runs: Sequence[Run]) -> np.ndarray:
+    return np.sqrt(np.mean(np.concatenate([r.qvel for r in runs]) ** 2, 0))
+
+
 def ready_finish(
     problem: Problem,
     search: Search,
     refined: bool = True,
     restarts: int = 0,
     tell: Tell = lambda _: None,
-) -> Callable[[jax.Array, jax.Array], tuple[list[Estimate], list[str]]]:
+) -> Callable[[jax.Array, jax.Array], tuple[list[Estimate], Notes]]:
     """Compiles the finish.
 
     Args:
@@ -155,16 +173,16 @@ def ready_finish(
 
     Returns:
         Takes means ``(S, n)`` and covariances ``(S, n, n)`` of searches, unit
-        coordinates, and returns an `Estimate` each, and notes on pieces and runs that
-        fit badly and on what the model lacks.
+        coordinates, and returns an `Estimate` each, and what gives the notes of one,
+        by its number, that did not diverge: on pieces and runs that fit badly, and on
+        what the model lacks.
     """
     finish = _Finish(problem, search, refined, restarts, tell)
     finish.compile()
 
-    def estimates(means: Any, covs: Any) -> tuple[list[Estimate], list[str]]:
+    def estimates(means: Any, covs: Any) -> tuple[list[Estimate], Notes]:
         every = [finish.passes(*both) for both in zip(means, covs, strict=True)]
-        sound = [e for e in every if not finish.lost(e[0])]
-        return [found for found, _ in every], finish.notes(*sound[0]) if sound else []
+        return [found for found, _ in every], lambda k: finish.notes(*every[k])
 
     return estimates
 
@@ -223,7 +241,7 @@ class _Finish:
         # With commands before each piece, where one that comes late needs them.
         cutting = widest.simulator if widest else simulator
         steps = max(problem.steps, round(_FINISH / simulator.dt))
-        steps = min(steps, max(len(r) for r in problem.fit) - 1)
+        steps = min(steps, _most_steps([len(r) for r in problem.fit], problem.steps))
         # Twice over, each counted half: where pieces begin matters less. A piece has a
         # row more than steps, its start's, which counts in the prior of that: with an
         # even number of rows each one is in two pieces.
@@ -497,6 +515,15 @@ class _Finish:
                 "fit much worse than the rest and weigh less than half "
                 "(a bump, a wrong reading, or motion that the model lacks)"
             )
+        fit = self.problem.fit
+        short = [run for run in fit if len(run) <= self.steps]
+        if short:
+            rows = sum(map(len, short)), sum(map(len, fit))
+            notes.append(
+                f"{len(short)} of {len(fit)} runs ({rows[0]} of {rows[1]} rows) are "
+                f"shorter than a piece of {self.steps * self.problem.simulator.dt:.3g} "
+                "s, and are not fitted"
+            )
         times, why = float(widened(found.excess)), no_region(found)
         if why:
             notes.append(why)
@@ -544,6 +571,14 @@ class _Finish:
             alone = distributed.local(end(*placed(given)))
             notes += _contradiction(self.search.space, name, alone, found)
         return notes
+
+
+def _most_steps(rows: Sequence[int], least: int) -> int:
+    """Steps of a piece at most, of runs with so many ``rows``: nine rows in ten are in
+    runs that are as long; ``least`` steps where any run has them."""
+    size = np.sort(rows)
+    some = size[np.cumsum(size) > _LEFT * size.sum()][0]
+    return max(int(some) - 1, min(least, int(size[-1]) - 1))
 
 
 def _resolution_noise(problem: Problem, sensors: Sensors) -> np.ndarray:

@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -13,6 +14,7 @@ from easi_jax.estimation.least_squares import (
     NOT_DETERMINED,
     OUTCOMES,
     flag_codes,
+    raised_to_range,
     result_code,
 )
 from easi_jax.model.parameters import Parameter, ParameterSpace
@@ -193,14 +195,18 @@ def ended(names: Sequence[str], codes: np.ndarray) -> tuple[Outcome, str]:
     at = ", ".join(n for n, c in zip(names, codes, strict=True) if c == AT_BOUND)
     reasons = {
         CONVERGED: "",
-        AT_BOUND: f"{at}: wider bounds may fit better",
+        AT_BOUND: f"{at}: wider bounds may fit better, where physics allows them",
         NOT_DETERMINED: f"the data determine none of {', '.join(names)}",
     }
     return OUTCOMES[code], reasons[code]
 
 
 def seed_result(
-    space: ParameterSpace, unit_mean: ArrayLike, unit_cov: ArrayLike, hessian: ArrayLike
+    space: ParameterSpace,
+    unit_mean: ArrayLike,
+    unit_cov: ArrayLike,
+    hessian: ArrayLike,
+    unit_fit: ArrayLike | None = None,
 ) -> SeedResult:
     """One seed's result in SI units, and what may be believed of it.
 
@@ -208,17 +214,24 @@ def seed_result(
         unit_mean: ``(n,)``.
         unit_cov: ``(n, n)``.
         hessian: Fisher information, ``(n, n)``; all in unit coordinates.
+        unit_fit: best fit, from which the initial range draws the mean, ``(n,)``: a fit
+            may end at a bound where the mean does not.
     """
     ident = identifiability(space, np.asarray(hessian))
     mean, cov = np.asarray(unit_mean), np.asarray(unit_cov, float)
     below, above = _ends(space, mean, cov)
     low, high = (np.asarray(b) for b in space.unit_bounds)
     codes = flag_codes(mean, low, high, ident.determined, _AT)
+    if unit_fit is not None:
+        # Friction that is not there is no bound, nor is what no data hold back.
+        fit = np.asarray(raised_to_range(space, jnp.asarray(unit_fit)))
+        ends = flag_codes(fit, low, high, ident.determined, _AT)
+        codes = np.where(ident.determined, ends, codes)
     outcome, reason = ended(space.names, codes)
     return SeedResult(
         mean=_si(space, mean).tolist(),
         std=(0.5 * (above - below)).tolist(),
-        interval_68=np.stack([below, above], 1).tolist(),
+        interval_68=np.stack([_within(space, x) for x in (below, above)], 1).tolist(),
         unit_mean=np.asarray(mean, float).tolist(),
         unit_covariance=cov.tolist(),
         flags=flag_words(codes),
@@ -267,6 +280,12 @@ def _weighed(parameter: Parameter) -> bool:
 
 def _si(space: ParameterSpace, unit: np.ndarray) -> np.ndarray:
     return np.asarray(space.to_si(unit), float)
+
+
+def _within(space: ParameterSpace, si: np.ndarray) -> np.ndarray:
+    """SI values ``(n,)`` inside their bounds."""
+    low, high = (_si(space, np.asarray(b, float)) for b in space.unit_bounds)
+    return np.clip(si, low, high)
 
 
 def _ends(

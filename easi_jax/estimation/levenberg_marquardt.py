@@ -400,7 +400,7 @@ class _Fit:
 
     def trust(self, pieces: jax.Array, weight: jax.Array, now: _Now) -> jax.Array:
         """Weight of each piece by its cost, ``(M,)``."""
-        robust = weights.robust(pieces, self.whole.segments.weight > 0)
+        robust = weights.robust(pieces, weight)
         left_out = now.moving & now.item.dropping & weights.far_worse(pieces, weight)
         return jnp.where(left_out, 0.0, jnp.where(now.trusting, 1.0, robust))
 

@@ -15,6 +15,7 @@ _DIFFERENCED, _ALIKE = 6.0, 1.94
 # is wrong.
 _POWERS = 0.0, 1.0, 2.0, 4.0
 _TOLD = 1e-6  # of a model's squared errors: noise below it is told from none
+_MOVING, _STILL = 0.75, 0.1  # quantile of pieces, and share of it that none errs below
 _SCORED = 30  # rounds of Fisher scoring, which squares its error in each
 # Times that of the rows: where nothing moves a fit leaves no error; those of a slow
 # sensor may hold a hundred times as much motion.
@@ -101,7 +102,8 @@ def white_noise(error: jax.Array, there: jax.Array | None = None) -> jax.Array:
     Second differences of readings as near to each other as any keep white noise and
     little of what a model errs by, which is smooth; the median over pieces keeps out
     those in which it jumps. In the readings themselves fast motion would pass for
-    noise.
+    noise. Pieces in which next to nothing is left, as of encoders at rest, do not
+    count: they say nothing of what readings of motion are off by.
 
     Args:
         error: ``(M, H, n)``; at least three steps.
@@ -125,6 +127,9 @@ def white_noise(error: jax.Array, there: jax.Array | None = None) -> jax.Array:
     bent = jnp.where(known, error - 2.0 * before + earlier, 0.0) ** 2
     count = known.sum(1)
     square = bent.sum(1) / count  # 0 / 0: none
+    square = jnp.where(square > 0, square, jnp.nan)
+    usual = jnp.nanquantile(square, _MOVING, axis=0)
+    square = jnp.where(square >= _STILL * usual, square, jnp.nan)
     free = count.sum(0) / jnp.maximum((count > 0).sum(0), 1)
     # A chi-square's median (Wilson and Hilferty, PNAS 17, 1931).
     free = jnp.maximum(1.0 + (free - 1.0) / _ALIKE, 0.5)
@@ -153,7 +158,8 @@ def outlier_weights(
     limit: float,
     there: jax.Array | None = None,
 ) -> jax.Array:
-    """Weight of each piece ``(M,)``: 1, or less beyond ``limit`` median errors.
+    """Weight of each piece ``(M,)``: 1, or less beyond ``limit`` median errors, or
+    expected ones where these are larger.
 
     Huber's weight on the RMS over a piece of the error in units of its expectation;
     0 of what is not finite. ``there``: which numbers were read, 1 or 0, all where None.
@@ -162,7 +168,7 @@ def outlier_weights(
     there = jnp.ones_like(square) if there is None else there
     size = jnp.sqrt((there * square).sum((1, 2)) / jnp.maximum(there.sum((1, 2)), 1.0))
     fine = _finite(error)
-    return jnp.where(fine, huber(jnp.where(fine, size, jnp.nan), limit), 0.0)
+    return jnp.where(fine, huber(jnp.where(fine, size, jnp.nan), limit, 1.0), 0.0)
 
 
 def _finite(error: jax.Array) -> jax.Array:

@@ -119,5 +119,5 @@ def result_of(space: ParameterSpace, found: Estimate) -> SeedResult:
     """What one fit says, without what an owner knows."""
     root = np.asarray(found.distribution.factor, np.float64)
     stated = found.distribution.mean, root @ root.T
-    result = seed_result(space, *stated, found.hessian)
+    result = seed_result(space, *stated, found.hessian, found.fit)
     return replace(result, no_region=no_region(found))

@@ -55,22 +55,31 @@ def times_noise(excess: jax.Array, weight: jax.Array) -> jax.Array:
     return jnp.sqrt(share + _NOISIER**2)
 
 
-def huber(size: A, limit: float) -> A:
+def huber(size: A, limit: float, least: float = 0.0) -> A:
     """Huber's weight of each error by its ``size (M,)``: less than 1 beyond ``limit``
-    median sizes; NaN of one that is."""
+    median sizes, or ``least`` where these are smaller; NaN of one that is."""
     xp = array_module(size)
-    return xp.minimum(1.0, limit * xp.nanmedian(size) / xp.maximum(size, 1e-30))
+    typical = xp.maximum(xp.nanmedian(size), least)
+    return xp.minimum(1.0, limit * typical / xp.maximum(size, 1e-30))
 
 
-def robust(costs: jax.Array, used: jax.Array) -> jax.Array:
+def robust(costs: jax.Array, weight: jax.Array) -> jax.Array:
     """Weight of each piece by its cost ``(M,)``: what fits far worse counts less.
 
-    Cauchy's weights about the median of those ``used (M,)``. Few pieces that meet a
-    limit which is still wrong would otherwise bend every other parameter until they
-    fit.
+    Cauchy's weights about the median, or what the noise makes of a typical piece where
+    that is more: a machine that rests in most pieces errs by nothing there. Few pieces
+    that meet a limit which is still wrong would otherwise bend every other parameter
+    until they fit.
+
+    Args:
+        weight: of each measured number, ``(M, H, 2 nv)``.
     """
+    numbers = 0.5 * weight.sum((1, 2))
+    used = numbers > 0
     typical = jnp.nanmedian(jnp.where(used & jnp.isfinite(costs), costs, jnp.nan))
     typical = jnp.nan_to_num(typical)  # where there is none
+    usual = jnp.nanmedian(jnp.where(used, numbers, jnp.nan))
+    typical = jnp.maximum(typical, jnp.nan_to_num(usual))
     ratio = costs / jnp.maximum(_OUTLYING * typical, 1e-30)
     return jnp.where(jnp.isfinite(ratio), 1.0 / (1.0 + ratio), 0.0)
 

@@ -206,6 +206,11 @@ class Part:
         """The number's row."""
         return NUMBERS[self.column]
 
+    @property
+    def usual(self) -> float:
+        """Its value without the effect, whatever the place."""
+        return self.number.neutral if self.without is None else self.without
+
     def bounds(self, o: Spot) -> tuple[float, float]:
         """Low and high of a fit."""
         sizes = o.sizes

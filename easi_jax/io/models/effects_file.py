@@ -150,6 +150,19 @@ def _entry(path: str, i: int, item: Any) -> EffectEntry:
                 f'{path}, {where} ({name}): unknown column "{key}"'
                 f"{nearest(str(key), NUMBERS)}"
             )
+    at, kind = item.get("at", ""), str(item.get("kind", "model"))
+    if isinstance(at, list | dict):
+        raise UserError(f"{path}, {where} ({name}): at: holds one name, not {at}")
+    site = CATALOG[name].sites.get(kind)
+    own = {p.column: p for p in site.parts} if site else {}
+    odd = next((str(key) for key in columns if site and str(key) not in own), None)
+    if odd:
+        raise UserError(
+            f'{path}, {where}: {name} at a {kind} has no column "{odd}" (it has '
+            f"{', '.join(own)})"
+        )
+    # What was left out is as without the effect.
+    given = {c: p.usual for c, p in own.items() if math.isfinite(p.usual)} | columns
     std = item.get("std") or {}
     if not isinstance(std, dict):
         raise UserError(
@@ -157,9 +170,9 @@ def _entry(path: str, i: int, item: Any) -> EffectEntry:
         )
     return EffectEntry(
         name,
-        str(item.get("at", "")),
-        str(item.get("kind", "model")),
-        {str(k): _number(path, where, v) for k, v in columns.items()},
+        str(at),
+        kind,
+        {str(k): _number(path, where, v) for k, v in given.items()},
         {str(k): _number(path, where, v) for k, v in std.items()},
     )
 

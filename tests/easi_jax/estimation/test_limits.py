@@ -6,6 +6,7 @@ import pytest
 
 from easi_jax.estimation import weights
 from easi_jax.estimation.limits import Reach, beyond_edge, edge, jumps, of, unmet
+from easi_jax.estimation.prediction_error import outlier_weights, white_noise
 from easi_jax.model.parameters import Parameter, ParameterSpace
 
 
@@ -94,7 +95,7 @@ def test_a_narrow_dip_has_to_be_deeper() -> None:
 def test_what_fits_far_worse_counts_less() -> None:
     used = jnp.ones((20, 10, 2))
     costs = jnp.full(20, 10.0).at[3].set(900.0).at[4].set(jnp.inf)
-    trust = np.asarray(weights.robust(costs, used[:, 0, 0] > 0))
+    trust = np.asarray(weights.robust(costs, used))
     assert trust[3] < 0.1 and trust[4] == 0 and (np.delete(trust, [3, 4]) > 0.85).all()
     far = np.asarray(weights.far_worse(costs, used))
     assert np.flatnonzero(far).tolist() == [3, 4]
@@ -103,3 +104,18 @@ def test_what_fits_far_worse_counts_less() -> None:
     assert weights.excess(costs, used) > 1000.0
     size = np.array([1.0, 1.0, 4.0])
     assert weights.huber(size, 2.0).tolist() == [1.0, 1.0, 0.5]
+
+
+def test_pieces_at_rest_do_not_make_those_that_move_outliers() -> None:
+    """A machine rests in most pieces, and its encoders with it: nothing is left there,
+    and no more than the noise where it moves."""
+    moves, numbers = np.arange(20) % 3 == 0, jnp.ones((20, 10, 2))
+    costs = jnp.asarray(np.where(moves, 10.0, 0.0))
+    assert (np.asarray(weights.robust(costs, numbers)) > 0.85).all()
+    rng = np.random.default_rng(0)
+    for rest in (0.0, 0.05):
+        size = np.where(moves, 1.0, rest)[:, None, None]
+        error = jnp.asarray(size * rng.normal(size=(20, 30, 2)))
+        weight = outlier_weights(error, jnp.ones(2), jnp.zeros((30, 2)), 2.5)
+        np.testing.assert_allclose(weight, 1.0)
+        np.testing.assert_allclose(white_noise(error), 1.0, rtol=0.1)

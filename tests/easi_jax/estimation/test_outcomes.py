@@ -12,6 +12,7 @@ from easi_jax.estimation.from_runs import (
     _alone,
     _contradiction,
     _Finish,
+    _most_steps,
     _worst,
 )
 from easi_jax.estimation.identifiability import seed_result
@@ -55,6 +56,32 @@ def test_each_seed_says_how_its_fit_ended(
     assert result.outcome == outcome and reason in result.reason
     at_bound = [w == "at bound" for w in result.flags]
     assert at_bound == [outcome == "at bound", False]
+
+
+def test_a_fit_at_a_bound_is_one_though_its_mean_is_not() -> None:
+    """The initial range draws the mean inside."""
+    top = float(SPACE.unit_bounds[1][0])
+    given = np.array([0.9 * top, 0.5]), np.diag([(0.2 * top) ** 2, 1e-4])
+    at = np.array([top, 0.5])
+    result = seed_result(SPACE, *given, SURE, at)
+    assert result.outcome == "at bound" and result.flags[0] == "at bound"
+    # What no data hold back may be anywhere.
+    loose = np.diag([0.0, 1e4])
+    assert seed_result(SPACE, *given, loose, at).flags[0] == "not determined"
+    # A logarithm far below its range is as good as zero, which is no bound.
+    zero = np.array([float(SPACE.unit_bounds[0][0]), 0.5])
+    low = seed_result(SPACE, np.array([0.0, 0.5]), 1e-4 * np.eye(2), SURE, zero)
+    assert low.outcome == "converged"
+    # What is stated lies within the bounds.
+    below, above = result.interval_68[0]
+    assert 0.01 <= below < above == pytest.approx(100.0)
+
+
+def test_runs_shorter_than_a_piece_do_not_vanish() -> None:
+    """Of 49 runs of 0.3 s and one of 6 s, pieces are as long as the most are."""
+    assert _most_steps([150] * 49 + [3000], 20) == 149
+    assert _most_steps([30, 5000], 20) == 4999, "a tenth of the rows at most is lost"
+    assert _most_steps([15] * 10, 20) == 14
 
 
 def test_a_seed_that_diverged_has_a_reason_and_no_number() -> None:

@@ -252,7 +252,7 @@ def test_the_finish_finds_all_of_it(problem: Problem) -> None:
     std = np.sqrt(np.diag(covariance(found.distribution)))
     assert (np.abs(off) < 3.5 * std).all(), (off, std)
     assert (std < 0.02).all(), std
-    assert not any("before the command" in n for n in notes)
+    assert not any("before the command" in n for n in notes(0))
     # A mass that is taken for known is held in a fit of the same readings.
     (told,) = seed_results(problem.sensing, space, [found])
     assert told.relative is None and set(told.flags) == {"determined"}

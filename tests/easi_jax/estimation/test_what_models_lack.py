@@ -73,7 +73,7 @@ def _stated(off: float, finer: int) -> tuple[np.ndarray, np.ndarray, list[str]]:
         mean = jnp.asarray(truth + np.array([0.2, -0.2, 0.1]))
         ((found,), notes) = finish(mean[None], 0.04 * jnp.eye(3)[None])
     std = np.sqrt(np.diag(covariance(found.distribution)))
-    return np.asarray(found.distribution.mean, float) - truth, std, notes
+    return np.asarray(found.distribution.mean, float) - truth, std, notes(0)
 
 
 def _space(m: mujoco.MjModel) -> ParameterSpace:
