@@ -1,6 +1,7 @@
 """``python -m train.export``: what a run found, for those who have not this package."""
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -79,9 +80,19 @@ def run(config: Config) -> None:
     if {"mjcf", "randomization"} & {*chosen}:
         files |= _parameter_files(config, {**settings, **results}, chosen)
     out = config.out or config.run_folder / "export"
+    source = config.model or settings.get("model")
+    if source and _same_file(out / "model.xml", Path(str(source))):
+        raise UserError(
+            f"--out {out} would replace the model that the run was made with: name "
+            "another folder"
+        )
     for name, content in files.items():
         atomic_write(out / name, content)
         say(f"written: {out / name}")
+
+
+def _same_file(a: Path, b: Path) -> bool:
+    return os.path.exists(a) and os.path.exists(b) and os.path.samefile(a, b)
 
 
 def _policy_files(config: Config, chosen: tuple[str, ...]) -> dict[str, str | bytes]:

@@ -14,6 +14,9 @@ from easi_jax.model.quantities import (
     is_velocity_servo,
 )
 
+_NONE = int(mujoco.mjtDyn.mjDYN_NONE)
+# Activations that follow the command, and are it at rest.
+FILTERS = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
 _ROOM = 0.15  # of a joint's range that a start needs on both sides
 _SLOWEST = 0.3  # Hz, what a velocity drive has to be able to sweep its travel with
 _BRISK = 1.5  # Hz, natural torque: what moves a joint by its travel at this
@@ -132,7 +135,7 @@ def hold_command(m: mujoco.MjModel, start: np.ndarray, limits: Limits) -> np.nda
     for a in range(m.nu):
         gain = m.actuator_gainprm[a, 0]
         plain = m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED and gain != 0
-        if not plain or m.actuator_dyntype[a] != mujoco.mjtDyn.mjDYN_NONE:
+        if not plain or m.actuator_dyntype[a] not in (_NONE, *FILTERS):
             continue
         bias = m.actuator_biasprm[a]
         affine = m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.data.recording import physics_steps
-from easi_jax.excite.drives import Feedback, Limits, driven
+from easi_jax.excite.drives import FILTERS, Feedback, Limits, driven
 from easi_jax.model.joint_space import scalar_dofs
 from easi_jax.model.mujoco_warnings import warnings_to
 
@@ -61,6 +61,12 @@ def variations(m: mujoco.MjModel) -> list[mujoco.MjModel]:
     return out
 
 
+def _settle(m: mujoco.MjModel, d: mujoco.MjData, ctrl: np.ndarray) -> None:
+    """Drives with a filter have followed the first command, as at rest."""
+    for a in np.flatnonzero(np.isin(m.actuator_dyntype, FILTERS)).tolist():
+        d.act[m.actuator_actadr[a]] = ctrl[a]
+
+
 def play(
     m: mujoco.MjModel,
     start: np.ndarray,
@@ -88,6 +94,7 @@ def play(
     q_at, v_at = (np.array(x, int) for x in zip(*at, strict=True)) if at else ([], [])
     reach = None if far is None else far[v_at]
     d.qpos[:] = start
+    _settle(m, d, ctrl[0])
     end = rows
     # One that goes astray is found below; MuJoCo need not tell of it.
     with warnings_to():

@@ -12,7 +12,7 @@ from easi_jax.errors import UserError
 from easi_jax.io.models.completed import as_read
 from easi_jax.io.models.mjcf import mujoco_warnings
 from easi_jax.io.models.repaired_mjcf import Repaired, repaired_model
-from easi_jax.model.found_effects import EffectEntry, FoundEffects
+from easi_jax.model.found_effects import EffectEntry, FoundEffects, set_by_none
 from easi_jax.model.parameters import Parameter, ParameterSpace
 from easi_jax.simulation.mujoco_c import InMujoco
 from easi_jax.simulation.simulator import Simulator
@@ -102,7 +102,6 @@ def written_machine(
         UserError: as `identified_model`.
     """
     by_address = {a: values[p.name] for p in parameters for a in p.addresses}
-    own = {a: v for a, v in (effects.own or {}).items() if a not in by_address}
     entries = [
         dataclasses.replace(
             e,
@@ -110,9 +109,10 @@ def written_machine(
         )
         for e in effects.entries
     ]
-    space = ParameterSpace(
-        tuple(p for p in parameters if not p.addresses[0].startswith("effect."))
-    )
+    # An entry says what its numbers are; other effects are parameters of the model.
+    said = {e.address(c) for e in entries for c in e.columns}
+    space = ParameterSpace(tuple(p for p in parameters if not said & {*p.addresses}))
+    own = set_by_none(mj_model, space, effects.own or {})
     theta = np.array([values[name] for name in space.names], float)
     simulator = Simulator(mj_model, space, dt, fixed=own)
     return identified_model(source, simulator, theta, entries)

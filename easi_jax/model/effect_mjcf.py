@@ -19,6 +19,8 @@ from easi_jax.model.effects import drive_factors, tilted
 from easi_jax.model.joint_space import joint_name
 from easi_jax.model.quantities import actuator_name, body_name, direct_solref
 
+_LINEAR = 1  # MuJoCo's ``interp`` of commands that are kept: between two of them
+
 
 @dataclass(frozen=True)
 class InMjcf:
@@ -100,8 +102,12 @@ def _lag(m: mujoco.MjModel, e: EffectEntry) -> None:
 
 def _delayed(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
     # MuJoCo C keeps a history of commands; MJX does not.
-    actuator, delay = spec.actuators[_index(m, e)], e.columns["delay"]
-    actuator.delay = delay
+    # It acts between two steps by interpolation, and after one at least.
+    actuator = spec.actuators[_index(m, e)]
+    delay = actuator.delay + e.columns["delay"]
+    if delay < m.opt.timestep:
+        return False
+    actuator.delay, actuator.interp = delay, _LINEAR
     actuator.nsample = math.ceil(delay / m.opt.timestep) + 2
     return True
 

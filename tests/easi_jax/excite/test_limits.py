@@ -6,6 +6,7 @@ import pytest
 
 from easi_jax.errors import UserError
 from easi_jax.excite import candidates, drives
+from easi_jax.excite.play import play
 
 ARM = """
 <mujoco>
@@ -185,3 +186,23 @@ def test_a_joint_that_others_swing_keeps_its_own_command() -> None:
     for test in tests:
         assert test.amplitude[0] > 0.3
         assert test.amplitude[1] > 0.05 * test.amplitude[0]
+
+
+@pytest.mark.parametrize("kind", ["filter", "filterexact"])
+def test_a_filtered_drive_holds_its_start(kind: str) -> None:
+    """Commands would begin with a jump from zero otherwise, on a real machine."""
+    servo = '<position name="{}" joint="{}" kp="{}" kv="5" timeconst="0.05"/>'
+    plain = servo.replace(' timeconst="0.05"', "")
+    pairs = ("a", "shoulder", 60), ("b", "elbow", 20)
+    slow, fast = (
+        built("".join(text.format(*pair) for pair in pairs)) for text in (servo, plain)
+    )
+    for a in range(slow.nu):
+        slow.actuator_dyntype[a] = getattr(mujoco.mjtDyn, f"mjDYN_{kind.upper()}")
+    limits = drives.limits_of(slow, 0.0, np.ones(2), np.full(2, np.inf))
+    start = np.array([0.5, 0.8])
+    hold = drives.hold_command(slow, start, limits)
+    np.testing.assert_allclose(hold, drives.hold_command(fast, start, limits))
+    assert np.abs(hold).min() > 0.1
+    motion = play(slow, start, np.tile(hold, (50, 1)), DT)
+    np.testing.assert_allclose(motion.qpos, np.tile(start, (50, 1)), atol=1e-3)

@@ -14,7 +14,7 @@ from mujoco import mjx
 
 from easi_jax.errors import UserError
 from easi_jax.estimation.identifiability import seed_result
-from easi_jax.export.mjcf import identified_model
+from easi_jax.export.mjcf import identified_model, written_machine
 from easi_jax.export.randomization import (
     domain_randomizer,
     read_randomization,
@@ -23,7 +23,7 @@ from easi_jax.export.randomization import (
 from easi_jax.io.files import to_json
 from easi_jax.io.runs.folder import RunFolder
 from easi_jax.model import distribution
-from easi_jax.model.found_effects import EffectEntry
+from easi_jax.model.found_effects import EffectEntry, FoundEffects
 from easi_jax.model.parameters import ParameterSpace, declare
 from easi_jax.simulation.mujoco_c import InMujoco
 from easi_jax.simulation.simulator import Simulator
@@ -205,3 +205,27 @@ def test_a_machine_without_the_address_is_refused(given) -> None:
     with pytest.raises(UserError):
         domain_randomizer(path, other)
     assert Simulator(make("cartpole").mj_model, given[0], 0.02).space.size == 3
+
+
+def test_parameters_and_effects_of_a_machine_are_all_written(tmp_path: Path) -> None:
+    """A pattern that covers a refitted number holds it; an effect without an entry is
+    a parameter of the model."""
+    path = tmp_path / "m.xml"
+    path.write_text(
+        '<mujoco><worldbody><body name="b"><joint name="j" damping="0.1"/>'
+        '<geom size=".1"/></body></worldbody><actuator><motor name="a" joint="j"/>'
+        "</actuator></mujoco>"
+    )
+    m = mujoco.MjModel.from_xml_path(str(path))
+    parameters = [
+        declare(m, "damping", "joint.*.damping"),
+        declare(m, "rotor", "effect.armature.j", nominal=0.1, initial=(0.01, 1.0)),
+        declare(m, "late", "effect.delay.a", nominal=0.01, initial=(0.001, 0.1)),
+    ]
+    values = {"damping": 0.3, "rotor": 0.2, "late": 0.02}
+    own = FoundEffects((), {"joint.j.damping": 0.5})
+    got = written_machine(path, m, None, parameters, values, own)
+    written = mujoco.MjModel.from_xml_string(got.xml)
+    assert written.dof_damping[0] == pytest.approx(0.3)
+    assert written.dof_armature[0] == pytest.approx(0.2) or "rotor" in got.left
+    assert written.actuator_delay[0] == pytest.approx(0.02) or "late" in got.left

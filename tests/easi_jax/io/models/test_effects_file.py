@@ -31,3 +31,36 @@ def test_an_unknown_column_is_told(column: str) -> None:
     with pytest.raises(UserError, match=f'unknown column "{column}"') as caught:
         parsed_effects(content("com_offset", **{column: 0.1}), "effects.yaml")
     assert "\n" not in str(caught.value)
+
+
+def one(effect: str, kind: str, at: Any = "j", **columns: float) -> dict[str, Any]:
+    entry = {"effect": effect, "at": at, "kind": kind, "columns": columns}
+    return {"effects": [entry]}
+
+
+def test_columns_that_are_left_out_are_as_without_the_effect() -> None:
+    (found,) = parsed_effects(
+        one("joint_stiffness", "joint", stiffness=2.0), "e"
+    ).entries
+    assert found.columns == {"stiffness": 2.0, "spring": 0.0}
+    (found,) = parsed_effects(one("payload_mass", "body", mass=0.3), "e").entries
+    assert found.columns == {"mass": 0.3, "spread": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (
+            one("actuator_delay", "actuator", lag=0.01),
+            'actuator_delay at a actuator has no column "lag" (it has delay)',
+        ),
+        (one("coulomb_friction", "joint", coulomb=1.0, damping=1.0), '"damping"'),
+        (one("coulomb_friction", "joint", ["a", "b"], coulomb=1.0), "holds one name"),
+    ],
+)
+def test_columns_of_another_effect_are_refused(
+    content: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(UserError) as caught:
+        parsed_effects(content, "effects.yaml")
+    assert said in str(caught.value) and str(caught.value).startswith("effects.yaml")

@@ -321,3 +321,30 @@ def test_a_model_that_mujoco_cannot_write(file: Callable[[str], Path]) -> None:
     path = file("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>")
     with pytest.raises(UserError, match=r"robot\.xml: MuJoCo cannot write"):
         repaired_model(path, [])
+
+
+def test_a_delay_acts_between_two_steps_and_adds_to_the_models(
+    file: Callable[[str], Path],
+) -> None:
+    drive = '<motor name="a" joint="j" delay="0.01" nsample="8"/>'
+    late = EffectEntry("actuator_delay", "a", "actuator", {"delay": 0.005}, {})
+    m = mujoco.MjModel.from_xml_string(
+        repaired_model(file(one(drive=drive)), [late]).xml
+    )
+    assert m.actuator_delay[0] == pytest.approx(0.015)
+    plain = '<motor name="a" joint="j"/>'
+    m = mujoco.MjModel.from_xml_string(
+        repaired_model(file(one(drive=plain)), [late]).xml
+    )
+    d, force = mujoco.MjData(m), []
+    d.ctrl[0] = 1.0
+    for _ in range(5):
+        mujoco.mj_step(m, d)
+        force.append(float(d.actuator_force[0]))
+    steps = 0.005 / m.opt.timestep
+    want = np.clip(np.arange(5) - steps + 1, 0, 1)
+    np.testing.assert_allclose(force, want, atol=1e-6)
+    # Less than a step MuJoCo cannot say.
+    short = EffectEntry("actuator_delay", "a", "actuator", {"delay": 1e-4}, {})
+    got = repaired_model(file(one(drive=plain)), [short])
+    assert got.left == ["actuator_delay@a"]
