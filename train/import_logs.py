@@ -27,6 +27,9 @@ class Config(BaseOptions):
     """Files and folders, all with one robot and one mapping."""
     model: str
     """MuJoCo model (MJCF) of the machine, or the name of a built-in robot."""
+    allow_assets: tuple[Path, ...] = ()
+    """Files, or folders with all below them, that the model may read besides those in
+    its own folder."""
     out: Path = Path("logs")
     """Folder for the logs."""
     mapping: Path | None = None
@@ -72,7 +75,7 @@ def run(config: Config) -> None:
     if not (math.isfinite(config.command_slack) and config.command_slack >= 0):
         raise UserError(f"--command-slack is {config.command_slack:g}: 0 s or more")
     held = ((), None) if config.held_base else None
-    mj_model = read_model(config.model, (), held).mj_model
+    mj_model = read_model(config.model, config.allow_assets, held).mj_model
     mapping = None if config.mapping is None else read_mapping(config.mapping)
     done = import_recordings(
         config.recordings,

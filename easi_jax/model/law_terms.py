@@ -15,6 +15,7 @@ the same term is evaluated on rows of a log, in a simulation, and printed.
 
 import ast
 import functools
+import keyword
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -193,7 +194,8 @@ def _named(node: ast.AST) -> tuple[str, str] | None:
 
 def name_of(kind: str, name: str) -> str:
     """The text of a position, speed or command."""
-    return f"{kind}.{name}" if name.isidentifier() else f'{kind}["{name}"]'
+    plain = name.isascii() and name.isidentifier() and not keyword.iskeyword(name)
+    return f"{kind}.{name}" if plain else f'{kind}["{name}"]'
 
 
 def _remembers(node: ast.AST) -> bool:

@@ -121,8 +121,21 @@ class OwnEffect:
             UserError: what is wrong with it.
         """
         what = f"effect {self.name!r}"
-        if not _NAME.fullmatch(self.name):
+        if not (isinstance(self.name, str) and _NAME.fullmatch(self.name)):
             raise UserError(f"{what}: a name is lower-case letters, digits and _")
+        if not isinstance(self.sentence, str):
+            raise UserError(f"{what}: its sentence is no text")
+        # A comma that is missing makes no tuple of one.
+        for name, kind in (("numbers", Number), ("at", str)):
+            given = getattr(self, name)
+            if not (
+                isinstance(given, list | tuple)
+                and all(isinstance(x, kind) for x in given)
+            ):
+                raise UserError(
+                    f"{what}: {name}= holds a tuple, of one with a comma: "
+                    f"({kind.__name__.lower()},)"
+                )
         if self.name in CATALOG:
             raise UserError(f"{what}: there is one of this name; give it another")
         acts = [self.force, self.command, self.reading]
@@ -142,14 +155,23 @@ class OwnEffect:
             raise UserError(f"{what}: two of its numbers have one name")
         try:
             self.sentence.format(at="", kind="", **{n.name: "" for n in self.numbers})
-        except (KeyError, IndexError, ValueError) as error:
+        except (KeyError, IndexError) as error:
             raise UserError(
                 f"{what}: its sentence names {error}, which is no number of it"
+            ) from error
+        except (ValueError, AttributeError, TypeError) as error:
+            raise UserError(
+                f"{what}: its sentence has names of numbers in braces, and nothing "
+                f"more there, for these come with their units ({error})"
             ) from error
 
     def _check_number(self, n: Number) -> None:
         what = f"effect {self.name!r}, number {n.name!r}"
-        if not _NAME.fullmatch(n.name) or n.name in ("at", "kind", "pair"):
+        values = (n.low, n.high, n.neutral, *_listed(n.starts), n.step or 0.0)
+        if not all(isinstance(x, int | float) for x in values):
+            raise UserError(f"{what}: low, high, neutral, starts and step hold numbers")
+        plain = isinstance(n.name, str) and _NAME.fullmatch(n.name)
+        if not plain or n.name in ("at", "kind", "pair"):
             raise UserError(
                 f"{what}: a name is lower-case letters, digits and _, and not at, kind "
                 "or pair"
@@ -161,6 +183,10 @@ class OwnEffect:
                 raise UserError(f"{what}: {x:g} is not within {n.low:g} to {n.high:g}")
         if not n.size > 0:
             raise UserError(f"{what}: step is {n.size:g}: give one above 0")
+
+
+def _listed(x: Any) -> tuple[Any, ...]:
+    return tuple(x) if isinstance(x, list | tuple) else (x,)
 
 
 @contextlib.contextmanager

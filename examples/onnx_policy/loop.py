@@ -20,6 +20,8 @@ names, drives, dt = (json.loads(told[k]) for k in ("observation", "ctrl", "dt"))
 spec = importlib.util.spec_from_file_location("my_robot", sys.argv[2])
 robot = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(robot)
+if "ctrl" not in [output.name for output in session.get_outputs()]:
+    sys.exit(f"{sys.argv[1]} has no commands: its robot has no action_map")
 steps = int(sys.argv[3]) if len(sys.argv) > 3 else None  # for ever where not given
 
 due = time.monotonic()
@@ -29,5 +31,5 @@ while steps is None or steps > 0:
     (ctrl,) = session.run(["ctrl"], {"observation": observation})
     robot.send(dict(zip(drives, ctrl[0].tolist(), strict=True)))
     steps = None if steps is None else steps - 1
-    due += dt
+    due = max(due + dt, time.monotonic())  # what a stall missed is not made up for
     time.sleep(max(0.0, due - time.monotonic()))

@@ -47,7 +47,8 @@ def to_table(
     mapping.check_used({"time": None, **{use.column: None for use in uses}})
     notes += [f"not used: {listed(unused)}"] if unused else []
     times = _times(recording, mapping, uses)
-    rows = next(use.stream for use in uses if use.column.startswith("qpos."))
+    read = [use.stream for use in uses if use.column.startswith("qpos.")]
+    rows = next(s for s in recording.streams if any(s is stream for stream in read))
     time = times[rows]
     table = {"time": time}
     known = np.ones(len(time), bool)

@@ -224,6 +224,12 @@ def _names(path: Path, content: dict[Any, Any], key: str) -> dict[str, str | Non
     for theirs, ours in section.items():
         if isinstance(ours, list | dict):
             raise UserError(f'{path}: {key} of "{theirs}" is not a name')
+        for word in (theirs, ours):
+            if isinstance(word, bool):  # YAML's yes, no, on and off
+                raise UserError(
+                    f"{path}: {key}: a name that YAML takes for {word}: put it in "
+                    "quotes"
+                )
     return {
         str(theirs): None if ours in (None, "") else str(ours)
         for theirs, ours in section.items()

@@ -245,6 +245,14 @@ def test_bad_files(text: str, said: str, tmp_path: Path) -> None:
         ({"numbers": (Number("a", "1", 1.0, 2.0),)}, "not within"),
         ({"sentence": "{none}"}, "no number of it"),
         ({"at": ("wrist",)}, "its at= names"),
+        ({"at": "wrist"}, "at= holds a tuple, of one with a comma"),
+        ({"numbers": Number("a", "1", 0.0, 1.0)}, "numbers= holds a tuple"),
+        ({"numbers": ("a",)}, "numbers= holds a tuple"),
+        ({"numbers": (Number("a", "1", "0", 1.0),)}, "hold numbers"),
+        ({"name": 3}, "lower-case"),
+        ({"sentence": 3}, "no text"),
+        ({"sentence": "by {at:.3g}"}, "nothing more there"),
+        ({"sentence": "by {at.x}"}, "nothing more there"),
     ],
 )
 def test_bad_effects(arm: mujoco.MjModel, changes: dict, said: str) -> None:
