@@ -207,6 +207,11 @@ def test_two_topics_of_states_are_brought_to_the_rows_of_the_first(
     for run in runs:
         moved = run.qpos[:, 1] - 50 * run.time
         np.testing.assert_allclose(moved - moved[0], 0.0, atol=1e-9)
+    # The first that is named, whichever joint the model has first.
+    again = (path, "--state", "/arm", "/base", "--format", "parquet", "--overwrite")
+    command(import_logs, *_arguments(tmp_path, tmp_path / "robot.xml", again, ARRAY))
+    runs = read_logs(tmp_path / "logs" / "walk.parquet", mj_model).runs
+    assert runs[0].dt == pytest.approx(0.004)
 
 
 def test_clock_of_the_headers(tmp_path: Path, call: Any, refuse: Any) -> None:
