@@ -212,7 +212,8 @@ def _of_search(
     """What is stated of a search's end that nothing refines."""
     weight, pieces = paired.weight, paired.segments
     eq = paired.normal(mean, paired.unmoved, weight)
-    left = excess(eq.costs, weight)
+    # At starts as they are after a correction: as read they err by themselves.
+    left = excess(paired.costs(mean[None], eq.start_step[None], weight)[0], weight)
     open_cov, seen, _ = _posterior(eq.hessian * trusted(left))
     spread = open_cov + seen @ cov @ seen.T
     center = _MIDDLE + seen @ (mean - _MIDDLE)

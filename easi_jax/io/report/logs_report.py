@@ -75,7 +75,8 @@ def logs_report(
                 ok="less" in better,
                 note=""
                 if "less" in better
-                else "no listed parameter can express what the model lacks",
+                else "no listed parameter can express what the model lacks, if it "
+                "lacks anything",
             ),
             Diagnostic(
                 "the fit",

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -47,6 +48,7 @@ def tide(now, p):
     return p.size * jnp.sin(3.0 * now.time)
 
 
+_WORD: Any = "0"
 TIDE = OwnEffect(
     "tide",
     'something pulls "{at}" by {size}, now this way, now that',
@@ -248,7 +250,7 @@ def test_bad_files(text: str, said: str, tmp_path: Path) -> None:
         ({"at": "wrist"}, "at= holds a tuple, of one with a comma"),
         ({"numbers": Number("a", "1", 0.0, 1.0)}, "numbers= holds a tuple"),
         ({"numbers": ("a",)}, "numbers= holds a tuple"),
-        ({"numbers": (Number("a", "1", "0", 1.0),)}, "hold numbers"),
+        ({"numbers": (Number("a", "1", _WORD, 1.0),)}, "hold numbers"),
         ({"name": 3}, "lower-case"),
         ({"sentence": 3}, "no text"),
         ({"sentence": "by {at:.3g}"}, "nothing more there"),
