@@ -233,7 +233,8 @@ def fit_covariance(
     open_ = np.where(np.isfinite(width), width / np.sqrt(12.0), _ANYTHING * size)
     prior = (size / open_) ** 2
     cov = inverted(np.asarray(left), prior, _ALIKE)[0]
-    moved = inverted(normal, prior, _ALIKE)[0] @ np.reshape(pulls, (-1, len(size))).T
+    scores = np.reshape(pulls, (len(pulls), len(size)))
+    moved = inverted(normal, prior, _ALIKE)[0] @ scores.T
     return (cov + moved @ moved.T) * np.outer(size, size)
 
 

@@ -160,7 +160,7 @@ def test_a_stopped_analysis_goes_on(
     with pytest.raises(SystemExit) as stop:
         run(*words, "--resume")
     assert stop.value.code == 2
-    assert "other logs" in capsys.readouterr().err
+    assert f"{log} has changed since" in capsys.readouterr().err
     log.write_text(measured)
 
     # What was written last may be damaged.

@@ -467,7 +467,7 @@ class _Reader:
             self.note(f"{name}: holes longer than {HOLE_STEPS:.0f} steps: {holes}")
         hidden = joint_dofs(self.model, self.hidden)
         given = np.isfinite(raw.qvel[rows[good]][:, ~hidden])
-        measured = bool((given.mean(0) >= _GIVEN).all())
+        measured = bool(given.size) and bool((given.mean(0) >= _GIVEN).all())
         runs: list[Run] = []
         single = sum(len(piece) < 2 for piece in pieces)
         for piece in pieces:

@@ -15,6 +15,7 @@ class _Windows:
 
     def __init__(self, worth: dict[str, float], missed: set[str]) -> None:
         self.worth, self.missed = worth, missed
+        self.windows = SimpleNamespace(led=np.ones(1, bool))
 
     def model(self, keys: list[str]) -> Any:
         gone = sum(w for k, w in self.worth.items() if k not in keys)
@@ -54,13 +55,11 @@ def test_what_is_neither_probable_nor_missed_is_spared(
     assert [p.key for p in found] == spared
 
 
-@pytest.mark.parametrize(
-    ("likely", "tried"), [(set(), ["b", "c"]), ({"a", "c"}, ["c"])]
-)
+@pytest.mark.parametrize(("likely", "tried"), [(None, ["b", "c"]), ({"a", "c"}, ["c"])])
 def test_rivals_are_looked_for_among_likely_names(
-    likely: set[str], tried: list[str], monkeypatch: pytest.MonkeyPatch
+    likely: set[str] | None, tried: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All are likely where no stage has told which."""
+    """All are likely of a smaller robot."""
     asked: list[str] = []
 
     def screened(chosen: object, base: object, others: list[Any]) -> list[Any]:
