@@ -170,6 +170,7 @@ def _model_files(
 def _model_of(config: Config, settings: dict[str, Any]) -> tuple[Path, Any, Any]:
     """File of the run's model, the model, and its control step where there is one."""
     from easi_jax.errors import UserError
+    from easi_jax.io.runs.folder import has_changed
     from easi_jax.io.runs.schemas import MADE_WITH, checked
     from envs import REGISTRY
     from envs.robot import model_file
@@ -178,6 +179,11 @@ def _model_of(config: Config, settings: dict[str, Any]) -> tuple[Path, Any, Any]
 
     if settings.get("model"):  # of measured logs
         path = Path(config.model or str(settings["model"]))
+        if has_changed(config.run_folder, path):
+            say(
+                f"note: {path} has changed since the run was made: model.xml has what "
+                "was found in the model as it was, and the changes"
+            )
         held = None
         if settings.get("held_base"):
             mapping = settings.get("mapping")

@@ -245,6 +245,22 @@ def _read_head(folder: Path) -> dict[str, Any]:
     return checked(head, CONFIG, f"{path} is not a run's configuration")
 
 
+def has_changed(folder: Path, path: Path) -> bool:
+    """Whether a file that the run in a folder read is another now, as far as it says.
+
+    Raises:
+        UserError: what it says cannot be read.
+    """
+    was = _digests(folder).get(os.fspath(path))
+    return was is not None and os.path.isfile(path) and was != _digest(path)
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    """Of the files that a run read, by their paths; none where it does not say."""
+    path = folder / _FILES
+    return checked(read_json(path), {"*": str}, str(path)) if path.exists() else {}
+
+
 def _digest(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
@@ -268,11 +284,8 @@ def _check_same(
             f"{folder} holds a run with {_differs(name, old, config)}{more}: resume "
             "with the same settings, or choose another --out"
         )
-    was = folder / _FILES
-    begun = checked(read_json(was), {"*": str}, str(was)) if was.exists() else {}
-    changed = [
-        name for name, digest in files.items() if begun.get(name, digest) != digest
-    ]
+    begun = _digests(folder)
+    changed = [name for name, now in files.items() if begun.get(name, now) != now]
     if changed:
         raise UserError(
             f"{changed[0]} has changed since {folder} was begun: put the file back, or "

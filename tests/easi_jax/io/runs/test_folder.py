@@ -13,7 +13,7 @@ from easi_jax.errors import UserError
 from easi_jax.io.files import atomic_write, number, to_json
 from easi_jax.io.report.html import Report, write_report
 from easi_jax.io.report.video import write_video
-from easi_jax.io.runs.folder import RunFolder, config_hash, read_config
+from easi_jax.io.runs.folder import RunFolder, config_hash, has_changed, read_config
 from easi_jax.io.runs.metrics import MetricsLog, read_metrics
 
 
@@ -315,9 +315,11 @@ def test_a_run_does_not_go_on_with_another_file(tmp_path):
     with RunFolder.open(out, {"data": str(log)}, files=files, resume=True) as run:
         assert run.resumed
     log.write_text("2")
+    assert has_changed(out, log) and not has_changed(out, missing)
     before = _contents(out)
     with pytest.raises(UserError, match=r"log\.csv has changed since"):
         RunFolder.open(out, {"data": str(log)}, files=files, resume=True)
     assert _contents(out) == before
     (out / "files.json").unlink()  # a run of an older version
+    assert not has_changed(out, log)
     RunFolder.open(out, {"data": str(log)}, files=files, resume=True).close()
