@@ -7,6 +7,7 @@ the model.
 """
 
 import dataclasses
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -149,6 +150,8 @@ def domain_randomizer(path: Path | str, mj_model: mujoco.MjModel) -> Randomizer:
     Raises:
         UserError: a file of another form, an address that the model lacks, or one that
             MJX would leave out of it since it is zero there.
+
+    Warns of parameters that MJX has no word for (a joint's speed limit, a delay).
     """
     given = read_randomization(path)
     _check_gates(mj_model, given.addresses)
@@ -157,6 +160,18 @@ def domain_randomizer(path: Path | str, mj_model: mujoco.MjModel) -> Randomizer:
     names = _changed(base.mjx, moved)
     if not names:
         raise UserError(f"{path}: MJX has no word for any of {', '.join(given.names)}")
+    unsaid = [
+        name
+        for name, tied, value in zip(
+            given.names, given.addresses, _middle(given), strict=True
+        )
+        if not _reaches(mj_model, tied, float(value))
+    ]
+    if unsaid:
+        warnings.warn(
+            f"{path}: MJX has no word for {', '.join(unsaid)}, which stay as they are",
+            stacklevel=2,
+        )
 
     def one(key: jax.Array) -> dict[str, jax.Array]:
         model = with_parameters(base, given.draw(key)).mjx
@@ -173,6 +188,12 @@ def domain_randomizer(path: Path | str, mj_model: mujoco.MjModel) -> Randomizer:
         )
 
     return randomize
+
+
+def _reaches(m: mujoco.MjModel, tied: tuple[str, ...], value: float) -> bool:
+    """Whether a parameter at some addresses writes anything of an MJX model."""
+    base = put_model(m, [tied], {})
+    return bool(_changed(base.mjx, with_parameters(base, jnp.array([value])).mjx))
 
 
 def _middle(given: Randomization) -> np.ndarray:

@@ -186,6 +186,10 @@ def test_what_mjx_leaves_out_is_said(given, tmp_path: Path) -> None:
     text = path.read_text().replace("joint.pole.damping", "joint.pole.frictionloss")
     (tmp_path / "other.yaml").write_text(text)
     domain_randomizer(tmp_path / "other.yaml", m)
+    late = text.replace("joint.pole.frictionloss", "effect.delay.cart")
+    (tmp_path / "late.yaml").write_text(late)
+    with pytest.warns(UserWarning, match="no word for damping, which stay"):
+        domain_randomizer(tmp_path / "late.yaml", m)
     m.dof_frictionloss[:] = 0.0
     with pytest.raises(UserError, match="leaves it out"):
         domain_randomizer(tmp_path / "other.yaml", m)
