@@ -131,8 +131,10 @@ def main(
 def _outside(error: BaseException) -> str:
     """What the system, or MuJoCo, says of a file or a model; empty for what may be this
     program's own fault."""
+    from easi_jax.io.files import os_reason
+
     if isinstance(error, OSError) and error.errno in _OF_SYSTEM:
-        return ": ".join(str(x) for x in (error.filename, error.strerror) if x)
+        return ": ".join(str(x) for x in (error.filename, os_reason(error)) if x)
     engine = sys.modules.get("mujoco")
     if engine and isinstance(error, engine.FatalError):
         return f"MuJoCo cannot simulate this model: {error}"

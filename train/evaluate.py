@@ -61,23 +61,25 @@ def run(config: Config) -> None:
     from easi_jax.errors import UserError
     from easi_jax.io.files import atomic_write, to_json
     from easi_jax.io.report.video import check_video
-    from train._effects import effect_notes
-    from train._robots import check_seeds
+    from train._effects import effect_notes, read_given
+    from train._robots import check_seeds, load_policies
 
     check_seeds((config.seed,))
     if config.episodes < 1:
         raise UserError(f"--episodes is {config.episodes}: give at least 1")
     if config.render is not None:
         check_video(config.render)
-    every = [_played(config, config.run, config.policy)]
+    given = read_given(config)
+    runs = [load_policies(config.run, config.policy, config.env, given)]
     if config.beside is not None:
-        every.append(_played(config, config.beside, None))
-        names = [p.saved["env"].name for p in every]
+        runs.append(load_policies(config.beside, None, config.env, given))
+        names = [saved["env"].name for saved in runs]
         if names[0] != names[1]:
             raise UserError(
                 f"{config.beside} is of {names[1]}, and {config.run} of {names[0]}: "
                 "only runs of one robot can be shown beside each other"
             )
+    every = [_played(config, saved) for saved in runs]
     for played in every:
         saved = played.saved
         rows = [
@@ -103,7 +105,7 @@ def run(config: Config) -> None:
         say(f"written: {config.render}")
 
 
-def _played(config: Config, folder: Path, policy: str | None) -> _Played:
+def _played(config: Config, saved: dict[str, Any]) -> _Played:
     """Plays the policies of a run."""
     import jax
     import jax.numpy as jnp
@@ -111,10 +113,7 @@ def _played(config: Config, folder: Path, policy: str | None) -> _Played:
 
     from easi_jax.pipeline.stages import Pipeline, PipelineConfig, target_parameters
     from easi_jax.simulation.compile_time import expected
-    from train._effects import read_given
-    from train._robots import load_policies
 
-    saved = load_policies(folder, policy, config.env, read_given(config))
     env = saved["env"]
     theta = target_parameters(env.space, config.target)
     pipe = Pipeline(
@@ -145,14 +144,16 @@ def _render(path: Path, every: Sequence[_Played]) -> None:
     """Draws what was played, side by side, each with the name of its policy."""
     import numpy as np
 
-    from easi_jax.io.report.video import captioned, render, write_video
+    from easi_jax.io.report.video import FRAMES, captioned, render, write_video
 
     env = every[0].saved["env"]
     skip = max(1, round(1 / (_FPS * env.dt)))
-    rows = min(len(p.motion) for p in every)
+    rows = np.arange(0, min(len(p.motion) for p in every), skip)
+    if path.suffix == ".svg":  # what a strip shows, for drawing takes time
+        rows = rows[np.linspace(0, len(rows) - 1, FRAMES).round().astype(int)]
     parts = []
     for played in every:
-        shown = played.motion[:rows:skip]
+        shown = played.motion[rows]
         frames = render(env.mj_model, shown, tell=lambda text: say(f"note: {text}"))
         if len(every) > 1:
             frames = captioned(frames, played.saved["method"])

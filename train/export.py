@@ -81,7 +81,8 @@ def run(config: Config) -> None:
         files |= _parameter_files(config, {**settings, **results}, chosen)
     out = config.out or config.run_folder / "export"
     source = config.model or settings.get("model")
-    if source and _same_file(out / "model.xml", Path(str(source))):
+    replaced = {os.path.realpath(out / name) for name in files}
+    if source and os.path.realpath(str(source)) in replaced:
         raise UserError(
             f"--out {out} would replace the model that the run was made with: name "
             "another folder"
@@ -89,10 +90,6 @@ def run(config: Config) -> None:
     for name, content in files.items():
         atomic_write(out / name, content)
         say(f"written: {out / name}")
-
-
-def _same_file(a: Path, b: Path) -> bool:
-    return os.path.exists(a) and os.path.exists(b) and os.path.samefile(a, b)
 
 
 def _policy_files(config: Config, chosen: tuple[str, ...]) -> dict[str, str | bytes]:

@@ -10,11 +10,10 @@ import mujoco
 import numpy as np
 
 from easi_jax.data.recording import Run
+from easi_jax.model.quantities import FILTERS
 
 _DYN = mujoco.mjtDyn
-_FOLLOWING = tuple(
-    int(t) for t in (_DYN.mjDYN_FILTER, _DYN.mjDYN_FILTEREXACT, _DYN.mjDYN_MUSCLE)
-)
+_FOLLOWING = (*FILTERS, int(_DYN.mjDYN_MUSCLE))
 _INTEGRATOR = int(_DYN.mjDYN_INTEGRATOR)
 
 

@@ -29,10 +29,9 @@ def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
     full, pairs = np.zeros((m.nv, m.nv)), pair_ids(m)
     for run in runs:
         v = fitted_velocity(run.qpos, run.dt, run.configuration)
-        span = max(1, round(0.02 / run.dt))
+        span = min(max(1, round(0.02 / run.dt)), len(run) - 1)
         start = np.broadcast_to(m.qpos0, run.qpos.shape)
         moved = run.configuration.difference(start, run.qpos)
-        span = min(span, len(run) - 1)
         for i in range(0, len(run) - span, stride):
             d.qpos[:], d.qvel[:] = run.qpos[i], v[i]
             d.qacc[:] = (v[i + span] - v[i]) / (span * run.dt)

@@ -9,14 +9,13 @@ from easi_jax.data.unmeasured import is_play
 from easi_jax.errors import UserError
 from easi_jax.model.joint_space import is_scalar, joint_name, scalar_dofs
 from easi_jax.model.quantities import (
+    FILTERS,
     actuator_name,
     is_position_servo,
     is_velocity_servo,
 )
 
 _NONE = int(mujoco.mjtDyn.mjDYN_NONE)
-# Activations that follow the command, and are it at rest.
-FILTERS = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
 _ROOM = 0.15  # of a joint's range that a start needs on both sides
 _SLOWEST = 0.3  # Hz, what a velocity drive has to be able to sweep its travel with
 _BRISK = 1.5  # Hz, natural torque: what moves a joint by its travel at this

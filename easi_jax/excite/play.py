@@ -8,9 +8,10 @@ import mujoco
 import numpy as np
 
 from easi_jax.data.recording import physics_steps
-from easi_jax.excite.drives import FILTERS, Feedback, Limits, driven
+from easi_jax.excite.drives import Feedback, Limits, driven
 from easi_jax.model.joint_space import scalar_dofs
 from easi_jax.model.mujoco_warnings import warnings_to
+from easi_jax.model.quantities import FILTERS
 
 _WRONG = 0.2  # by how much mass and friction may be wrong
 _ROUNDS = 30

@@ -162,10 +162,8 @@ def domain_randomizer(path: Path | str, mj_model: mujoco.MjModel) -> Randomizer:
         raise UserError(f"{path}: MJX has no word for any of {', '.join(given.names)}")
     unsaid = [
         name
-        for name, tied, value in zip(
-            given.names, given.addresses, _middle(given), strict=True
-        )
-        if not _reaches(mj_model, tied, float(value))
+        for i, name in enumerate(given.names)
+        if not _reaches(base, moved, names, _middle(given), i)
     ]
     if unsaid:
         warnings.warn(
@@ -190,10 +188,17 @@ def domain_randomizer(path: Path | str, mj_model: mujoco.MjModel) -> Randomizer:
     return randomize
 
 
-def _reaches(m: mujoco.MjModel, tied: tuple[str, ...], value: float) -> bool:
-    """Whether a parameter at some addresses writes anything of an MJX model."""
-    base = put_model(m, [tied], {})
-    return bool(_changed(base.mjx, with_parameters(base, jnp.array([value])).mjx))
+def _reaches(
+    base: Any, at: Any, names: Sequence[str], middle: np.ndarray, i: int
+) -> bool:
+    """Whether one of the parameters moves any of some leaves of the MJX model that is
+    ``at`` their ``middle``."""
+    other = middle.copy()
+    other[i] = 1.01 * middle[i] + 1e-3
+    moved = with_parameters(base, jnp.asarray(other)).mjx
+    return any(
+        not np.array_equal(_leaf(at, name), _leaf(moved, name)) for name in names
+    )
 
 
 def _middle(given: Randomization) -> np.ndarray:

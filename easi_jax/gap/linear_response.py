@@ -68,7 +68,8 @@ class LinearResponse:
         self.middle: Physics
         self._linearize()
         index = (blocks[:, None] * BLOCK + np.arange(BLOCK)).reshape(-1)[: self.count]
-        self._later = p.later(x, p.windows.take(np.minimum(index, len(p.windows) - 1)))
+        led = p.windows.led
+        self._later = p.later(x, led[np.minimum(index, len(led) - 1)])
         self.holds = self._checked(moved)
 
     def covers(self, vectors: np.ndarray) -> np.ndarray:

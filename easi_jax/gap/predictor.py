@@ -356,26 +356,26 @@ class Predictor:
 
         Where readings are late they are those of other times than the window's.
         """
-        late, early = self._late(x, windows)
+        late, early = self._late(x, windows.led)
         start, step = windows.row[:, None] - early, np.arange(self.steps + 1)
         readings = (start + late)[:, None] + step[:, None]
         commands = start + step[:-1]
         ahead = np.ceil(readings - _ROUNDED)  # as readings are compared
         return Rows(ahead.astype(int), np.round(commands).astype(int))
 
-    def later(self, x: np.ndarray, windows: WindowSet) -> np.ndarray:
+    def later(self, x: np.ndarray, led: np.ndarray) -> np.ndarray:
         """How many rows after what is simulated the rows are that it is compared with,
-        less than one, ``(W, nv)``."""
-        late, early = self._late(x, windows)
+        less than one, ``(W, nv)``; ``led (W,)`` of these windows."""
+        late, early = self._late(x, led)
         rows = late - early
         return np.maximum(np.ceil(rows - _ROUNDED) - rows, 0.0)
 
-    def _late(self, x: np.ndarray, windows: WindowSet) -> tuple[np.ndarray, np.ndarray]:
-        """By how many rows joints read late, ``(nv,)``, and simulations of windows
-        begin early, ``(W, 1)``."""
+    def _late(self, x: np.ndarray, led: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """By how many rows joints read late, ``(nv,)``, and simulations of windows that
+        are ``led (W,)`` begin early, ``(W, 1)``."""
         e = self.layout.effects(jnp.asarray(x[self.own :], jnp.float32))
         late = np.asarray(e.late, float) / self.simulator.dt
-        return late, windows.led[:, None] * late.max(initial=0.0)
+        return late, led[:, None] * late.max(initial=0.0)
 
     def _program(self, left_out: tuple[str, ...], batch: int) -> Any:
         """A compiled one. For an arm MJX's take a minute each, so side by side."""

@@ -29,6 +29,8 @@ _SOLID = {
     int(mujoco.mjtGeom.mjGEOM_CYLINDER),
 }
 _INF = math.inf
+# Activations that follow the command, and are it at rest.
+FILTERS = int(mujoco.mjtDyn.mjDYN_FILTER), int(mujoco.mjtDyn.mjDYN_FILTEREXACT)
 
 Index = tuple[int, ...]
 
@@ -214,8 +216,7 @@ def _refuse_gear(m: Any, a: int) -> str | None:
 
 
 def _refuse_time_constant(m: Any, a: int) -> str | None:
-    filters = (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
-    if int(m.actuator_dyntype[a]) not in map(int, filters):
+    if int(m.actuator_dyntype[a]) not in FILTERS:
         return (
             'it has no filter: write timeconst="..." (position) or '
             'dyntype="filterexact" dynprm="..." (general) in the model file'

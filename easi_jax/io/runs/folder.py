@@ -14,6 +14,7 @@ from easi_jax.devices import distributed
 from easi_jax.errors import UserError
 from easi_jax.io.files import (
     atomic_write,
+    digest_of,
     os_reason,
     read_json,
     to_json,
@@ -96,7 +97,7 @@ class RunFolder:
         opened: list[Self] = []
 
         def begin() -> bool:
-            read = {os.fspath(p): _digest(p) for p in files if os.path.isfile(p)}
+            read = {os.fspath(p): digest_of(p) for p in files if os.path.isfile(p)}
             begun = cls._begun(folder, plain, command, resume, overwrite, read)
             opened.append(begun)
             return opened[0].resumed
@@ -252,18 +253,13 @@ def has_changed(folder: Path, path: Path) -> bool:
         UserError: what it says cannot be read.
     """
     was = _digests(folder).get(os.fspath(path))
-    return was is not None and os.path.isfile(path) and was != _digest(path)
+    return was is not None and os.path.isfile(path) and was != digest_of(path)
 
 
 def _digests(folder: Path) -> dict[str, str]:
     """Of the files that a run read, by their paths; none where it does not say."""
     path = folder / _FILES
     return checked(read_json(path), {"*": str}, str(path)) if path.exists() else {}
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _check_same(
