@@ -28,7 +28,7 @@ def test_files_a_line_and_a_traceback(tmp_path: Path) -> None:
     model, out = tmp_path / "m.xml", tmp_path / "p.yaml"
     assert _outcome(parameters, out, "--model", model) == (
         commands.REFUSED,
-        "m.xml: no such model file",
+        "m.xml: no such model file, or not to be read",
     )
     model.write_text(feature_models()["actuator motor"])
     assert _outcome(parameters, out, "--model", model) == (commands.FILES, "")

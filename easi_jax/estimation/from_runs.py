@@ -31,7 +31,6 @@ from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.pieces import effective_noise, few, segments_from_runs
 from easi_jax.estimation.posterior import (
     Estimate,
-    as_fitted,
     begun,
     diverged,
     no_region,
@@ -388,10 +387,8 @@ class _Finish:
             # near where the fit was before anything else could take up errors.
             last = self.ended(undoubted, cov, None, ", as the model is", self.lost)
         found = last.found
-        if not self.lost(found):
-            beyond = self.beyond(found)
-            space = self.search.space
-            found = as_fitted(space, found) if beyond else self.of_steps(found, cov)
+        if not self.lost(found) and not self.beyond(found):
+            found = self.of_steps(found, cov)
         return replace(found, search_mean=mean, search_cov=cov), last.weight
 
     def ended(

@@ -434,14 +434,6 @@ def no_region(found: Estimate) -> str:
     )
 
 
-def as_fitted(space: ParameterSpace, found: Estimate) -> Estimate:
-    """The estimate about the fit itself, for want of a region: where the model errs by
-    far more than the noise, information is next to nothing, and a mean of fit and
-    initial range would leave the valley that predicts best."""
-    spread = found.distribution.factor @ found.distribution.factor.T
-    return replace(found, distribution=gaussian(space, space.clip(found.fit), spread))
-
-
 def diverged(found: Estimate, names: Sequence[str]) -> str:
     """Why an estimate of parameters ``names`` is none; empty where it is one."""
     stated = found.distribution.mean[:, None], found.distribution.factor
