@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 from train._command import say, show_table
 from train._effects import read_given
-from train._log_problem import files_of, read_problem
+from train._inputs import files_of
+from train._log_problem import read_problem
 
 if TYPE_CHECKING:
     from easi_jax.estimation.problem import Problem

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from train._command import say
 from train._effects import found_in, read_given
+from train._inputs import files_of
 from train._stand import known_from_stand, stand_problem
 
 if TYPE_CHECKING:
@@ -30,7 +31,6 @@ def run(config: Any) -> None:
     from easi_jax.pipeline.stages import seed_keys
     from easi_jax.search.unpaired import Simulations
     from train._from_logs import searched, show
-    from train._log_problem import files_of
 
     search, data = problem.search(settings), problem.data()
     simulated = Simulations(search, data)

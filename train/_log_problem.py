@@ -60,13 +60,6 @@ def read_runs(config: Any, mj_model: Any, horizon: float) -> "MeasuredRuns":
     return measured_runs(mj_model, log, held, horizon)
 
 
-def files_of(config: Any) -> list[Path]:
-    """What a command reads: model, parameters, mapping, logs, the user's effects."""
-    each = (config.model, config.parameters, config.mapping)
-    files = [Path(p) for p in each if p]
-    return [*files, *config.data, *config.held_out, *config.effects_from]
-
-
 def model_and_space(config: Any) -> tuple[str, Any, Any]:
     from easi_jax.errors import UserError
     from easi_jax.io.models.parameter_file import read_parameter_file

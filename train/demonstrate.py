@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from train._command import main, say, show_table
+from train._inputs import files_of
 from train._options import EngineOptions, RunOptions
 
 if TYPE_CHECKING:
@@ -75,6 +76,7 @@ def run(config: Config) -> None:
         command="train.demonstrate",
         resume=config.resume,
         overwrite=config.overwrite,
+        files=files_of(config),
     ) as folder:
         if played is not None:
             env, policy = played

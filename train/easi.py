@@ -4,6 +4,7 @@ from dataclasses import replace
 
 from train._command import main, say
 from train._easi_config import Config
+from train._inputs import files_of
 
 
 def run(config: Config) -> None:
@@ -80,6 +81,7 @@ def _from_target(config: Config) -> None:
         command="train.easi",
         resume=config.resume,
         overwrite=config.overwrite,
+        files=files_of(config),
     ) as folder:
         notes = effect_notes(given)
         out = setup.pipe.chain(

@@ -167,6 +167,7 @@ def _model_files(
 def _model_of(config: Config, settings: dict[str, Any]) -> tuple[Path, Any, Any]:
     """File of the run's model, the model, and its control step where there is one."""
     from easi_jax.errors import UserError
+    from easi_jax.io.models.mjcf import check_assets
     from easi_jax.io.runs.folder import has_changed
     from easi_jax.io.runs.schemas import MADE_WITH, checked
     from envs import REGISTRY
@@ -176,9 +177,10 @@ def _model_of(config: Config, settings: dict[str, Any]) -> tuple[Path, Any, Any]
 
     if settings.get("model"):  # of measured logs
         path = Path(config.model or str(settings["model"]))
-        if has_changed(config.run_folder, path):
+        named = [path, *check_assets(path, config.allow_assets)]
+        for one in [p for p in named if has_changed(config.run_folder, p)][:1]:
             say(
-                f"note: {path} has changed since the run was made: model.xml has what "
+                f"note: {one} has changed since the run was made: model.xml has what "
                 "was found in the model as it was, and the changes"
             )
         held = None

@@ -4,6 +4,7 @@ from functools import partial
 
 from train._command import compiled, main, progress, say
 from train._gap_config import Config
+from train._inputs import files_of
 
 _PATIENCE = 5.0  # s; a stage that takes no longer shows no progress
 
@@ -28,7 +29,6 @@ def run(config: Config) -> None:
         check_robot(config.retrain, problem.model.mj_model, config.retrain_steps)
     from easi_jax.gap.analysis import Analysis
     from easi_jax.io.runs.step_cache import Journal, key_of
-    from train._log_problem import files_of
 
     analysis = Analysis(
         problem.model.mj_model,

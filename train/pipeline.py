@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from train._command import main, say
+from train._inputs import files_of
 from train._options import (
     ChainOptions,
     EngineOptions,
@@ -82,6 +83,7 @@ def run(config: Config) -> None:
         command="train.pipeline",
         resume=config.resume,
         overwrite=config.overwrite,
+        files=files_of(config),
     ) as folder:
         out, (compiling, running) = _outcome(folder, setup)
         curves = _told(folder, setup, out)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from train._command import main, say, show_table
+from train._inputs import files_of
 from train._options import (
     EngineOptions,
     OwnEffectsOptions,
@@ -110,6 +111,7 @@ def run(config: Config) -> None:
         command="train.udr",
         resume=config.resume,
         overwrite=config.overwrite,
+        files=files_of(config),
     ) as folder:
         notes = effect_notes(given)
         policies = _trained(folder, config, pipe, target, keys["udr"], old, notes)

@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 
+from easi_jax.data.activations import activation_guess
 from easi_jax.data.recording import Run
 from easi_jax.data.windows import fitted_velocity
 
@@ -10,18 +11,16 @@ from easi_jax.data.windows import fitted_velocity
 def drive_forces(m: mujoco.MjModel, run: Run) -> np.ndarray:
     """Forces or torques of all actuators in each row, ``(T, nu)`` [N, N m].
 
-    By the measured positions, their fitted velocities and the commands; a drive with
-    a state of its own is taken to follow its command.
+    By the measured positions, their fitted velocities, the commands, and activations
+    as far as these tell (`easi_jax.data.activations`).
     """
     d = mujoco.MjData(m)
     velocity = fitted_velocity(run.qpos, run.dt, run.configuration)
     out = np.zeros((len(run), m.nu))
-    follows = [(int(m.actuator_actadr[i]), i) for i in range(m.nu)]
-    follows = [(a, i) for a, i in follows if a >= 0]
+    act = activation_guess(m, run)
     for t in range(len(run)):
-        d.qpos[:], d.qvel[:], d.ctrl[:] = run.qpos[t], velocity[t], run.ctrl[t]
-        for a, i in follows:
-            d.act[a] = run.ctrl[t, i]
+        d.qpos[:], d.qvel[:] = run.qpos[t], velocity[t]
+        d.ctrl[:], d.act[:] = run.ctrl[t], act[t]
         mujoco.mj_fwdPosition(m, d)
         mujoco.mj_fwdVelocity(m, d)
         mujoco.mj_fwdActuation(m, d)

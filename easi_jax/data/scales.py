@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from easi_jax.data.activations import activation_guess
 from easi_jax.data.drive_forces import drive_forces
 from easi_jax.data.recording import Run
 from easi_jax.data.unmeasured import hidden_in_any, start_spread
@@ -32,10 +33,11 @@ def scales_of(m: mujoco.MjModel, runs: Sequence[Run]) -> Scales:
         span = min(max(1, round(0.02 / run.dt)), len(run) - 1)
         start = np.broadcast_to(m.qpos0, run.qpos.shape)
         moved = run.configuration.difference(start, run.qpos)
+        act = activation_guess(m, run)
         for i in range(0, len(run) - span, stride):
             d.qpos[:], d.qvel[:] = run.qpos[i], v[i]
             d.qacc[:] = (v[i + span] - v[i]) / (span * run.dt)
-            d.ctrl[:] = run.ctrl[i]
+            d.ctrl[:], d.act[:] = run.ctrl[i], act[i]
             acceleration = d.qacc.copy()
             mujoco.mj_forward(m, d)
             rows["touching"].append(np.array(touching(pairs, d)))

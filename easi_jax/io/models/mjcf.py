@@ -103,8 +103,9 @@ def mujoco_warnings() -> Iterator[list[str]]:
         yield said
 
 
-def check_assets(path: Path, allowed: Sequence[Path] = ()) -> None:
-    """Refuses a model that names a file outside of its folder and of ``allowed``.
+def check_assets(path: Path, allowed: Sequence[Path] = ()) -> list[Path]:
+    """The files that a model names, directly or in files that it includes; none may lie
+    outside of its folder and of ``allowed``.
 
     Every place where MuJoCo may look is tried: relative to the model, to the file
     that names it, and to each folder of a ``compiler`` element.
@@ -119,6 +120,7 @@ def check_assets(path: Path, allowed: Sequence[Path] = ()) -> None:
     folders, below, named = {path.parent}, {""}, set[tuple[Path | None, str]]()
     todo, seen, tried = [path], {path.resolve()}, set[tuple[Path | None, Path]]()
     leads: dict[Path, set[Path]] = {}
+    found: dict[Path, Path] = {}  # the first place of each, by what it is
     while todo:
         document = todo.pop()
         folders.add(document.parent)
@@ -142,6 +144,7 @@ def check_assets(path: Path, allowed: Sequence[Path] = ()) -> None:
                     continue
                 tried.add((parent, place))
                 real = _confined(path, value, place, roots)
+                found.setdefault(real, place)
                 if parent is None:
                     continue
                 leads.setdefault(parent, set()).add(real)
@@ -149,6 +152,7 @@ def check_assets(path: Path, allowed: Sequence[Path] = ()) -> None:
                     seen.add(real)
                     todo.append(place)
     _refuse_circles(path, leads)
+    return sorted(found.values())
 
 
 def _refuse_circles(path: Path, leads: dict[Path, set[Path]]) -> None:

@@ -1,11 +1,14 @@
 """Activations as commands and positions tell them, beside MuJoCo's own."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 
 from easi_jax.data.activations import activation_guess, activation_spread
 from easi_jax.data.recording import Run
+from easi_jax.data.scales import scales_of
 from easi_jax.model.joint_space import Configuration
 
 ACTUATORS = {
@@ -54,3 +57,23 @@ def test_filter_is_followed_exactly_after_its_start() -> None:
 def test_integrator_of_commands_is_their_sum() -> None:
     m, run, act = recorded(ACTUATORS["integrator"])
     np.testing.assert_allclose(activation_guess(m, run), act, atol=1e-9)
+
+
+def test_scales_of_a_drive_do_not_hang_on_how_it_is_written() -> None:
+    """A position drive that holds its joint pulls next to nothing, with a filter of its
+    commands as without; a speed command is no activation of an integrated one."""
+    drives = {
+        "plain": '<position kp="100" joint="j"/>',
+        "filtered": '<position kp="100" timeconst="0.005" joint="j"/>',
+        "integrated": '<intvelocity kp="100" actrange="-2 2" joint="j"/>',
+    }
+    found = {}
+    for name, drive in drives.items():
+        m, run, _ = recorded(drive)
+        held = 1.0 + 0.01 * np.sin(0.2 * np.arange(400))[:, None]
+        command = held if name != "integrated" else np.full_like(held, 1.5)
+        still = replace(run, qpos=held, qvel=np.zeros_like(held), ctrl=command)
+        found[name] = scales_of(m, [still])
+    for scales in found.values():
+        assert scales.force[0] < 5 and scales.peak[0] < 5
+        np.testing.assert_allclose(scales.torque, found["plain"].torque, rtol=0.3)

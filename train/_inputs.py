@@ -1,0 +1,37 @@
+"""The files that a command reads, whose digests a run keeps."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+_FILES = "parameters", "mapping", "env", "demonstrations"
+_LISTS = "data", "held_out", "stand", "effects_from"
+_RUNS = "udr", "policy", "start_from"  # folders of earlier runs, or files
+_RESULTS = "results.json"  # of a run folder; another with every training
+
+
+def files_of(config: Any) -> list[Path]:
+    """The model with all that it names, parameters, logs, an environment, the owner's
+    effects, and results of earlier runs; what an effects file says is part of the
+    configuration, and stands there."""
+    return list(dict.fromkeys(_each(config)))
+
+
+def _each(config: Any) -> Iterator[Path]:
+    from easi_jax.io.models.mjcf import check_assets
+
+    model = getattr(config, "model", None)
+    if model:
+        yield Path(model)
+        yield from check_assets(Path(model), config.allow_assets)
+    for name in _FILES:
+        given = getattr(config, name, None)
+        if given:
+            yield Path(given)
+    for name in _LISTS:
+        yield from map(Path, getattr(config, name, ()))
+    for name in _RUNS:
+        given = getattr(config, name, None)
+        if given:
+            path = Path(given)
+            yield path / _RESULTS if path.is_dir() else path
