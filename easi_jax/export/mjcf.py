@@ -14,6 +14,7 @@ from easi_jax.io.models.mjcf import mujoco_warnings
 from easi_jax.io.models.repaired_mjcf import Repaired, repaired_model
 from easi_jax.model.found_effects import EffectEntry, FoundEffects, set_by_none
 from easi_jax.model.parameters import Parameter, ParameterSpace
+from easi_jax.model.written_effects import Undo, is_written
 from easi_jax.simulation.mujoco_c import InMujoco
 from easi_jax.simulation.simulator import Simulator
 
@@ -39,6 +40,7 @@ def identified_model(
     simulator: Simulator,
     theta: np.ndarray,
     entries: Sequence[EffectEntry] = (),
+    undo: Undo | None = None,
 ) -> Repaired:
     """The MJCF of ``source`` with parameters ``theta (n,)``, SI, and effects in it.
 
@@ -46,6 +48,7 @@ def identified_model(
         source: file that the machine's model came from.
         simulator: whose parameters they are.
         entries: effects that the machine has besides.
+        undo: what the text keeps of effects that are in its numbers.
 
     Raises:
         UserError: ``source`` is another model than the machine's, or MuJoCo cannot
@@ -59,7 +62,7 @@ def identified_model(
     with jax.enable_x64(True):  # a space of its own, as in `InMujoco`
         space = dataclasses.replace(simulator.space)
         unit = np.asarray(space.to_unit(np.asarray(theta, np.float64)))
-    model = repaired_model(source, entries, write.at(unit))
+    model = repaired_model(source, entries, write.at(unit), undo)
     lost = [
         name
         for name, reached in zip(simulator.space.names, write.reaches, strict=True)
@@ -112,7 +115,17 @@ def written_machine(
     # An entry says what its numbers are; other effects are parameters of the model.
     said = {e.address(c) for e in entries for c in e.columns}
     space = ParameterSpace(tuple(p for p in parameters if not said & {*p.addresses}))
-    own = set_by_none(mj_model, space, effects.own or {})
+    own = set_by_none(mj_model, space.addresses, effects.own or {})
     theta = np.array([values[name] for name in space.names], float)
     simulator = Simulator(mj_model, space, dt, fixed=own)
-    return identified_model(source, simulator, theta, entries)
+    held = {e.address(c): v for e in entries for c, v in e.columns.items()} | by_address
+    held = {a: v for a, v in held.items() if is_written(a)}
+    if not held:
+        return identified_model(source, simulator, theta, entries)
+    less = [p.name for p in space.parameters if not held.keys() & {*p.addresses}]
+    plain = identified_model(
+        *(source, Simulator(mj_model, space.select(less), dt, fixed=own)),
+        np.array([values[name] for name in less], float),
+        [e for e in entries if not any(e.address(c) in held for c in e.columns)],
+    )
+    return identified_model(source, simulator, theta, entries, Undo(plain.model, held))

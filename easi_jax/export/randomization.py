@@ -22,14 +22,16 @@ import yaml
 
 from easi_jax.errors import UserError
 from easi_jax.io.strict_yaml import read_yaml
-from easi_jax.model.addresses import open_gates
+from easi_jax.model.found_effects import set_by_none
 from easi_jax.model.mjx_model import put_model, with_parameters
+from easi_jax.model.written_effects import undone
 
 _WIDE = 2.0  # standard deviations of a range
+_COUPLING = "nC", "M_rowadr", "M_rownnz", "M_colind"  # which inertias couple in MJX
 _HEAD = """\
 # Made by train.export. `covariance` is of ln(value), for `scale: linear` of the value;
-# `range` is mean -+ 2 standard deviations inside `bounds`, `factor` the same over the
-# nominal value.
+# `range` is mean -+ 2 standard deviations inside `bounds`, `factor` the same over
+# `nominal`: the value of the model that the run was made with.
 """
 
 
@@ -59,6 +61,7 @@ def to_yaml(found: Mapping[str, Any], seed: str, robot: str) -> str:
             "address": list(p["addresses"]),
             "unit": p["unit"],
             "scale": p["scale"],
+            "nominal": _round(p["nominal"]),
             "mean": _round(middle),
             "std": _round(std[i]),
             "range": [_round(first), _round(last)],
@@ -151,11 +154,16 @@ def domain_randomizer(path: Path | str, mj_model: mujoco.MjModel) -> Randomizer:
         UserError: a file of another form, an address that the model lacks, or one that
             MJX would leave out of it since it is zero there.
 
+    A model of ``train.export --to mjcf`` has effects in its numbers and says how it is
+    without: they count once (`easi_jax.model.written_effects`).
+
     Warns of parameters that MJX has no word for (a joint's speed limit, a delay).
     """
     given = read_randomization(path)
-    _check_gates(mj_model, given.addresses)
-    base = put_model(mj_model, given.addresses, {})
+    plain = undone(mj_model)
+    rest = set_by_none(plain.without, given.addresses, plain.values)
+    base = put_model(plain.without, given.addresses, rest)
+    _check_compiled(mj_model, base, given.addresses)
     moved = with_parameters(base, jnp.asarray(_middle(given))).mjx
     names = _changed(base.mjx, moved)
     if not names:
@@ -205,15 +213,50 @@ def _middle(given: Randomization) -> np.ndarray:
     return np.where(given.log, np.exp(np.where(given.log, given.mean, 0.0)), given.mean)
 
 
-def _check_gates(m: mujoco.MjModel, addresses: Sequence[tuple[str, ...]]) -> None:
+def _check_compiled(
+    m: mujoco.MjModel, base: Any, addresses: Sequence[tuple[str, ...]]
+) -> None:
+    """Refuses a model of which MJX would compile another program for some addresses:
+    what is zero or off is left out of it, and so is the coupling of inertias about a
+    center of mass that lies at its joint."""
+    own = _compiled(put_model(m, (), {}).mjx)
+    if _alike(own, _compiled(base.mjx)):
+        return
     for tied in addresses:
-        opened = open_gates(m, tied)
-        for field in ("dof_frictionloss", "actuator_forcelimited", "actuator_biastype"):
-            if not np.array_equal(getattr(m, field) != 0, getattr(opened, field) != 0):
-                raise UserError(
-                    f"{', '.join(tied)}: MJX leaves it out of this model, where it is "
-                    "zero or off; take the model of train.export --to mjcf"
-                )
+        theirs = _compiled(put_model(m, (tied,), {}).mjx)
+        if not _alike({k: v for k, v in own.items() if k not in _COUPLING}, theirs):
+            raise UserError(
+                f"{', '.join(tied)}: MJX leaves it out of this model, where it is "
+                "zero or off; take the model of train.export --to mjcf"
+            )
+        if not _alike(own, theirs):
+            raise UserError(
+                f"{', '.join(tied)}: MJX leaves out how the body's turns couple, since "
+                "its center of mass is at its joint; write its <inertial> with a pos "
+                "of 1e-6 m from there"
+            )
+
+
+def _compiled(m: Any, prefix: str = "") -> dict[str, Any]:
+    """What of an `mjx.Model` is no array of JAX, and so part of the program."""
+    out = {}
+    for field in dataclasses.fields(m):
+        value, name = getattr(m, field.name), prefix + field.name
+        if dataclasses.is_dataclass(value):
+            out |= _compiled(value, f"{name}.")
+        elif not isinstance(value, jax.Array):
+            out[name] = value
+    return out
+
+
+def _alike(some: Mapping[str, Any], others: Mapping[str, Any]) -> bool:
+    """Whether ``others`` say the same of all that is in ``some``."""
+    return all(
+        np.array_equal(value, others[name])
+        if isinstance(value, np.ndarray)
+        else value == others[name]
+        for name, value in some.items()
+    )
 
 
 def _changed(old: Any, new: Any) -> list[str]:

@@ -89,10 +89,16 @@ def _saturation(m: mujoco.MjModel, e: EffectEntry) -> None:
 
 
 def _filtered(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
-    actuator = spec.actuators[_index(m, e)]
+    a = _index(m, e)
+    actuator = spec.actuators[a]
     if actuator.dyntype != mujoco.mjtDyn.mjDYN_NONE:
         return False
     actuator.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
+    # A key frame is at rest: its command has arrived. The other activations move on.
+    range_ = m.actuator_ctrlrange[a] if m.actuator_ctrllimited[a] else (None, None)
+    for key, act, ctrl in zip(spec.keys, m.key_act, m.key_ctrl[:, a], strict=True):
+        at = int(m.actuator_actnum[:a].sum())
+        key.act = np.insert(act, at, np.clip(ctrl, *range_))
     return True
 
 

@@ -135,10 +135,12 @@ def _numbers(m: mujoco.MjModel, addresses: Iterable[str]) -> list[Number]:
 
 
 def set_by_none(
-    m: mujoco.MjModel, space: ParameterSpace, values: Mapping[str, float]
+    m: mujoco.MjModel,
+    addresses: Iterable[Iterable[str]],
+    values: Mapping[str, float],
 ) -> dict[str, float]:
-    """Those values, by address, that no parameter sets."""
-    free = {n for p in space.parameters for n in _numbers(m, p.addresses)}
+    """Those values, by address, that no parameter of these addresses sets."""
+    free = {n for tied in addresses for n in _numbers(m, tied)}
     return {a: v for a, v in values.items() if not free & set(_numbers(m, (a,)))}
 
 
@@ -160,7 +162,7 @@ def _renewed(
             continue
         nominal = float(np.mean([values.get(n, p.nominal) for n in places]))
         out.append(_about(p, nominal))
-    return ParameterSpace(tuple(out)), set_by_none(m, space, own)
+    return ParameterSpace(tuple(out)), set_by_none(m, space.addresses, own)
 
 
 def _about(p: Parameter, nominal: float) -> Parameter:

@@ -244,8 +244,8 @@ def put_model(
         with refusals(Exception):
             put = mjx.put_model(without_idle_cone(opened), own_device(), impl="jax")
             make_data(put)
-        if any(w.row.moves_center for w in writers):
-            put = full_structure(put)
+        moved = {w.body(opened) for w in writers if w.row.moves_center}
+        put = full_structure(put, moved) if moved else put
     n = len(per_parameter)
     lasting = [replace(w, parameter=w.parameter - n) for w in writers]
     lasting = tuple(w for w in lasting if w.parameter >= 0)
@@ -317,14 +317,21 @@ def for_every_effect(m: Any) -> Any:
     return NativeModel(Template(opened, m.template.limits_speed), m.changed)
 
 
-def full_structure(m: mjx.Model) -> mjx.Model:
-    """Lets every degree of freedom couple with all its ancestors.
+def full_structure(m: mjx.Model, bodies: Collection[int] | None = None) -> mjx.Model:
+    """Lets every degree of freedom that moves one of some bodies, by default any,
+    couple with all its ancestors.
 
     MuJoCo drops the off-diagonals of a body whose center of mass is at its joints;
     once the center moves they are no longer zero, but MJX keeps the mask.
     """
-    rows = []
+    rows, moved = [], set(range(m.nbody) if bodies is None else bodies)
+    while (more := moved | {int(m.body_parentid[b]) for b in moved}) != moved:
+        moved = more
     for i in range(m.nv):
+        if m.dof_bodyid[i] not in moved:
+            first = int(m.M_rowadr[i])
+            rows.append(m.M_colind[first : first + m.M_rownnz[i]].tolist())
+            continue
         chain = [i]
         while m.dof_parentid[chain[-1]] >= 0:
             chain.append(int(m.dof_parentid[chain[-1]]))

@@ -24,6 +24,7 @@ from easi_jax.model.effect_catalog import CATALOG
 from easi_jax.model.effect_numbers import EffectEntry
 from easi_jax.model.found_laws import public_name
 from easi_jax.model.joint_space import joint_name
+from easi_jax.model.written_effects import Undo, keep, numbers
 
 _ASSETS = "assets"  # folder beside the model
 _DIGITS = 17  # of a double, so that it is read as it was
@@ -31,10 +32,6 @@ _LONG_NUMBER = re.compile(r'(?<=[\s"])-?(?=[\d.]{16})\d*\.?\d+(?:e[-+]?\d+)?(?=[
 _RELATIVE = 1e-9  # of a number that is read again: far above rounding, below any use
 _ABSOLUTE = 1e-12  # of one that is about zero, in its own unit
 _TOLD = 20  # deviations that are listed one by one
-# Places of names and files in tables of bytes.
-_NO_NUMBERS = re.compile(
-    r"names(_map)?|paths|.*adr$|.*_adr|signature|nbuffer|nnames|npaths"
-)
 _OBJECTS = {
     **{"body": "nbody", "jnt": "njnt", "geom": "ngeom", "actuator": "nu"},
     **{"dof": "nv", "tendon": "ntendon", "eq": "neq", "sensor": "nsensor"},
@@ -53,11 +50,13 @@ class Repaired:
         left: what is not in it: effects that MJCF has no word for (a constant torque
             at a joint, torque ripple, late sensors ...), and numbers that are not
             those that were meant, each with both values.
+        model: the text, compiled.
     """
 
     xml: str
     assets: dict[str, Path]
     left: list[str]
+    model: mujoco.MjModel
 
     def files(self) -> dict[str, str | bytes]:
         """Contents by name: the assets, then ``model.xml``."""
@@ -66,7 +65,10 @@ class Repaired:
 
 
 def repaired_model(
-    path: Path, entries: Sequence[EffectEntry], meant: mujoco.MjModel | None = None
+    path: Path,
+    entries: Sequence[EffectEntry],
+    meant: mujoco.MjModel | None = None,
+    undo: Undo | None = None,
 ) -> Repaired:
     """A model with effects.
 
@@ -75,13 +77,14 @@ def repaired_model(
         entries: effects.
         meant: a compiled model with the numbers that it shall have before effects;
             those of ``path`` where not given.
+        undo: what the text keeps of effects that are in its numbers.
 
     Raises:
         UserError: MuJoCo cannot write this model.
     """
     try:
         with mujoco_warnings(), _all_digits():
-            return _repaired(path, entries, meant)
+            return _repaired(path, entries, meant, undo)
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())
         raise UserError(
@@ -91,7 +94,10 @@ def repaired_model(
 
 
 def _repaired(
-    path: Path, entries: Sequence[EffectEntry], meant: mujoco.MjModel | None
+    path: Path,
+    entries: Sequence[EffectEntry],
+    meant: mujoco.MjModel | None,
+    undo: Undo | None,
 ) -> Repaired:
     spec, given, assets = _explicit(path, meant)
     off = _set_all(spec, given if meant is None else meant)
@@ -108,13 +114,15 @@ def _repaired(
             spec = before
         else:
             off += added
+    if undo is not None:
+        keep(spec, spec.compile(), undo)
     wanted = spec.compile()
     xml = _LONG_NUMBER.sub(lambda n: repr(float(n[0])), spec.to_xml())
     read = mujoco.MjSpec.from_string(xml, assets=spec.assets).compile()
     off += deviations(read, wanted)
     off = list(dict.fromkeys(off))
     more = [f"and {len(off) - _TOLD} more numbers"] if len(off) > _TOLD else []
-    return Repaired(xml, assets, [*left, *off[:_TOLD], *more])
+    return Repaired(xml, assets, [*left, *off[:_TOLD], *more], read)
 
 
 @contextlib.contextmanager
@@ -142,7 +150,7 @@ def _explicit(
     and its files."""
     spec = as_read(path, meant)
     given = spec.compile()  # says where files named by included ones are, too
-    assets = _gathered(spec, path.parent)
+    assets = _gathered(spec, given, path.parent)
     spec.compile()
     own = spec.compiler
     infer = own.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
@@ -164,7 +172,7 @@ def _set_all(spec: mujoco.MjSpec, meant: mujoco.MjModel) -> list[str]:
     Returns:
         What could not be set.
     """
-    fields = [n for n, x in _numbers(spec.compile()) if np.size(x)]
+    fields = [n for n, x in numbers(spec.compile()) if np.size(x)]
     try:
         _changed(spec, lambda m: _copy(m, meant, fields))
     except ValueError:
@@ -176,8 +184,8 @@ def _set_all(spec: mujoco.MjSpec, meant: mujoco.MjModel) -> list[str]:
 
 
 def _copy(m: mujoco.MjModel, other: mujoco.MjModel, fields: Sequence[str]) -> None:
-    theirs = dict(_numbers(other))
-    for name, value in _numbers(m):
+    theirs = dict(numbers(other))
+    for name, value in numbers(m):
         wanted = theirs[name]
         if name not in fields or np.array_equal(value, wanted):
             continue
@@ -204,25 +212,14 @@ def _changed(
     return m
 
 
-def _numbers(m: mujoco.MjModel) -> Iterator[tuple[str, Any]]:
-    """Name and value of every number and array that a simulation may use: not names,
-    and not ``stat`` and ``vis``, which are for drawing."""
-    for prefix, owner in (("", m), ("opt.", m.opt)):
-        for name in dir(owner):
-            value = None if name[0] == "_" else getattr(owner, name)
-            number = isinstance(value, int | float | np.ndarray)
-            if number and not _NO_NUMBERS.fullmatch(name):
-                yield prefix + name, value
-
-
 def deviations(got: mujoco.MjModel, meant: mujoco.MjModel) -> list[str]:
     """Numbers of a compiled model that are not those of another one, as text.
 
     Every size and every array is compared, to 1e-9 of its value.
     """
     out = []
-    theirs = dict(_numbers(meant))
-    for name, value in _numbers(got):
+    theirs = dict(numbers(meant))
+    for name, value in numbers(got):
         a, b = np.asarray(value), np.asarray(theirs[name])
         if a.shape != b.shape:
             out.append(f"{name}: {len(a)} in place of {len(b)}")
@@ -252,12 +249,13 @@ def _place(m: mujoco.MjModel, name: str, index: tuple[int, ...]) -> str:
     return f" of {access(int(index[0])).name or f'{kind} {index[0]}'}"
 
 
-def _gathered(spec: mujoco.MjSpec, folder: Path) -> dict[str, Path]:
-    """Files of a model, which is changed to name them beside it."""
+def _gathered(spec: mujoco.MjSpec, m: mujoco.MjModel, folder: Path) -> dict[str, Path]:
+    """Files of a model, of which ``m`` was compiled; it is changed to name them beside
+    it."""
     out: dict[str, Path] = {}
 
-    def renamed(file: str, below: str) -> str:
-        place = _found(file, folder, below) if file else None
+    def renamed(file: str, below: str, read: str = "") -> str:
+        place = _found(file, folder, below, read) if file else None
         if place is None:
             return file
         count, name = 1, f"{_ASSETS}/{place.name}"
@@ -266,20 +264,34 @@ def _gathered(spec: mujoco.MjSpec, folder: Path) -> dict[str, Path]:
             name = f"{_ASSETS}/{place.stem}_{count}{place.suffix}"
         return name
 
-    for item in (*spec.meshes, *spec.hfields, *spec.skins):
-        item.file = renamed(item.file, spec.meshdir)
+    for items, adr in (
+        (spec.meshes, m.mesh_pathadr),
+        (spec.hfields, m.hfield_pathadr),
+        (spec.skins, m.skin_pathadr),
+    ):
+        for item in items:
+            read = _path(m, int(adr[item.id]))
+            item.file = renamed(item.file, item.compiler.meshdir, read)
     for texture in spec.textures:
-        texture.file = renamed(texture.file, spec.texturedir)
+        below, read = texture.compiler.texturedir, _path(m, m.tex_pathadr[texture.id])
+        texture.file = renamed(texture.file, below, read)
         for i, file in enumerate(texture.cubefiles):
-            texture.cubefiles[i] = renamed(file, spec.texturedir)
+            texture.cubefiles[i] = renamed(file, below)
     spec.meshdir = spec.texturedir = ""
     spec.assets = {name: place.read_bytes() for name, place in out.items()}
     return out
 
 
-def _found(file: str, folder: Path, below: str) -> Path | None:
-    """The file that MuJoCo read; of an attached model its name alone is left."""
-    tried = [
+def _path(m: mujoco.MjModel, start: int) -> str:
+    """A file that MuJoCo read; ``""`` where none is told."""
+    return m.paths[start : m.paths.index(b"\0", start)].decode() if start >= 0 else ""
+
+
+def _found(file: str, folder: Path, below: str, read: str) -> Path | None:
+    """The file that MuJoCo read, where it tells; of the sides of a cube in an attached
+    model their names alone are left."""
+    tried = [Path(read)] if read else []
+    tried += [
         folder / part / way
         for way in sorted(ways(file), key=len, reverse=True)
         for part in (below, "")

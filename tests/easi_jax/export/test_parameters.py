@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import yaml
 from mujoco import mjx
 
 from easi_jax.errors import UserError
@@ -143,6 +144,15 @@ def test_draws_are_those_of_the_distribution(given) -> None:
     np.testing.assert_allclose(got, want, atol=0.03)
 
 
+def test_factors_are_of_the_nominal_value_beside_them(given) -> None:
+    space, _, path = given
+    entries = yaml.safe_load(path.read_text())["parameters"]
+    assert [e["nominal"] for e in entries] == pytest.approx(list(space.nominal))
+    for e in entries:
+        sides = np.sort(np.multiply(e["factor"], e["nominal"]))
+        np.testing.assert_allclose(sides, e["range"], rtol=1e-6)
+
+
 def test_draws_stay_inside_the_bounds(given) -> None:
     read = read_randomization(given[2])
     middle = np.exp(read.mean[1])
@@ -196,6 +206,25 @@ def test_what_mjx_leaves_out_is_said(given, tmp_path: Path) -> None:
     m.dof_frictionloss[:] = 0.01
 
 
+def test_what_mjx_compiles_out_of_a_free_body_is_said(tmp_path: Path) -> None:
+    """Without the products of inertia its center cannot move, that of another body
+    can; nor is there air around it."""
+    text = """<mujoco><worldbody><body name="o" pos="0 0 1"><freejoint/>
+    <geom size=".1"/></body><body name="b" pos="2 0 1"><joint axis="1 0 0"/>
+    <geom size=".1" pos="0 0 .3"/></body></worldbody></mujoco>"""
+    m = mujoco.MjModel.from_xml_string(text)
+    free = {name: (f"body.{name}.com_x", (-0.1, 0.1)) for name in "ob"}
+    for name, (address, initial) in {**free, "air": ("option.density", (1, 2))}.items():
+        space = ParameterSpace((declare(m, "x", address, initial=initial),))
+        made = to_yaml(found(space, np.full(1, 0.6), 0.01 * np.eye(1)), "3", "m")
+        (tmp_path / f"{name}.yaml").write_text(made)
+    domain_randomizer(tmp_path / "b.yaml", m)
+    with pytest.raises(UserError, match="center of mass is at its joint"):
+        domain_randomizer(tmp_path / "o.yaml", m)
+    with pytest.raises(UserError, match=r"option\.density: MJX leaves it out"):
+        domain_randomizer(tmp_path / "air.yaml", m)
+
+
 @pytest.mark.parametrize("text", ["", "parameters: 3", "parameters: [{name: a}]"])
 def test_a_file_of_another_form_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "bad.yaml").write_text(text)
@@ -209,6 +238,50 @@ def test_a_machine_without_the_address_is_refused(given) -> None:
     with pytest.raises(UserError):
         domain_randomizer(path, other)
     assert Simulator(make("cartpole").mj_model, given[0], 0.02).space.size == 3
+
+
+DRIVEN = """<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1"/>
+<body name="b" pos="0 0 1"><joint name="j" armature="0.05" frictionloss="0.01"/>
+<geom size=".1"/><body name="c"><joint name="k" axis="1 0 0" armature="0.05"/>
+<geom size=".1" pos=".3 0 0"/></body></body></worldbody><actuator>
+<position name="a" joint="j" kp="10" forcerange="-5 5"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("as_entries", [True, False])
+def test_effects_in_an_exported_model_count_once(
+    as_entries: bool, tmp_path: Path
+) -> None:
+    """At the mean, what is drawn is the exported model, whatever of it varies."""
+    path = tmp_path / "m.xml"
+    path.write_text(DRIVEN)
+    m = mujoco.MjModel.from_xml_path(str(path))
+    rotor = ("effect.armature.j", 0.1, (0.01, 1.0))
+    free = [rotor, ("effect.friction", 0.5, (0.3, 0.8))]
+    free += [("effect.limit.a", 2.0, (1.0, 3.0)), ("effect.tilt.0", 0.1, (0.05, 0.2))]
+    parameters = [declare(m, a, a, nominal=x, initial=r) for a, x, r in free]
+    space, unit = ParameterSpace(tuple(parameters)), np.full(4, 0.5)
+    means = np.asarray(space.to_si(unit), float).tolist()
+    values = dict(zip(space.names, means, strict=True))
+    tilt = {"tilt.0": 0.1, "tilt.1": 0.2}
+    entries = [
+        EffectEntry("armature", "j", "joint", {"armature": 0.1}, {}),
+        EffectEntry("armature", "k", "joint", {"armature": 0.3}, {}),
+        EffectEntry("coulomb_friction", "j", "joint", {"coulomb": 0.05}, {}),
+        EffectEntry("gravity_tilt", "", "model", tilt, {}),
+    ]
+    own = FoundEffects(tuple(entries) if as_entries else ())
+    got = written_machine(path, m, None, parameters, values, own)
+    assert got.left == []
+    text = to_yaml(found(space, unit, 1e-14 * np.eye(4)), "3", "m")
+    (tmp_path / "random.yaml").write_text(text)
+    randomize = domain_randomizer(tmp_path / "random.yaml", got.model)
+    keys = jax.random.split(jax.random.key(0), 2)
+    drawn, _ = randomize(mjx.put_model(got.model, impl="jax"), keys)
+    for name in ("dof_armature", "geom_friction", "actuator_forcerange"):
+        want = np.broadcast_to(getattr(got.model, name), getattr(drawn, name).shape)
+        np.testing.assert_allclose(getattr(drawn, name), want, rtol=1e-4, err_msg=name)
+    np.testing.assert_allclose(drawn.opt.gravity[0], got.model.opt.gravity, rtol=1e-4)
+    np.testing.assert_allclose(drawn.dof_invweight0[0], got.model.dof_invweight0, 1e-4)
 
 
 def test_parameters_and_effects_of_a_machine_are_all_written(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """A repaired model loads wherever it is written, with all files that it names."""
 
+import dataclasses
 import struct
 import zlib
 from pathlib import Path
@@ -98,10 +99,34 @@ def test_with_effects(model: Path, tmp_path: Path) -> None:
         n: tmp_path / "elsewhere" / p.relative_to(model.parent)
         for n, p in got.assets.items()
     }
-    m = written(Repaired(got.xml, moved, got.left), tmp_path / "out")
+    m = written(dataclasses.replace(got, assets=moved), tmp_path / "out")
     assert_same_files(m, want)
     assert len(got.assets) == 7
     assert m.joint("j").frictionloss[0] == pytest.approx(0.05)
+
+
+def test_files_of_one_name_of_attached_models(tmp_path: Path) -> None:
+    """Each is the one that MuJoCo read: of an attached model the name alone is left."""
+    tip = TOOL.replace("<asset>", '<compiler meshdir="m"/><asset>')
+    names = {"l": 0.1, "r": 0.3}
+    for name, size in names.items():
+        (tmp_path / name / "m").mkdir(parents=True)
+        (tmp_path / name / "tool.xml").write_text(tip)
+        (tmp_path / name / "m" / "tip.obj").write_text(tetrahedron(size))
+    models = "".join(f'<model name="{n}" file="{n}/tool.xml"/>' for n in names)
+    attached = "".join(
+        f'<body pos="{k} 0 0"><joint/><attach model="{n}" body="tip" prefix="{n}_"/>'
+        "</body>"
+        for k, n in enumerate(names)
+    )
+    path = tmp_path / "robot.xml"
+    path.write_text(
+        f"<mujoco><asset>{models}</asset><worldbody>{attached}</worldbody></mujoco>"
+    )
+    got = repaired_model(path, [])
+    assert got.left == [] and len(got.assets) == 2
+    want = mujoco.MjModel.from_xml_path(str(path))
+    assert_same_files(written(got, tmp_path / "out"), want)
 
 
 SPRUNG = """<mujoco>{0}<worldbody><body name="b"><joint name="j" stiffness="2"

@@ -223,6 +223,20 @@ def test_lag_and_delay_leave_the_rest(file: Callable[[str], Path]) -> None:
     np.testing.assert_allclose(m.key_ctrl[0], [0.3])
 
 
+def test_a_key_frame_is_at_rest_behind_a_lag(file: Callable[[str], Path]) -> None:
+    """The command has arrived, as far as its range goes; other activations stay."""
+    drives = MOTOR + (
+        '<general name="f" joint="k" dyntype="filter" dynprm="0.1"/>'
+        '<motor name="c" joint="k"/>'
+    )
+    keys = '<keyframe><key ctrl="1.5 0.4 0.5" act="0.7"/><key/></keyframe>'
+    lags = [EffectEntry("actuator_lag", a, "actuator", {"lag": 0.03}, {}) for a in "ca"]
+    got = repaired_model(file(one(drive=drives, tail=keys)), lags)
+    assert got.left == []
+    m = mujoco.MjModel.from_xml_string(got.xml)
+    np.testing.assert_allclose(m.key_act, [[1.0, 0.7, 0.5], [0.0, 0.0, 0.0]])
+
+
 def test_a_lag_before_a_filter_is_left(file: Callable[[str], Path]) -> None:
     entry = EffectEntry("actuator_lag", "a", "actuator", {"lag": 0.03}, {})
     got = repaired_model(file(KINDS["timeconst"]), [entry, DRY])
