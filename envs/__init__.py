@@ -3,6 +3,7 @@
 import importlib.util
 import inspect
 import numbers
+import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -72,6 +73,7 @@ def load(path: Path, *, engine: str = "auto") -> Any:
     spec = importlib.util.spec_from_file_location(f"_own_env_{path.stem}", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their own module up
     try:
         spec.loader.exec_module(module)
         if not callable(getattr(module, "make", None)):

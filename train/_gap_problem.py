@@ -75,7 +75,7 @@ class GapProblem:
         """What the model has and MJCF cannot say, where no parameter sets it."""
         from easi_jax.model.found_effects import set_by_none
 
-        return set_by_none(self.model.mj_model, self.space, self.model.fixed)
+        return set_by_none(self.model.mj_model, self.space.addresses, self.model.fixed)
 
 
 def read_gap_problem(config: "Config") -> GapProblem:

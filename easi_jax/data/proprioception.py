@@ -22,7 +22,12 @@ from easi_jax.data.recording import Run
 from easi_jax.data.sensor_channels import Sensors, measured_sensors
 from easi_jax.data.unmeasured import hidden_in_any
 from easi_jax.errors import UserError
-from easi_jax.model.joint_space import joint_name, scalar_dofs, tangent_units
+from easi_jax.model.joint_space import (
+    driven_joint,
+    joint_name,
+    scalar_dofs,
+    tangent_units,
+)
 
 _GRAVITY, _TOUCH = "gravity", "touch"
 _READ = 0.95  # share of rows in which a sensor that is compared was read
@@ -193,9 +198,17 @@ def proprioception(
         raise UserError("the logs hold no joint and no sensor that can be compared")
     positions, dofs = zip(*at.values(), strict=True) if at else ((), ())
     names, units_of = zip(*channels, strict=True)
-    weight = float(m.body_mass.sum() * np.linalg.norm(m.opt.gravity))
+    weight = _driven_mass(m) * float(np.linalg.norm(m.opt.gravity))
     found = (positions, dofs, speeds, own, parts, names, units_of, weight)
     return Proprioception(*found), notes
+
+
+def _driven_mass(m: mujoco.MjModel) -> float:
+    """Of the trees that drives act on [kg]; of all bodies where that is not known."""
+    joints = [driven_joint(m, a) for a in range(m.nu)]
+    driven = {m.body_rootid[m.jnt_bodyid[j]] for j in joints if j is not None}
+    mine = np.isin(m.body_rootid, [*driven]) if driven else np.ones(m.nbody, bool)
+    return float(m.body_mass[mine].sum())
 
 
 def _parts(sensors: Sensors) -> tuple[_Part, ...]:

@@ -281,9 +281,16 @@ def moving_sensors(
     sensors = Sensors(tuple(n for n in sensors if n.sensor in moving))
     names = dict.fromkeys(n.sensor for n in sensors)
     notes = [f"sensors that are fitted as well: {', '.join(names)}"] if names else []
-    why = {c.split(".")[1]: text for c, text in {**ignored, **unpredicted}.items()}
+    why = {_owner(m, c): text for c, text in {**ignored, **unpredicted}.items()}
     notes += [f"sensor {name} is not fitted: {text}" for name, text in why.items()]
     return sensors, notes
+
+
+def _owner(m: mujoco.MjModel, channel: str) -> str:
+    """The sensor of a channel; names may have dots."""
+    name = channel.removeprefix("sensor.")
+    known = {m.sensor(i).name for i in range(m.nsensor)}
+    return name if name in known else name.rpartition(".")[0]
 
 
 def _why_not(m: mujoco.MjModel, i: int, runs: Sequence[Run]) -> str:

@@ -16,6 +16,7 @@ from easi_jax.data.windows import fitted_velocity
 from easi_jax.errors import UserError
 from easi_jax.model.joint_space import (
     dofs,
+    driven_joint,
     given_name,
     is_hinge,
     is_scalar,
@@ -26,10 +27,6 @@ from easi_jax.model.joint_space import (
 )
 
 _JOINT_EQUALITY = int(mujoco.mjtEq.mjEQ_JOINT)
-_AT_JOINT = (
-    int(mujoco.mjtTrn.mjTRN_JOINT),
-    int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
-)
 # Half the travel of a joint, by its range or by its spring under twice the weight, up
 # to which it is play or compliance of the joint beside it and no joint of its own.
 _PLAY = {"rad": 0.15, "m": 0.01}
@@ -102,7 +99,7 @@ def is_play(m: mujoco.MjModel, j: int) -> bool:
 def _is_driven(m: mujoco.MjModel, j: int) -> bool:
     for a in range(m.nu):
         kind, at = int(m.actuator_trntype[a]), int(m.actuator_trnid[a, 0])
-        if kind in _AT_JOINT and at == j:
+        if driven_joint(m, a) == j:
             return True
         if kind == int(mujoco.mjtTrn.mjTRN_TENDON):
             wraps = range(m.tendon_adr[at], m.tendon_adr[at] + m.tendon_num[at])

@@ -7,7 +7,7 @@ import numpy as np
 
 from easi_jax.data.unmeasured import is_play
 from easi_jax.errors import UserError
-from easi_jax.model.joint_space import is_scalar, joint_name, scalar_dofs
+from easi_jax.model.joint_space import driven_joint, is_scalar, joint_name, scalar_dofs
 from easi_jax.model.quantities import (
     FILTERS,
     actuator_name,
@@ -46,14 +46,9 @@ class Limits:
 def driven(m: mujoco.MjModel) -> dict[int, tuple[int, ...]]:
     """Actuators at each hinge or slide joint."""
     out: dict[int, tuple[int, ...]] = {}
-    # As numbers: an enumeration compares to no numpy integer from the left.
-    at_joint = (
-        int(mujoco.mjtTrn.mjTRN_JOINT),
-        int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
-    )
     for a in range(m.nu):
-        j = int(m.actuator_trnid[a, 0])
-        if int(m.actuator_trntype[a]) in at_joint and is_scalar(m, j):
+        j = driven_joint(m, a)
+        if j is not None and is_scalar(m, j):
             out[j] = (*out.get(j, ()), a)
     return out
 

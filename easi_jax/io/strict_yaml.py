@@ -1,5 +1,6 @@
 """Plain data from YAML, strictly: no tags, no key twice, no aliases that explode."""
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,16 @@ class _Loader(yaml.SafeLoader):
                 )
             seen.add(text)
         return super().construct_mapping(node, deep)
+
+
+def number_of(value: Any) -> float:
+    """What was read as a number; NaN where it is none. YAML 1.1 takes 1e-3 for text."""
+    try:
+        return math.nan if isinstance(value, bool) else float(value)
+    except OverflowError:  # a whole number of hundreds of digits
+        return math.inf
+    except (TypeError, ValueError):
+        return math.nan
 
 
 def read_yaml(path: Path) -> Any:

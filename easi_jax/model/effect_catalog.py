@@ -716,4 +716,3 @@ _ROWS = (
 # Beside these, what owners write (`easi_jax.model.own_effects`).
 CATALOG: dict[str, Effect] = {row.name: row for row in _ROWS}
 EFFECTS = tuple(CATALOG)
-SHARED = tuple(name for name, row in CATALOG.items() if row.is_shared)

@@ -336,7 +336,8 @@ def _direct(m: mjx.Model, solref: jax.Array) -> jax.Array:
     if not m.opt.disableflags & DisableBit.REFSAFE:
         time = jnp.maximum(time, 2 * m.opt.timestep)
     time, ratio = (jnp.where(standard, x, 1.0) for x in (time, ratio))
-    direct = -jnp.stack([1 / (time * ratio) ** 2, 2 / time], 1)
+    square = jnp.maximum((time * ratio) ** 2, mujoco.mjMINVAL)
+    direct = -jnp.stack([1 / square, 2 / time], 1)
     return jnp.where(standard[:, None], direct, solref)
 
 

@@ -17,6 +17,10 @@ import mujoco
 import numpy as np
 
 _Joint = mujoco.mjtJoint
+_AT_JOINT = {
+    int(mujoco.mjtTrn.mjTRN_JOINT),
+    int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
+}
 # Widths of a joint's positions, of which a free joint has the most, and velocities.
 FREE_WIDTH = 7
 _WIDTHS = {_Joint.mjJNT_FREE: (FREE_WIDTH, 6), _Joint.mjJNT_BALL: (4, 3)}
@@ -119,6 +123,12 @@ def turns_fully(m: Any, j: int) -> bool:
     may jump by a turn without a motion."""
     low, high = m.jnt_range[j]
     return is_hinge(m, j) and bool(not m.jnt_limited[j] or high - low >= _FULL_TURN)
+
+
+def driven_joint(m: Any, a: int) -> int | None:
+    """The joint that actuator ``a`` is at; None where it is at something else."""
+    at = int(m.actuator_trntype[a]) in _AT_JOINT
+    return int(m.actuator_trnid[a, 0]) if at else None
 
 
 def scalar_dofs(m: Any) -> dict[int, tuple[int, int]]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from easi_jax.errors import UserError
 from easi_jax.model import addresses as language
-from easi_jax.model.joint_space import is_scalar, scalar_dofs
+from easi_jax.model.joint_space import driven_joint, is_scalar, scalar_dofs
 from easi_jax.model.parameters import Parameter, ParameterSpace, Range, declare
 
 _GRAVITY = 9.81
@@ -31,10 +31,6 @@ _DIGITS = 4  # significant ones, of a proposed number
 _FELT = 1e-3
 _INERTIA_DECIMALS = 9  # kg m2: rounding of what is said in a model
 _RANGE_DECIMALS = 4  # rad or m: as ends are written
-_AT_JOINTS = {
-    int(mujoco.mjtTrn.mjTRN_JOINT),
-    int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
-}
 _POSES = 4  # in which bodies are felt for, drawn at random
 _SHARES = {  # of the drive's force, of that over a brisk speed, of the inertia
     "frictionloss": (1e-3, 0.1),
@@ -210,14 +206,14 @@ def _look(m: mujoco.MjModel, kind: str, i: int) -> tuple[Any, ...]:
     if kind == "joint":
         return int(m.jnt_type[i]), _depth(m, i), _width(m.jnt_range[i])
     if kind == "actuator":
-        way, at = int(m.actuator_trntype[i]), int(m.actuator_trnid[i, 0])
+        at = driven_joint(m, i)
         look = (
-            way,
+            int(m.actuator_trntype[i]),
             _width(m.actuator_ctrlrange[i]),
             _mirrored(m.actuator_forcerange[i]),
             abs(float(m.actuator_gear[i, 0])),
         )
-        return (*look, *(_look(m, "joint", at) if way in _AT_JOINTS else ()))
+        return look if at is None else (*look, *_look(m, "joint", at))
     if kind == "body":
         return (_body_depth(m, i), *np.round(m.body_inertia[i], _INERTIA_DECIMALS))
     return ()
@@ -330,8 +326,7 @@ def _drives(m: mujoco.MjModel, joint: int) -> list[float]:
     """Largest forces of the actuators at a joint, where the model says them."""
     out = []
     for a in range(m.nu):
-        at_joint = m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT
-        if not at_joint or m.actuator_trnid[a, 0] != joint:
+        if driven_joint(m, a) != joint:
             continue
         gear = abs(float(m.actuator_gear[a, 0]))
         if m.actuator_forcelimited[a]:

@@ -13,7 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from easi_jax.model.joint_space import dofs, is_scalar
+from easi_jax.model.joint_space import dofs, driven_joint, is_scalar
 
 # Added to what MJX would compile out if it were zero: small against any real value,
 # and a normal number in float32.
@@ -265,9 +265,9 @@ def linear_drive(m: Any, a: int) -> bool | None:
             return True
         slides = m.jnt_type[m.wrap_objid[at]] == _Joint.mjJNT_SLIDE
         return bool(slides[0]) if (slides == slides[0]).all() else None
-    joint = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-    if kind in map(int, joint) and m.jnt_type[target] != _Joint.mjJNT_FREE:
-        return bool(m.jnt_type[target] == _Joint.mjJNT_SLIDE)
+    joint = driven_joint(m, a)
+    if joint is not None and m.jnt_type[joint] != _Joint.mjJNT_FREE:
+        return bool(m.jnt_type[joint] == _Joint.mjJNT_SLIDE)
     return None
 
 
@@ -393,7 +393,8 @@ def direct_solref(m: Any, solref: Any) -> tuple[float, float]:
         return -time, -ratio
     if not m.opt.disableflags & _Disable.mjDSBL_REFSAFE:
         time = max(time, 2 * m.opt.timestep)
-    return 1 / (time * ratio) ** 2, 2 / time
+    # MuJoCo's least number: a ratio of zero means as stiff as can be said.
+    return 1 / max((time * ratio) ** 2, float(mujoco.mjMINVAL)), 2 / time
 
 
 def _open_contact(m: Any, g: int) -> None:

@@ -6,8 +6,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from easi_jax.model.contact_pairs import pair_ids
-
-_AT_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+from easi_jax.model.joint_space import driven_joint
 
 
 def separate_trees(m: mujoco.MjModel) -> np.ndarray:
@@ -17,8 +16,8 @@ def separate_trees(m: mujoco.MjModel) -> np.ndarray:
     where an equality, a tendon, a flex or an actuator that is not at a joint may couple
     trees, all of them are.
     """
-    others = (m.actuator_trntype[:, None] != _AT_JOINTS).all(1)
-    if m.neq or m.ntendon or m.nflex or others.any():
+    others = any(driven_joint(m, a) is None for a in range(m.nu))
+    if m.neq or m.ntendon or m.nflex or others:
         return np.zeros(m.nv, int)
     pairs = np.array(pair_ids(m), int).reshape(-1, 2)
     trees = m.body_treeid[m.geom_bodyid[pairs]]

@@ -4,6 +4,9 @@ from dataclasses import dataclass, replace
 
 from easi_jax.errors import UserError, nearest
 
+LOSSES = "wasserstein", "gan"
+REGULARIZERS = "clip", "gradient_penalty", "none"
+
 
 @dataclass(frozen=True)
 class SearchConfig:
@@ -94,8 +97,8 @@ class SearchConfig:
         """Checks names and sizes; raises UserError."""
         choices = {
             "source": ("replay", "policy"),
-            "loss": ("wasserstein", "gan"),
-            "regularizer": ("clip", "gradient_penalty", "none"),
+            "loss": LOSSES,
+            "regularizer": REGULARIZERS,
             "spread_about": ("old_mean", "new_mean"),
         }
         for field, known in choices.items():

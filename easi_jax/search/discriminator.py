@@ -13,9 +13,6 @@ import jax
 import jax.numpy as jnp
 import optax
 
-LOSSES = ("wasserstein", "gan")
-REGULARIZERS = ("clip", "gradient_penalty", "none")
-
 
 class Discriminator(nn.Module):
     """MLP with ReLU layers, ``(..., features) -> (...)`` scores."""

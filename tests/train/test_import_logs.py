@@ -1,5 +1,6 @@
 """``train.import_logs``: recordings of every kind become logs, or one clear line."""
 
+import errno
 import json
 import os
 import pickle
@@ -448,6 +449,7 @@ def test_tensors_stay_inside_their_storage(tmp_path: Path, refuse: Any) -> None:
         ),
         ({"dof_pos": QPOS[:, :, None]}, "dof_pos is 30x2x1, not rows by joints"),
         ({"time": 1000 * TIME}, "wrong rate"),
+        ({"dof_pos": QPOS[:0]}, "dof_pos is empty"),
     ],
 )
 def test_wrong_pace_recordings(
@@ -735,6 +737,48 @@ def test_earlier_logs_are_kept(tmp_path: Path, call: Any, refuse: Any) -> None:
     assert "--overwrite" in refuse(path)  # not even the first episode is written
     assert mine.read_text() == "mine"
     check(call(path, "--overwrite")["pusht_000001"], CTRL + 1, rtol=1e-6)
+
+
+def test_logs_are_as_before_where_one_cannot_be_written(
+    tmp_path: Path, call: Any, refuse: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = [lerobot(tmp_path / name) for name in ("pusht", "reach")]
+    call(*paths)
+    logs = sorted((tmp_path / "logs").iterdir())
+    for log in logs:
+        log.write_text("mine")
+    replace = os.replace
+
+    def full(source: Path, target: Path) -> None:
+        if Path(target) == logs[-1] and Path(source).parent.name != "before":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
+    assert "No space left" in refuse(*paths, "--overwrite")
+    assert [log.read_text() for log in logs] == ["mine"] * len(logs)
+    assert sorted((tmp_path / "logs").iterdir()) == logs
+
+
+def test_a_reading_that_is_no_number_costs_its_own_rows_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a joint that turns, too, whose readings are brought to other rows."""
+    ros = Ros()
+    for i, at in enumerate(TIME):
+        ros.joints(at, ["slider"], [QPOS[i, 0]], topic="/base")
+        ros.array(at, [CTRL[i]])
+        angle = np.nan if i == len(TIME) // 3 else QPOS[i, 1]
+        ros.joints(at + 1e-3, ["pole"], [angle], topic="/arm")
+    path = ros.write(tmp_path / "walk")
+    model = tmp_path / "robot.xml"
+    model.write_text(MODEL)
+    asked = (path, "--state", "/base", "/arm", "--allow-nan")
+    command(import_logs, *_arguments(tmp_path, model, asked, ARRAY))
+    capsys.readouterr()
+    mj_model = mujoco.MjModel.from_xml_string(MODEL)
+    runs = read_logs(tmp_path / "logs" / "walk.csv", mj_model).runs
+    assert sum(map(len, runs)) >= len(TIME) - 4
 
 
 def test_a_wrong_last_recording_leaves_nothing(tmp_path: Path, refuse: Any) -> None:

@@ -1,6 +1,7 @@
 """An environment in a file outside the package: ``--env FILE``."""
 
 import json
+import shutil
 from pathlib import Path
 
 import jax
@@ -39,6 +40,17 @@ def test_a_broken_file_gets_one_line(text: str, said: str, tmp_path: Path) -> No
         load(_file(tmp_path, text))
     message = str(caught.value)
     assert said in message and str(tmp_path) in message and "\n" not in message
+
+
+def test_a_file_may_have_dataclasses(tmp_path: Path) -> None:
+    """Which look up the module that they are in."""
+    head = "from __future__ import annotations\nfrom dataclasses import dataclass\n"
+    data = "\n\n@dataclass\nclass Gains:\n    kp: float = 1.0\n"
+    folder = tmp_path / "own"
+    shutil.copytree(TEMPLATE.parent, folder)
+    _, about, rest = TEMPLATE.read_text().split('"""', 2)
+    path = _file(folder, f'"""{about}"""\n{head}{rest}{data}')
+    assert load(path).name
 
 
 def test_a_robot_that_nothing_drives_has_no_policy(tmp_path: Path) -> None:

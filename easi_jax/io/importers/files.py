@@ -170,17 +170,22 @@ def _read_back(
 
 
 def _put_in_place(staged: Path, targets: list[Path]) -> None:
-    """Moves all of ``targets`` out of ``staged``; none stays if one cannot be moved."""
-    new: list[Path] = []
+    """Moves all of ``targets`` out of ``staged``; if one cannot be moved, all are as
+    they were before."""
+    old, done = staged / "before", list[Path]()
     try:
+        old.mkdir()
         for target in targets:
             target.parent.mkdir(parents=True, exist_ok=True)
-            if not target.exists():
-                new.append(target)
+            if target.exists():
+                os.replace(target, old / target.name)
+            done.append(target)
             os.replace(staged / target.name, target)
     except OSError as error:
-        for target in new:
+        for target in done:
             target.unlink(missing_ok=True)
+            if (old / target.name).exists():
+                os.replace(old / target.name, target)
         raise UserError(f"cannot write {targets[0].parent}: {os_reason(error)}") from (
             error
         )

@@ -16,6 +16,7 @@ from easi_jax.io.importers.streams import (
     listed,
     stream,
 )
+from easi_jax.io.logs.tables import parquet_file
 
 _STATE, _COMMAND = "observation.state", "action"
 _SUFFIXES: dict[str, Role] = {".pos": "qpos", ".vel": "qvel"}
@@ -106,24 +107,17 @@ def _episodes(
 
 
 def _read(file: Path, wanted: Sequence[str]) -> dict[str, np.ndarray]:
-    import pyarrow
-    import pyarrow.parquet
-
-    broken = UserError(f"{file}: not a Parquet file, damaged or cut short")
-    try:
-        with pyarrow.parquet.ParquetFile(file) as parquet:
-            there = parquet.schema_arrow.names
-            for key in ("episode_index", *wanted):
-                if key not in there:
-                    raise UserError(f'{file}: no column "{key}"{nearest(key, there)}')
-            extra = [key for key in ("timestamp", "frame_index") if key in there]
-            table = parquet.read(columns=["episode_index", *extra, *wanted])
+    with parquet_file(file) as parquet:
+        there = parquet.schema_arrow.names
+        for key in ("episode_index", *wanted):
+            if key not in there:
+                raise UserError(f'{file}: no column "{key}"{nearest(key, there)}')
+        extra = [key for key in ("timestamp", "frame_index") if key in there]
+        table = parquet.read(columns=["episode_index", *extra, *wanted])
         return {
             name: _numbers(file, name, column.combine_chunks())
             for name, column in zip(table.column_names, table.columns, strict=True)
         }
-    except (pyarrow.ArrowException, OSError, ValueError, MemoryError):
-        raise broken from None
 
 
 def _numbers(file: Path, name: str, column: Any) -> np.ndarray:

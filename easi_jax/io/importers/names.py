@@ -9,7 +9,7 @@ from easi_jax.errors import UserError, nearest
 from easi_jax.io.importers.streams import Recording, Stream, listed
 from easi_jax.io.logs.columns import LogColumns, hidden_joints, log_columns
 from easi_jax.io.logs.mapping import LogMapping
-from easi_jax.model.joint_space import FREE_WIDTH, joint_name, widths
+from easi_jax.model.joint_space import FREE_WIDTH, driven_joint, joint_name, widths
 
 _KINDS = {FREE_WIDTH: "free", 4: "ball"}  # by their number of positions
 
@@ -164,13 +164,9 @@ class _Assignment:
         )
 
     def _drives(self, joint: str) -> list[str]:
-        of_joint = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-        return [
-            name
-            for i, name in enumerate(self.actuators)
-            if mujoco.mjtTrn(int(self.model.actuator_trntype[i])) in of_joint
-            and self.joints[int(self.model.actuator_trnid[i, 0])] == joint
-        ]
+        at = (driven_joint(self.model, a) for a in range(self.model.nu))
+        named = zip(self.actuators, at, strict=True)
+        return [a for a, j in named if j is not None and self.joints[j] == joint]
 
     def _check_mapping(self) -> None:
         channels = [c for s in self.recording.streams for c in s.channels]

@@ -38,6 +38,9 @@ def read_pace(path: Path, selection: Selection) -> Recording:
                 f'{path}: no tensor "{key}"{nearest(key, tensors)} '
                 f"(it has {listed(list(tensors))})"
             )
+    empty = next((key for key, values in tensors.items() if not values.size), None)
+    if empty is not None:
+        raise UserError(f"{path}: {empty} is empty")
     time = tensors["time"].astype(float)
     if time.ndim != 1:
         raise UserError(f"{path}: time is {time.ndim}-dimensional, not a row of times")

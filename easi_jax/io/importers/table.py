@@ -70,7 +70,9 @@ def to_table(
             continue
         else:
             if use.column in turning:
-                values = np.unwrap(values)
+                read = np.isfinite(values)
+                values = values.copy()
+                values[read] = np.unwrap(values[read])
             table[use.column], there = _interpolated(at, values, time)
         lost = int(np.sum(known & ~there))
         known &= there

@@ -16,6 +16,7 @@ from easi_jax.model.joint_space import (
     FREE_WIDTH,
     Configuration,
     dofs,
+    driven_joint,
     is_hinge,
     is_scalar,
     joint_name,
@@ -26,10 +27,6 @@ from easi_jax.model.joint_space import (
 )
 from easi_jax.model.quantities import is_position_servo, linear_drive
 
-_AT_JOINT = (
-    int(mujoco.mjtTrn.mjTRN_JOINT),
-    int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
-)
 _HUGE = 1e8
 # Readings so many times as far from the median as all others, in so many rows at most,
 # are codes of an error: no shock is a hundred times as strong as the next one.
@@ -384,8 +381,8 @@ def units_of_motion(
                     f"positions: in {unit}? {scaled(column, 1 / factor)}"
                 )
     for a in range(model.nu):
-        j = int(model.actuator_trnid[a, 0])
-        if int(model.actuator_trntype[a]) not in _AT_JOINT or not is_hinge(model, j):
+        j = driven_joint(model, a)
+        if j is None or not is_hinge(model, j):
             continue
         if not is_position_servo(model, a):
             continue

@@ -15,6 +15,7 @@ from easi_jax.model.addresses import matching
 from easi_jax.model.joint_space import (
     FREE_WIDTH,
     carrying_joints,
+    driven_joint,
     given_name,
     numbered,
     widths,
@@ -23,10 +24,6 @@ from easi_jax.model.joint_space import (
 _CHECKED = ("qpos.", "qvel.", "ctrl.")
 _ALL = "all"  # joints that a log lacks
 _LISTED = 5  # names in a message
-_AT_JOINT = (
-    int(mujoco.mjtTrn.mjTRN_JOINT),
-    int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
-)
 
 
 @dataclass(frozen=True)
@@ -283,11 +280,7 @@ def _undetermined(
     drives = [
         a
         for a in range(model.nu)
-        if columns.ctrl[a] in lost
-        or (
-            model.actuator_trntype[a] in _AT_JOINT
-            and int(model.actuator_trnid[a, 0]) in joints
-        )
+        if columns.ctrl[a] in lost or driven_joint(model, a) in joints
     ]
     said = [
         _listed("joint", [given_name(model, j) for j in joints]),

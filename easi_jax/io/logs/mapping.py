@@ -6,6 +6,7 @@ recordings that are imported.
 
 import math
 import os
+import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 
 from easi_jax.errors import UserError, nearest
 from easi_jax.io.logs.tables import Cells, Table
-from easi_jax.io.strict_yaml import check_keys, read_yaml
+from easi_jax.io.strict_yaml import check_keys, number_of, read_yaml
 from easi_jax.model.addresses import matching
 
 _NAMES = ("columns", "joints", "actuators")
@@ -104,7 +105,8 @@ class LogMapping:
                 )
         for joint in self.quaternions:
             if f"qpos.{joint}.3" not in columns:
-                known = {c.split(".")[1] for c in columns if c.count(".") == 2}
+                many = [c for c in columns if re.fullmatch(r"qpos\..+\.\d", c)]
+                known = {c[len("qpos.") : -len(".0")] for c in many}
                 raise UserError(
                     f'{self.source}: quaternions of "{joint}", which has none in the '
                     f"log{nearest(joint, known)}"
@@ -242,11 +244,7 @@ def _numbers(
     numbers: dict[str, float] = {}
     for name, value in _section(path, content, key).items():
         ours = columns.get(str(name)) or str(name)
-        try:
-            # YAML 1.1 takes 1e-3 for text
-            number = float(value)
-        except (TypeError, ValueError, OverflowError):
-            number = math.nan
+        number = number_of(value)
         if not math.isfinite(number):
             raise UserError(f'{path}: {key} of "{name}" is {value!r}, not a number')
         if ours in numbers:

@@ -154,13 +154,19 @@ def write_log(
         if hidden[mj_model.jnt_dofadr[j]]
         for name in (*columns.positions[j], *columns.joints[j])
     }
-    for name in chosen[0].sensors:
-        blocks.append((columns.sensors[name], [run.sensors[name] for run in chosen]))
+    for name in dict.fromkeys(name for run in chosen for name in run.sensors):
+        names = columns.sensors[name]
+        read = [r.sensors.get(name, _unread(len(r), len(names))) for r in chosen]
+        blocks.append((names, read))
     for names, arrays in blocks:
         values = np.concatenate(arrays)
         out |= dict(zip(names, values.T, strict=True))
     out = {name: values for name, values in out.items() if name not in left_out}
     write_table(path, out, digits)
+
+
+def _unread(rows: int, width: int) -> np.ndarray:
+    return np.full((rows, width), np.nan)
 
 
 def first_pose(

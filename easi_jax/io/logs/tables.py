@@ -1,12 +1,13 @@
 """Tables of named columns from CSV, NPZ and Parquet files, and back."""
 
+import contextlib
 import csv
 import io
 import os
 import re
 import zipfile
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -255,17 +256,28 @@ def _npz_column(archive: np.lib.npyio.NpzFile, name: str) -> np.ndarray | str:
 
 
 def _read_parquet(path: Path) -> dict[str, list[str] | np.ndarray | str]:
-    broken = UserError(f"{path}: not a Parquet file, damaged or cut short")
-    try:
-        with pyarrow.parquet.ParquetFile(path) as file:
-            _refuse_duplicates(path, file.schema_arrow.names)
-            cells = file.metadata.num_rows * file.metadata.num_columns
-            _refuse_bomb(path, 8 * cells)
-            table = file.read()
+    with parquet_file(path) as file:
+        _refuse_duplicates(path, file.schema_arrow.names)
+        cells = file.metadata.num_rows * file.metadata.num_columns
+        _refuse_bomb(path, 8 * cells)
+        table = file.read()
         return {
             name: _parquet_column(column)
             for name, column in zip(table.column_names, table.columns, strict=True)
         }
+
+
+@contextlib.contextmanager
+def parquet_file(path: Path) -> Iterator[pyarrow.parquet.ParquetFile]:
+    """An opened file.
+
+    Raises:
+        UserError: no Parquet, or what is read of it is damaged.
+    """
+    broken = UserError(f"{path}: not a Parquet file, damaged or cut short")
+    try:
+        with pyarrow.parquet.ParquetFile(path) as file:
+            yield file
     except OSError as error:
         if error.errno:
             raise

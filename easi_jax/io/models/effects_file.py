@@ -19,7 +19,7 @@ import yaml
 
 from easi_jax.errors import UserError, nearest
 from easi_jax.io.files import atomic_write, to_plain
-from easi_jax.io.strict_yaml import read_yaml
+from easi_jax.io.strict_yaml import number_of, read_yaml
 from easi_jax.model.effect_catalog import CATALOG
 from easi_jax.model.effect_numbers import NUMBERS, is_column
 from easi_jax.model.found_effects import EffectEntry, FoundEffects
@@ -206,12 +206,7 @@ def _with_law(where: str, item: dict[str, Any]) -> dict[str, Any]:
 
 
 def _number(path: str, where: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise UserError(f'{path}, {where}: "{value}" is not a number')
-    try:
-        number = float(value)
-    except OverflowError:  # a whole number of hundreds of digits
-        number = math.inf
+    number = number_of(value)
     if not math.isfinite(number):
-        raise UserError(f"{path}, {where}: {value} is not finite")
+        raise UserError(f"{path}, {where}: {value!r} is no finite number")
     return number

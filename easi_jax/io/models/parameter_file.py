@@ -20,7 +20,7 @@ import yaml
 
 from easi_jax.errors import UserError, nearest
 from easi_jax.io.files import atomic_write
-from easi_jax.io.strict_yaml import check_keys, read_yaml
+from easi_jax.io.strict_yaml import check_keys, number_of, read_yaml
 from easi_jax.model.parameters import ParameterSpace, Range, declare
 
 _KEYS = ("name", "address", "nominal", "initial", "bounds", "scale", "unit")
@@ -134,11 +134,7 @@ def _addresses(where: str, value: Any) -> tuple[str, ...]:
 
 
 def _number(where: str, key: str, value: Any) -> float:
-    try:
-        # YAML 1.1 takes 1e-3 for text
-        number = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = math.nan
+    number = number_of(value)
     if math.isnan(number):
         raise UserError(f"{where}: {key} is {value!r}, not a number")
     return number

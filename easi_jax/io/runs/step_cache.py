@@ -69,7 +69,7 @@ class Journal:
         return self._folder / f"step_{n:06d}.npz"
 
     def _read(self, n: int) -> Arrays | None:
-        """None where there is none that is whole; what follows it is not used then."""
+        """None where there is none that is whole: then this step is made again."""
         if self._folder is None or not self._path(n).is_file():
             return None
         try:

@@ -181,6 +181,9 @@ def test_values_of_the_model(m: mujoco.MjModel) -> None:
     # solref 0.02 1: stiffness 1/(0.02)^2, damping 2/0.02
     assert nominal(m, ["geom.base.contact_stiffness"]) == pytest.approx(2500)
     assert nominal(m, ["geom.base.contact_damping"]) == pytest.approx(100)
+    m = copy.deepcopy(m)
+    m.geom_solref[m.geom("base").id] = 0.02, 0.0  # as stiff as can be said
+    assert np.isfinite(nominal(m, ["geom.base.contact_stiffness"]))
     for address, message in (
         ("actuator.motor.force_limit", "states no value"),
         ("actuator.servo.force_limit", "not symmetric"),

@@ -177,7 +177,7 @@ def test_a_file_says_all_of_it(m: mujoco.MjModel, tmp_path: Path) -> None:
         ("terms: [qpos.a**3, abs(qvel.a)]", "terms: qpos.a", "acts: holds joints"),
         ("columns: {c1: -0.25, c2: 0.1}", "columns: {c1: -0.25}", "lacks a number"),
         ("std: {c1: 0.01}", "std: {c7: 0.01}", "for each term: c1, c2"),
-        ("acts: {a: 1.0}", "acts: {a: .nan}", "not finite"),
+        ("acts: {a: 1.0}", "acts: {a: .nan}", "no finite number"),
         ("acts: {a: 1.0}", "acts: {}", "names joints"),
         ("law: whatever", "lore: whatever", 'unknown key "lore"'),
     ],

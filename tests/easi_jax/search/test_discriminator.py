@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from easi_jax.search import discriminator as critic
+from easi_jax.search.config import LOSSES, REGULARIZERS
 from easi_jax.search.discriminator import CriticConfig, CriticState
 
 FEATURES, BATCH = 3, 128
@@ -34,8 +35,8 @@ def largest(state: CriticState) -> float:
     return max(float(jnp.abs(w).max()) for w in jax.tree.leaves(state.params))
 
 
-@pytest.mark.parametrize("loss", critic.LOSSES)
-@pytest.mark.parametrize("regularizer", critic.REGULARIZERS)
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("regularizer", REGULARIZERS)
 def test_separates_two_gaussians(loss: str, regularizer: str) -> None:
     config = CriticConfig(
         hidden=(16, 16), loss=loss, regularizer=regularizer, learning_rate=1e-3
@@ -84,7 +85,7 @@ def test_gradient_penalty_pulls_the_slope_to_one() -> None:
     assert loose.mean() > 2
 
 
-@pytest.mark.parametrize("loss", critic.LOSSES)
+@pytest.mark.parametrize("loss", LOSSES)
 def test_samples_of_no_weight_do_not_count(loss: str) -> None:
     config = CriticConfig(hidden=(8,), loss=loss, regularizer="none")
     state = critic.init(config, jax.random.key(1), FEATURES)

@@ -3,6 +3,7 @@
 import io
 import os
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -145,6 +146,11 @@ def test_written_logs_read_back_bit_equal(tmp_path, cart, extension):
         for name in ("time", "qpos", "qvel", "ctrl"):
             np.testing.assert_array_equal(getattr(new, name), getattr(old, name))
         np.testing.assert_array_equal(new.sensors["imu"], old.sensors["imu"])
+
+    write_log(path, cart, [runs[0], replace(runs[1], sensors={})])
+    both = read_logs(path, cart).runs
+    np.testing.assert_array_equal(both[0].sensors["imu"], runs[0].sensors["imu"])
+    assert np.isnan(both[1].sensors.get("imu", np.nan)).all()
 
     write_log(path, cart, runs[0], velocities=False)
     (run,) = read_logs(path, cart).runs

@@ -8,7 +8,7 @@ from easi_jax.errors import UserError
 from easi_jax.io.models.effects_file import parsed_effects
 
 
-def content(effect: str, **columns: float) -> dict[str, Any]:
+def content(effect: str, **columns: Any) -> dict[str, Any]:
     return {"effects": [{"effect": effect, "at": "j", "columns": columns}]}
 
 
@@ -24,6 +24,16 @@ def content(effect: str, **columns: float) -> dict[str, Any]:
 def test_columns_are_those_of_the_catalog(effect: str, column: str) -> None:
     found = parsed_effects(content(effect, **{column: 0.1}), "effects.yaml")
     assert found.entries[0].columns == {column: 0.1}
+
+
+def test_numbers_are_read_as_in_other_files() -> None:
+    """YAML 1.1 takes 1e-3 for text."""
+    columns: dict[str, Any] = {"coulomb": "1e-3"}
+    found = parsed_effects(content("coulomb_friction", **columns), "effects.yaml")
+    assert found.entries[0].columns == {"coulomb": 1e-3}
+    for wrong in ("a", True, None, "nan"):
+        with pytest.raises(UserError, match="is no finite number"):
+            parsed_effects(content("coulomb_friction", coulomb=wrong), "e.yaml")
 
 
 @pytest.mark.parametrize("column", ["com", "com.3", "com.x", "colomb", "bias.-1"])

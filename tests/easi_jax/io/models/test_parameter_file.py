@@ -86,7 +86,7 @@ def test_round_trip(tmp_path: Path) -> None:
         ("parameters: [{name: a, address: M, nominal: .inf}]", "finite"),
         (
             f"parameters: [{{name: a, address: M, nominal: 0x{'f' * 400}}}]",
-            "not a number",
+            "must be finite numbers",
         ),
         ("parameters: [{name: a, address: M, initial: 3}]", "write [low, high]"),
         ("parameters: [{name: a, address: M, initial: [1, 2, 3]}]", "[low, high]"),
