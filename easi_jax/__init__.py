@@ -1,6 +1,6 @@
 """EASI-JAX: simulator identification and repair in JAX.
 
-The names below are the public door; README shows them at work. Modules behind them may
+The names below are the public API; README shows them at work. Modules behind them may
 move between versions, these names stay.
 
     read_model, read_parameters, read_log   what is known of a machine

@@ -26,7 +26,8 @@ class _Sources:
     data: tuple[Path, ...] = ()
     """Measured logs (CSV, NPZ or Parquet) in place of a pseudo-real target."""
     held_out: tuple[Path, ...] = ()
-    """Logs kept out of the search, to test the result on."""
+    """Logs kept out of the search, to test the result on; not given: whole runs with a
+    quarter of the rows, of a single run 30 % in three blocks."""
     model: Path | None = None
     """MuJoCo model (MJCF) of the machine that the logs are of."""
     allow_assets: tuple[Path, ...] = ()
@@ -73,7 +74,8 @@ class Config(
     pseudo-real target, the search never sees the target's parameters, and the final
     policy is tested there against the first (and, with --oracle, against a policy
     trained in the target itself). With --data, logs of a real machine take the
-    target's place: give --model and --parameters for a machine of your own.
+    target's place: give --model and --parameters for a machine of your own. No policy
+    is trained then: train.udr --found does that under the result.
     """
 
     effects: Path | None = None
@@ -81,8 +83,9 @@ class Config(
     and their parameters are searched with the others; not given: those of the UDR run.
     """
     horizon: float | None = None
-    """Seconds of motion that a measured piece holds; not given: one control step for
-    clean demonstrations, as many as the noise asks for otherwise."""
+    """Length of a compared piece [s]; not given: one control step for clean
+    demonstrations, 0.16 s for noisy ones, for logs as short as their noise allows. Of
+    logs the held-out error is reported over it, too (0.2 s where not given)."""
     oracle: bool = False
     """Train the Oracle too: a policy trained in the target itself."""
     seeds: tuple[int, ...] = ()

@@ -117,4 +117,5 @@ def show(name: str, report: Any, notes: Sequence[str], out: Any) -> None:
     show_table(errors.title, errors.columns, errors.rows)
     for note in (*report.undetermined, *notes):
         say(f"note: {note}")
+    say(f"a policy for it: python -m train.udr --env FILE.py --found {out} ...")
     say(f"report: {out / 'report.html'}")

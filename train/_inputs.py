@@ -6,8 +6,8 @@ from typing import Any
 
 _FILES = "parameters", "mapping", "env", "demonstrations"
 _LISTS = "data", "held_out", "stand", "effects_from"
-_RUNS = "udr", "policy", "start_from"  # folders of earlier runs, or files
-_RESULTS = "results.json"  # of a run folder; another with every training
+_RUNS = "udr", "policy", "start_from", "found"  # folders of earlier runs, or files
+_RESULTS = "results.json", "distribution.json"  # of a run folder
 
 
 def files_of(config: Any) -> list[Path]:
@@ -34,4 +34,4 @@ def _each(config: Any) -> Iterator[Path]:
         given = getattr(config, name, None)
         if given:
             path = Path(given)
-            yield path / _RESULTS if path.is_dir() else path
+            yield from [path / r for r in _RESULTS] if path.is_dir() else [path]

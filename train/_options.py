@@ -10,10 +10,11 @@ class RobotOptions:
     """The robot to train."""
 
     robot: str = "cartpole"
-    """Built-in robot."""
+    """Built-in robot: cartpole, ant, ballbalance or go2."""
     option: tuple[str, ...] = ()
-    """Options of the built-in robot, NAME=VALUE: for go2 parameters=full (25 instead of
-    8), torque_speed=true."""
+    """Options of the built-in robot, NAME=VALUE. go2: parameters=default, real (without
+    friction) or full (25 in place of 8), torque_speed=true, rewarded=gait or command,
+    forward=LOW:HIGH [m/s], episode_length=STEPS; ballbalance: episode_length=STEPS."""
     env: Path | None = None
     """An environment of your own, a Python file, in place of --robot (template:
     examples/my_robot/env.py)."""
@@ -25,8 +26,8 @@ class EngineOptions:
 
     engine: Literal["auto", "mjx", "mujoco"] = "auto"
     """mjx: compiled, on CPU or accelerator. mujoco: native MuJoCo on all cores, which
-    compiles nothing and simulates every model. auto: mjx on an accelerator and for
-    small robots, else mujoco; the choice is said, and kept by --resume."""
+    compiles nothing and simulates nearly every model. auto: mjx on an accelerator and
+    for small robots, else mujoco; the command says which (docs/engines.md)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -45,8 +46,8 @@ class TargetOptions(OwnEffectsOptions):
 
     target: tuple[str, ...] | None = None
     """The pseudo-real robot: parameters that differ from the nominal ones, as
-    NAME*FACTOR or NAME=VALUE; not given: half of what the paper's Fig. 6 changes, such
-    as cart_kp*0.5 for cartpole."""
+    NAME*FACTOR or NAME=VALUE; not given: cart_kp*0.5 (cartpole), torso_mass*0.5 (ant),
+    ball_mass*0.5 (ballbalance), thigh_kp*0.5 (go2)."""
     effects: Path | None = None
     """Effects that the model lacks (effects.yaml of train.gap): the robot gets them,
     and their parameters vary with the others."""
@@ -68,7 +69,7 @@ class TrainingOptions:
     """Log of motion to imitate, made by train.demonstrate or recorded: a run is an
     episode, and SKILL:NAME as its name labels it."""
     labelled: float | None = None
-    """Share of the labelled steps whose label is used; all where not given."""
+    """Share of the labelled steps whose label is used, 0 to 1; all where not given."""
     skills: int | None = None
     """Skills that the policy has; not given: as many as there are labels, or one."""
     skill: str | None = None
@@ -92,8 +93,8 @@ class SearchOptions:
     """Further search settings, NAME=VALUE: loss=gan, regularizer=gradient_penalty,
     innovation_inputs=false, policy_updates_per_generation=20, ..."""
     start: tuple[float, float] | None = None
-    """Where the search starts, as factors on the nominal values; not given: where UDR
-    trained."""
+    """Where the search starts, as factors on the nominal values, such as 0.5 2; not
+    given: where UDR trained, for logs the initial ranges of --parameters."""
     refine: bool = True
     """Finish with least squares on the paired data. The preset paper has no such finish
     unless --set finish=true asks for it."""
@@ -110,8 +111,10 @@ class ChainOptions:
     trajectories: int = 200
     """Demonstration trajectories."""
     noise: tuple[float, ...] = ()
-    """Sensor noise (standard deviations of positions, then velocities, SI): added to
-    pseudo-real demonstrations; for logs it is estimated where not given."""
+    """Sensor noise, standard deviations: of each degree of freedom's position [m, rad],
+    then of each one's velocity [m/s, rad/s]; with --policy of each channel that is
+    compared. Added to pseudo-real demonstrations; for logs estimated where not
+    given."""
     warm_start: bool = True
     """Final training goes on from the networks of the UDR policy in place of new ones
     (the Oracle's, too): it gets further where a training of its length has not settled.

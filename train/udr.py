@@ -1,6 +1,7 @@
 """``python -m train.udr``: a rough policy by uniform domain randomization."""
 
 import dataclasses
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
 
     from easi_jax.io.report.html import Picture, Table
     from easi_jax.io.runs.folder import RunFolder
-    from easi_jax.pipeline.stages import Pipeline
+    from train._effects import Given
+    from train._found import Found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,9 +30,11 @@ class Config(
 ):
     """Trains a policy under uniformly random physics (UDR), the rough start of EASI.
 
-    Each episode draws the robot's parameters from [nominal / k, k nominal]. The policy
-    is what ``train.easi`` then records demonstrations with. Several seeds train side
-    by side, one on each device.
+    Each episode draws the robot's parameters from their initial ranges: a factor of 3
+    either way for built-in robots (go2: 2). The policy is what ``train.easi`` then
+    records demonstrations with. With --found they are drawn from what train.easi found,
+    so that the policy is the final one. Several seeds train side by side, one on each
+    device.
     """
 
     out: Path = Path("results/udr")
@@ -48,6 +52,10 @@ class Config(
     fixed: bool = False
     """Train in the target itself, without randomization: the nominal model where no
     target is given."""
+    found: Path | None = None
+    """Run folder of train.easi (from logs, too): draw the physics from what it found,
+    with its effects, in place of the initial range. The policy is then tested in the
+    robot as identified where no target is given."""
     start_from: Path | None = None
     """Run folder of train.udr whose networks the training goes on from (fine-tuning);
     a seed that it lacks starts from its first."""
@@ -60,7 +68,7 @@ class Config(
 
 def run(config: Config) -> None:
     """Trains, evaluates and writes the run folder."""
-    from train._effects import effect_notes, read_given, robots
+    from train._effects import effect_notes
     from train._robots import (
         check_chunk,
         check_seeds,
@@ -86,16 +94,15 @@ def run(config: Config) -> None:
         stage_keys,
         target_parameters,
     )
-    from envs import open_env
     from train._results import per_seed_json
+    from train._stages import train_stage
 
-    given = read_given(config)
-    env, real = robots(open_env(config.robot, config.env, config.option), given)
+    env, real, given, own = _robots(config)
     training = training_config(
         *(env, config.env_steps, config.algorithm, imitation_of(config))
     )
     theta = target_parameters((real or env).space, config.target)
-    method = "Fixed" if config.fixed else "UDR"
+    method = "EASI" if own else "Fixed" if config.fixed else "UDR"
     settings = PipelineConfig(training=training, eval_episodes=config.eval_episodes)
     if config.fixed:
         env, real = real or env, None
@@ -113,8 +120,14 @@ def run(config: Config) -> None:
         overwrite=config.overwrite,
         files=files_of(config),
     ) as folder:
-        notes = effect_notes(given)
-        policies = _trained(folder, config, pipe, target, keys["udr"], old, notes)
+        notes = [*([own.note] if own else []), *effect_notes(given)]
+        physics = own.distribution if own else None
+        if physics is None:
+            physics = pipe.point(target) if config.fixed else pipe.udr()
+        policies = train_stage(
+            *(folder, "train", pipe, keys["udr"], physics, target, config.seeds),
+            *(config.chunk, old, notes),
+        )
         returns, motion = jax.jit(pipe.play)(policies, target, keys["evaluate"])
         per_seed = np.asarray(returns).mean(1)
         save_policies(folder, method, policies)
@@ -131,23 +144,26 @@ def run(config: Config) -> None:
     say(f"report: {config.out / 'report.html'}")
 
 
-def _trained(
-    folder: "RunFolder",
-    config: Config,
-    pipe: "Pipeline",
-    target: Any,
-    key: Any,
-    old: Any,
-    notes: list[str],
-) -> Any:
-    """Policies of all seeds; ``old`` networks to go on from, None for new ones."""
-    from train._stages import train_stage
+def _robots(config: Config) -> "tuple[Any, Any, Given, Found | None]":
+    """The robot that is trained, the one that stands for the real one (None where it is
+    the first), their effects, and what a run found."""
+    from easi_jax.errors import UserError
+    from envs import open_env
+    from train._effects import read_given, robots
+    from train._found import found_robot
 
-    physics = pipe.point(target) if config.fixed else pipe.udr()
-    return train_stage(
-        *(folder, "train", pipe, key, physics, target, config.seeds, config.chunk),
-        *(old, notes),
-    )
+    for flag, value in (("--fixed", config.fixed), ("--effects", config.effects)):
+        if value and config.found:
+            raise UserError(
+                f"{flag} goes without --found: the run says what the robot is"
+            )
+    given = read_given(config)
+    nominal = open_env(config.robot, config.env, config.option)
+    env, real = robots(nominal, given)
+    if config.found is None:
+        return env, real, given, None
+    own = found_robot(config.found, nominal)
+    return own.env, real, replace(given, effects=own.given.effects), own
 
 
 def _settings(config: Config, method: str, robot: str, training: Any) -> dict[str, Any]:
@@ -197,6 +213,7 @@ def _report(
     title = f"{method} on {robot}: return in the target"
     table = Table(title, ("seed", "return"), rows)
     how = "in the target itself" if config.fixed else "under uniform randomization"
+    how = f"under what {config.found} found" if config.found else how
     write_report(
         folder.path / "report.html",
         Report(

@@ -1,6 +1,7 @@
 """A simulator, or an environment, with found effects in its model."""
 
 import copy
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -38,15 +39,19 @@ def env_with(env: Any, found: FoundEffects) -> Any:
     return _simulated_by_own(out, "effects")
 
 
-def env_with_space(env: Any, space: ParameterSpace) -> Any:
-    """An environment with other parameters; the given one stays as it is.
+def env_with_space(
+    env: Any, space: ParameterSpace, fixed: Mapping[str, float] | None = None
+) -> Any:
+    """An environment with other parameters, and ``fixed`` values by address besides;
+    the given one stays as it is.
 
     Raises:
         UserError: as `env_with`.
     """
     needs_simulator(env, "other parameters")
     out = copy.copy(env)
-    out.simulator, out.space = env.simulator.rebuilt(space=space), space
+    fixed = {**env.simulator.fixed, **(fixed or {})}
+    out.simulator, out.space = env.simulator.rebuilt(space=space, fixed=fixed), space
     return _simulated_by_own(out, "other parameters")
 
 

@@ -1,4 +1,4 @@
-"""The public door: the example in the README, and one line for each mistake."""
+"""The public API: the example in the README, and one line for each mistake."""
 
 import re
 import subprocess
