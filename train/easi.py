@@ -1,10 +1,18 @@
 """``python -m train.easi``: identify a simulator, then train the policy in it."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from train._command import main, say
 from train._easi_config import Config
 from train._inputs import files_of
+
+# Options that say something of logs alone, of a policy that made them, of a target.
+_OF_LOGS = "model", "parameters", "mapping", "held_out", "robot", "policy"
+_OF_LOGS += "held_base", "unmeasured", "allow_assets"
+_OF_POLICIES = "policy_seed", "observed", "sampled", "stand"
+_OF_TARGETS = "udr", "target", "target_effects", "oracle", "trajectories"
+_OF_TARGETS += "warm_start", "eval_episodes", "chunk"
 
 
 def run(config: Config) -> None:
@@ -18,25 +26,30 @@ def run(config: Config) -> None:
         check_seeds(config.seeds)
     if config.restarts is not None and config.restarts < 0:
         raise UserError(f"--restarts is {config.restarts}: give 0 or more")
-    if config.data and config.env and not config.policy:
-        raise UserError("--env goes without --data: give --model and --parameters")
-    if config.data:
-        from train import _from_logs, _from_policy
-
-        if config.target_effects:
-            raise UserError("--target-effects goes without --data: logs have their own")
-        for option in ("policy_seed", "observed", "sampled", "stand"):
-            if getattr(config, option) not in (None, False, ()) and not config.policy:
-                flag = "--" + option.replace("_", "-")
-                raise UserError(f"{flag} goes with --policy: give the policy, too")
-        (_from_policy if config.policy else _from_logs).run(config)
+    if not config.data:
+        why = "goes with --data LOG: give the measured logs too"
+        _refuse(config, (*_OF_LOGS, *_OF_POLICIES), why)
+        _from_target(config)
         return
-    only = ("model", "parameters", "mapping", "held_out", "robot", "policy")
-    for option in (*only, "policy_seed", "observed", "sampled", "stand"):
-        if getattr(config, option) not in (None, False, ()):
-            flag = "--" + option.replace("_", "-")
-            raise UserError(f"{flag} goes with --data LOG: give the measured logs too")
-    _from_target(config)
+    _refuse(config, _OF_TARGETS, "goes without --data: logs stand for the target")
+    if not config.policy:
+        _refuse(config, _OF_POLICIES, "goes with --policy: give the policy, too")
+        why = "goes without --data: give --model and --parameters"
+        _refuse(config, ("env",), why)
+    from train import _from_logs, _from_policy
+
+    (_from_policy if config.policy else _from_logs).run(config)
+
+
+def _refuse(config: Config, options: Sequence[str], why: str) -> None:
+    """Refuses options that would do nothing."""
+    from easi_jax.errors import UserError
+
+    plain = Config()
+    for option in options:
+        if getattr(config, option) != getattr(plain, option):
+            no = "no-" if option == "warm_start" else ""
+            raise UserError(f"--{no}{option.replace('_', '-')} {why}")
 
 
 def _from_target(config: Config) -> None:

@@ -1,6 +1,7 @@
 """``train.easi --data LOG --policy``: robots whose base nobody measured."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -162,5 +163,18 @@ def test_a_policy_that_is_not_there_is_one_line(
     assert said in refused(capsys, easi, *given)
 
 
-def test_policy_goes_with_data(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "--policy goes with --data" in refused(capsys, easi, "--policy", "x")
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--policy", "x"), "--policy goes with --data"),
+        (("--held-base",), "--held-base goes with --data"),
+        (("--unmeasured", "all"), "--unmeasured goes with --data"),
+        (("--oracle", "--data", "x.csv"), "--oracle goes without --data"),
+        (("--no-warm-start", "--data", "x.csv"), "--no-warm-start goes without"),
+        (("--sampled", "--data", "x.csv"), "--sampled goes with --policy"),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(
+    options: Sequence[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert said in refused(capsys, easi, *options)
