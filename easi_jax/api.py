@@ -6,6 +6,7 @@ The commands of ``train`` do the same with folders, checkpoints and reports.
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,7 @@ from easi_jax.search.config import preset
 from easi_jax.search.easi import Search
 from easi_jax.simulation import engine as engines
 from easi_jax.simulation.simulator import Simulator
+from easi_jax.simulation.with_effects import env_identified
 
 PathLike = str | os.PathLike[str]
 Tell = Callable[[str], None]
@@ -439,9 +441,9 @@ def train_policy(
     Args:
         env: a built-in robot (``envs.make``) or an environment of your own
             (``envs.load``), made for an engine.
-        estimated: its distribution is drawn from, a sample an episode; parameters that
-            it lacks keep their nominal values. None: uniform over the environment's
-            own ranges.
+        estimated: its distribution is drawn from, a sample an episode, with the
+            effects that it was given; what it lacks keeps the model's values. None:
+            uniform over the environment's own ranges.
         algorithm: ``sac``, ``ppo``, or ``ess_infogail``, which imitates; the
             environment's own where None.
         env_steps: control steps of training; those of the preset where None.
@@ -450,8 +452,8 @@ def train_policy(
 
     Raises:
         UserError: no such algorithm, or one that does not go with ``demonstrations``; a
-            log that cannot be imitated; ``estimated`` has parameters that ``env``
-            lacks; the training did not stay finite.
+            log that cannot be imitated; ``estimated`` is of another robot; the
+            training did not stay finite.
     """
     config = training_preset(env, algorithm)
     if env_steps is not None:
@@ -461,22 +463,12 @@ def train_policy(
     if isinstance(config, EssInfoGailConfig) and demonstrations is not None:
         config = imitating(config, env, Path(demonstrations))
     if estimated is None:
-        space, dist = env.space, distribution.uniform(env.space, *env.space.initial)
+        dist = distribution.uniform(env.space, *env.space.initial)
     else:
-        space, dist = estimated.space, estimated.distribution
-    unknown = [n for n in space.names if n not in env.space.names]
-    if unknown:
-        raise UserError(
-            f"{env.name} has no parameter {', '.join(unknown)} (it has "
-            f"{', '.join(env.space.names)})"
-        )
-    given = np.array([env.space.names.index(n) for n in space.names])
-    nominal = jnp.asarray(env.space.nominal, jnp.result_type(float))
-
-    def drawn(dist: Distribution, key: jax.Array) -> jax.Array:
-        return nominal.at[given].set(distribution.draw(space, dist, key))
-
-    trainer = make_trainer(env, config, env.model, drawn)
+        dist, fixed = estimated.distribution, estimated.simulator.fixed
+        env = env_identified(env, estimated.space, estimated.mean, fixed)
+    space = env.space
+    trainer = make_trainer(env, config, env.model, partial(distribution.draw, space))
     middle = distribution.point(space, space.nominal)
     keys = seed_keys([seed])
     train = jax.jit(lambda keys: train_seeds(trainer, keys, dist, middle))

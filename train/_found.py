@@ -37,11 +37,11 @@ def found_robot(folder: Path, env: Any) -> Found:
 
     from easi_jax.errors import UserError
     from easi_jax.io.runs.folder import read_config
-    from easi_jax.io.runs.schemas import read_distribution
+    from easi_jax.io.runs.schemas import read_distribution, space_of
     from easi_jax.model.distribution import gaussian
     from easi_jax.model.found_effects import joined, set_by_none
-    from easi_jax.model.parameters import Parameter, ParameterSpace
-    from easi_jax.simulation.with_effects import env_with_space
+    from easi_jax.model.parameters import ParameterSpace
+    from easi_jax.simulation.with_effects import env_identified
 
     path = folder / "distribution.json"
     if not path.is_file():
@@ -52,26 +52,13 @@ def found_robot(folder: Path, env: Any) -> Found:
     settings, content = read_config(folder), read_distribution(path)
     seed = str(content.get("best_seed", next(iter(content["seeds"]))))
     result = content["seeds"][seed]
-    space = ParameterSpace(
-        tuple(
-            Parameter(
-                name=p["name"],
-                addresses=tuple(p["addresses"]),
-                nominal=mean,
-                initial=tuple(p["initial"]),
-                bounds=tuple(p["bounds"]),
-                unit=p["unit"],
-                log=p["scale"] == "log",
-            )
-            for p, mean in zip(content["parameters"], result["mean"], strict=True)
-        )
-    )
+    space = space_of(content)
     given = Given(settings.get("effects"))
     try:
         own, values = joined(env.mj_model, ParameterSpace(()), found_in(given.effects))
         values |= {a: p.nominal for p in own.parameters for a in p.addresses}
         fixed = set_by_none(env.mj_model, space.addresses, values)
-        identified = env_with_space(env, space, fixed)
+        identified = env_identified(env, space, result["mean"], fixed)
     except UserError as error:
         raise UserError(f"--found {folder}: {error}") from None
     cov = np.array(result["unit_covariance"], float)

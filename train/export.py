@@ -140,21 +140,10 @@ def _model_files(
     config: Config, settings: dict[str, Any], found: dict[str, Any], seed: str
 ) -> dict[str, str | bytes]:
     from easi_jax.export.mjcf import written_machine
-    from easi_jax.model.parameters import Parameter
+    from easi_jax.io.runs.schemas import space_of
     from train._effects import found_in
 
-    parameters = [
-        Parameter(
-            name=p["name"],
-            addresses=tuple(p["addresses"]),
-            nominal=p["nominal"],
-            initial=tuple(p["initial"]),
-            bounds=tuple(p["bounds"]),
-            unit=p["unit"],
-            log=p["scale"] == "log",
-        )
-        for p in found["parameters"]
-    ]
+    parameters = space_of(found).parameters
     means = found["seeds"][seed]["mean"]
     values = {p.name: mean for p, mean in zip(parameters, means, strict=True)}
     effects = found_in(settings.get("effects"))

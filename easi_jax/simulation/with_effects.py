@@ -2,10 +2,13 @@
 
 import copy
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
 
 from easi_jax.errors import UserError
 from easi_jax.model.found_effects import FoundEffects, joined
@@ -37,6 +40,21 @@ def env_with(env: Any, found: FoundEffects) -> Any:
     out.simulator = simulator_with(env.simulator, found)
     out.space = out.simulator.space
     return _simulated_by_own(out, "effects")
+
+
+def env_identified(
+    env: Any, space: ParameterSpace, means: ArrayLike, fixed: Mapping[str, float]
+) -> Any:
+    """An environment with the parameters of ``space`` alone, nominal at ``means (n,)``,
+    SI; others keep the model's values. ``fixed``: values by address besides.
+
+    Raises:
+        UserError: as `env_with`, or an address that the robot lacks.
+    """
+    values = np.asarray(means, float).tolist()
+    each = zip(space.parameters, values, strict=True)
+    found = ParameterSpace(tuple(replace(p, nominal=value) for p, value in each))
+    return env_with_space(env, found, fixed)
 
 
 def env_with_space(

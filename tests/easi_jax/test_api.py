@@ -16,6 +16,7 @@ import pytest
 
 import easi_jax
 from easi_jax import UserError, api
+from easi_jax.model.distribution import gaussian
 from easi_jax.model.found_effects import EffectEntry, FoundEffects
 from tests.tiny_robot.env import Tiny
 
@@ -176,10 +177,34 @@ def test_a_policy_is_trained_and_exported(tmp_path: Path) -> None:
     assert not (tmp_path / "other").exists()
 
 
+def test_a_policy_is_trained_under_what_was_found(machine: Any) -> None:
+    """With a parameter that the environment does not vary."""
+    env = Tiny()
+    addresses = {a for p in env.space.parameters for a in p.addresses}
+    joint = env.mj_model.joint(0).name
+    one = machine.space.parameters[0]
+    one = replace(one, name="dry", addresses=(f"joint.{joint}.frictionloss",))
+    assert not addresses & {*one.addresses}
+    space = type(machine.space)((one,))
+    found: Any = SimpleNamespace(
+        space=space,
+        mean=[0.02],
+        distribution=gaussian(space, [0.5], [[1e-4]]),
+        simulator=SimpleNamespace(fixed={}),
+    )
+    policy = easi_jax.train_policy(env, found)
+    assert policy.returns.size and np.isfinite(policy.returns).all()
+    assert env.space.names != space.names
+
+
 def test_other_parameters_than_the_robots_are_refused(machine: Any) -> None:
-    one = replace(machine.space.parameters[0], name="stiffness")
-    wrong: Any = SimpleNamespace(space=type(machine.space)((one,)), distribution=None)
-    with pytest.raises(UserError, match="tiny has no parameter stiffness"):
+    one = replace(machine.space.parameters[0], addresses=("joint.other.damping",))
+    space = type(machine.space)((one,))
+    fixed = SimpleNamespace(fixed={})
+    wrong: Any = SimpleNamespace(
+        space=space, distribution=None, mean=[0.3], simulator=fixed
+    )
+    with pytest.raises(UserError, match="other"):
         easi_jax.train_policy(Tiny(), wrong)
     with pytest.raises(UserError, match="unknown algorithm"):
         easi_jax.train_policy(Tiny(), algorithm="sacc")

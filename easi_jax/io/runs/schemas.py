@@ -5,6 +5,7 @@ from typing import Any
 
 from easi_jax.errors import UserError
 from easi_jax.io.files import number, read_json
+from easi_jax.model.parameters import Parameter, ParameterSpace
 
 # Forms: a type; [form] for a list; {key: form} for a mapping, where a key that ends in
 # "?" may be missing or null, and the key "*" stands for all others.
@@ -83,6 +84,24 @@ def read_distribution(path: Path) -> dict[str, Any]:
     elif str(found["best_seed"]) not in seeds:
         raise UserError(f"{path}: best_seed is none of its seeds")
     return found
+
+
+def space_of(found: dict[str, Any]) -> ParameterSpace:
+    """The parameters of `read_distribution`."""
+    return ParameterSpace(
+        tuple(
+            Parameter(
+                name=p["name"],
+                addresses=tuple(p["addresses"]),
+                nominal=p["nominal"],
+                initial=tuple(p["initial"]),
+                bounds=tuple(p["bounds"]),
+                unit=p["unit"],
+                log=p["scale"] == "log",
+            )
+            for p in found["parameters"]
+        )
+    )
 
 
 def read_checked(path: Path, form: Any, what: str) -> Any:
