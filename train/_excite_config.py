@@ -29,7 +29,7 @@ class Config(EngineOptions, OwnEffectsOptions, BaseOptions):
     called feedforward.ACTUATOR, not ctrl.ACTUATOR. Log what is sent in all.
     """
 
-    model: str = ""
+    model: str = dataclasses.field(kw_only=True)
     """MuJoCo model (MJCF), or the name of a built-in robot."""
     allow_assets: tuple[Path, ...] = ()
     """Files, or folders with all below them, that the model may read besides those in

@@ -86,7 +86,7 @@ def test_the_robot_is_as_it_was_identified(tmp_path: Path) -> None:
 
 def test_what_is_no_result_for_this_robot_is_refused(tmp_path: Path) -> None:
     run = _run_of(tmp_path, "joint.wrist.damping")
-    asked = {"env": TEMPLATE, "out": tmp_path / "policy"}
+    asked: dict[str, Any] = {"env": TEMPLATE, "out": tmp_path / "policy"}
     with pytest.raises(UserError, match=r"--found .*easi: .*wrist"):
         udr.run(udr.Config(**asked, found=run))
     with pytest.raises(UserError, match=r"no distribution\.json"):
@@ -99,13 +99,14 @@ def test_what_is_no_result_for_this_robot_is_refused(tmp_path: Path) -> None:
 def test_a_policy_is_trained_and_tested_in_it(tmp_path: Path) -> None:
     run = _run_of(tmp_path, "body.upper.mass", "joint.elbow.armature", effects=_EFFECTS)
     out = tmp_path / "policy"
-    few = {"env_steps": 1500, "eval_episodes": 2}
+    few: dict[str, Any] = {"env_steps": 1500, "eval_episodes": 2}
     udr.run(udr.Config(env=TEMPLATE, found=run, out=out, **few))
     made = json.loads((out / "results.json").read_text())
     assert made["methods"] == ["EASI"] and made["effects"] == _EFFECTS
     assert made["target"] == pytest.approx({"p0": 1.0, "p1": 1.25})
     assert np.isfinite(made["returns"]["EASI"]["0"])
     assert f"under what {run} found" in (out / "report.html").read_text()
-    asked = {"run": out, "env": TEMPLATE, "episodes": 2, "out": tmp_path / "r.json"}
+    asked: dict[str, Any] = {"run": out, "env": TEMPLATE, "episodes": 2}
+    asked["out"] = tmp_path / "r.json"
     evaluate.run(evaluate.Config(**asked))
     assert json.loads((tmp_path / "r.json").read_text())["robot"] == "two_link"
