@@ -29,8 +29,8 @@ class Config(EngineOptions, OwnEffectsOptions, BaseOptions):
     called feedforward.ACTUATOR, not ctrl.ACTUATOR. Log what is sent in all.
     """
 
-    model: str = dataclasses.field(kw_only=True)
-    """MuJoCo model (MJCF), or the name of a built-in robot."""
+    model: str = ""
+    """Required: MuJoCo model (MJCF), or the name of a built-in robot."""
     allow_assets: tuple[Path, ...] = ()
     """Files, or folders with all below them, that the model may read besides those in
     its own folder (meshes, textures, includes)."""

@@ -68,7 +68,7 @@ def read_excite_problem(config: "Config") -> ExciteProblem:
     from train._log_problem import held_of
 
     if not config.model:
-        raise UserError("--model is empty: give M.xml or a robot's name")
+        raise UserError("give --model M.xml (or a robot's name)")
     _check_numbers(config, LEAD)
     check_names(config.effects)
     _check_out(config)

@@ -20,13 +20,13 @@ class Config(EngineOptions, OwnEffectsOptions, BaseOptions):
     commands) and report.html.
     """
 
-    model: str = dataclasses.field(kw_only=True)
-    """MuJoCo model (MJCF), or the name of a built-in robot."""
+    model: str = ""
+    """Required: MuJoCo model (MJCF), or the name of a built-in robot."""
     allow_assets: tuple[Path, ...] = ()
     """Files, or folders with all below them, that the model may read besides those in
     its own folder (meshes, textures, includes)."""
-    data: tuple[Path, ...] = dataclasses.field(kw_only=True)
-    """Measured logs (CSV, NPZ or Parquet)."""
+    data: tuple[Path, ...] = ()
+    """Required: measured logs (CSV, NPZ or Parquet)."""
     out: Path = Path("results/gap")
     """Folder for the results."""
     held_out: tuple[Path, ...] = ()

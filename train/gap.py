@@ -20,8 +20,8 @@ def run(config: Config) -> None:
     from train._retrain import check_robot
     from train._robots import check_seeds
 
-    if not config.data:
-        raise UserError("--data names no log")
+    if not config.model or not config.data:
+        raise UserError("give --model M.xml (or a robot's name) and --data LOG...")
     runtime.larger_loops()
     check_seeds(config.retrain_seeds)
     problem = read_gap_problem(config)

@@ -1,5 +1,6 @@
 """train.gap has its results on disk before anything optional begins."""
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -43,7 +44,7 @@ def write(
     monkeypatch.setattr(_gap_results, "_record_next", lambda *_: ("play steps",))
     some = Picture("Measured and predicted", "<svg></svg>", "traces")
     monkeypatch.setattr(gap_report, "traces_picture", lambda _: some)
-    config = gap.Config(model="", data=(), out=tmp_path / "out", retrain="x")
+    config = dataclasses.replace(gap.Config(), out=tmp_path / "out", retrain="x")
     problem: Any = SimpleNamespace(
         model=SimpleNamespace(mj_model=None, path=None, name="m"), held=[None]
     )

@@ -43,7 +43,7 @@ def test_names_do_no_harm() -> None:
         traces_picture(Traces(np.arange(4.0), flat, flat, flat, (EVIL,), (HANDLER,))),
     ]
     pictures.append(dataclasses.replace(pictures[0], title=EVIL, alt=HANDLER))
-    config = Config(model=EVIL, data=(Path(HANDLER),))
+    config = dataclasses.replace(Config(), model=EVIL, data=(Path(HANDLER),))
     page = render(gap_report(found, pictures, config))
     harmless(page)
     assert page.count("&lt;script&gt;alert(1)&lt;/script&gt;") > 15
