@@ -95,7 +95,13 @@ def main(
         if isinstance(stream, io.TextIOWrapper):  # names of files may be any bytes
             stream.reconfigure(errors="backslashreplace")
     try:
-        config = tyro.cli(config_class, prog=f"python -m {name}", args=args)
+        words = sys.argv[1:] if args is None else args
+        asked: Any = config_class
+        if {"-h", "--help"} & {*words}:
+            from train._help import with_help
+
+            asked = with_help(config_class)
+        config = tyro.cli(asked, prog=f"python -m {name}", args=args)
     except BrokenPipeError:
         _unheard()
     try:

@@ -2,8 +2,11 @@ import asyncio
 import contextlib
 import dataclasses
 import errno
+import importlib
+import inspect
 import io
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -424,3 +427,21 @@ def test_what_takes_engine_options_runs_on_that_engine(name: str) -> None:
 
     main(EngineOptions, run, name="t", args=("--engine", name))
     assert seen == [name]
+
+
+@pytest.mark.parametrize("name", ["easi", "gap", "import_logs", "export"])
+def test_help_of_an_option_is_a_paragraph(
+    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """tyro breaks it where the source does, and tells defaults that are none."""
+    monkeypatch.setenv("COLUMNS", "80")
+    module = importlib.import_module(f"train.{name}")
+    with pytest.raises(SystemExit) as stop:
+        main(module.Config, module.run, name=f"train.{name}", args=["--help"])
+    assert stop.value.code == 0
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for field in dataclasses.fields(module.Config):
+        assert field.name in said.replace("-", "_") or "_folder" in field.name
+    assert "default: None" not in said and "(default: )" not in said
+    for text in re.findall(r'"""(.+?)"""', inspect.getsource(module.Config), re.S)[1:]:
+        assert " ".join(text.split()) in said
