@@ -38,9 +38,6 @@ def read_pace(path: Path, selection: Selection) -> Recording:
                 f'{path}: no tensor "{key}"{nearest(key, tensors)} '
                 f"(it has {listed(list(tensors))})"
             )
-    empty = next((key for key, values in tensors.items() if not values.size), None)
-    if empty is not None:
-        raise UserError(f"{path}: {empty} is empty")
     time = tensors["time"].astype(float)
     if time.ndim != 1:
         raise UserError(f"{path}: time is {time.ndim}-dimensional, not a row of times")
@@ -51,6 +48,8 @@ def read_pace(path: Path, selection: Selection) -> Recording:
     streams: list[Stream] = []
     for key, role in roles.items():
         values = tensors[key].astype(float)
+        if not values.size:
+            raise UserError(f"{path}: {key} is empty")
         if values.ndim not in (1, 2):
             shape = "x".join(map(str, values.shape))
             raise UserError(f"{path}: {key} is {shape}, not rows by joints")
@@ -63,6 +62,7 @@ def read_pace(path: Path, selection: Selection) -> Recording:
         for key, values in tensors.items()
         if key not in roles
         and key != "time"
+        and values.size
         and values.ndim in (1, 2)
         and len(values) == len(time)
         and np.issubdtype(values.dtype, np.number)
