@@ -70,9 +70,7 @@ def noise_of(run: Run) -> Noise:
     """
     c, kept = run.configuration, _kept_noise(run)
     steps = c.difference(run.qpos[:-1], run.qpos[1:])
-    resolution = np.zeros(c.nv)
-    resolution[list(c.scalar_qvel)] = resolution_of(run.qpos[:, list(c.scalar_qpos)])
-    sigma, bound = _estimate(steps, 1, resolution, kept)
+    sigma, bound = _estimate(steps, 1, _resolution(run), kept)
     if run.qvel_measured:
         resolution = resolution_of(run.qvel)
         speed, wide = _estimate(run.qvel, 0, resolution, kept)
@@ -95,9 +93,12 @@ def estimate_noise(run: Run) -> np.ndarray:
 def pooled(runs: Sequence[Run]) -> Noise:
     """Noise ``(2 nv,)`` of runs of one machine; the same must be hidden in all.
 
-    The median over runs that tell motion from noise; where none does, over all.
+    The median over runs that tell motion from noise; where none does, over all. At
+    least what the resolution makes of positions (`resolutions`).
     """
-    return _pooled([noise_of(run) for run in runs])
+    std, is_bound = _pooled([noise_of(run) for run in runs])
+    least = np.pad(resolutions(runs) / math.sqrt(12.0), (0, len(std) // 2))
+    return Noise(np.maximum(std, least), is_bound)
 
 
 def pooled_noise(runs: Sequence[Run]) -> np.ndarray:
@@ -347,9 +348,20 @@ def _kept_noise(run: Run) -> np.ndarray:
     return np.median(orders, 1) if len(orders) else np.ones(len(_ORDERS))
 
 
-def resolutions(run: Run) -> np.ndarray:
+def resolutions(runs: Sequence[Run]) -> np.ndarray:
     """Smallest step between two readings of each degree of freedom, ``(nv,)``; 0 for
-    orientations."""
+    orientations. A joint whose reading never changes has that of the finest other one:
+    how far it moves unseen is not told by itself."""
+    c = runs[0].configuration
+    out, scalar = np.zeros(c.nv), list(c.scalar_qvel)
+    found = finest([_resolution(run) for run in runs])[scalar]
+    others = found[found > 0]
+    out[scalar] = np.where(found > 0, found, others.min() if len(others) else 0.0)
+    return out
+
+
+def _resolution(run: Run) -> np.ndarray:
+    """As `resolutions`, of a run by itself; 0 where nothing changes."""
     c = run.configuration
     out = np.zeros(c.nv)
     out[list(c.scalar_qvel)] = resolution_of(run.qpos[:, list(c.scalar_qpos)])

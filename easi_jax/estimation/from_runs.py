@@ -581,7 +581,7 @@ def _most_steps(rows: Sequence[int], least: int) -> int:
 def _resolution_noise(problem: Problem, sensors: Sensors) -> np.ndarray:
     """What the resolution of readings makes of noise, ``(2 nv + N,)``."""
     runs, measured = problem.fit, problem.measured
-    position = finest([resolutions(run) for run in runs])
+    position = resolutions(runs)
     velocity = finest([resolution_of(run.qvel) for run in runs])
     sensed = sensors.finest(runs)
     step = [position, np.where(measured, velocity, 0.0), sensed]

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from easi_jax.data import unmeasured
-from easi_jax.data.noise import finest, resolutions
+from easi_jax.data.noise import resolutions
 from easi_jax.data.recording import Run
 from easi_jax.data.segments import to_device
 from easi_jax.data.velocity_lag import noise_in_starts
@@ -99,7 +99,7 @@ class WindowErrors:
             read[..., nv:] = begun[:, None]
             self.starts.read = read
         self.rows = self.starts.noise
-        step = finest([resolutions(r) for r in (*problem.fit, *problem.held)])
+        step = resolutions([*problem.fit, *problem.held])
         self.resolution = np.pad(step, (0, self.starts.alone))
 
     def of(self, theta: jax.Array) -> tuple[np.ndarray, int]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from easi_jax.data.noise import finest, pooled, resolutions
+from easi_jax.data.noise import pooled, resolutions
 from easi_jax.data.recording import Run
 from easi_jax.data.sensor_channels import Sensors
 from easi_jax.data.velocity_lag import noise_in_starts, of_model, set_right
@@ -69,7 +69,7 @@ def recorded(
     told, is_bound = sensors.noise(fit)
     spread, fast = np.maximum(sensors.spread(fit), 1e-9), scales.speed
     motion = np.concatenate([scales.position, spread, fast[: len(noise) - nv]])
-    step = finest([resolutions(run) for run in runs])
+    step = resolutions(runs)
     return Recorded(
         m,
         fit,

@@ -69,6 +69,21 @@ def test_what_can_be_told_is_no_bound(rate: int) -> None:
     assert np.mean(said, axis=0)[0] <= 0.25
 
 
+def test_a_joint_that_never_moves_is_no_better_known_than_others() -> None:
+    """Read in steps, it may move by half of one unseen."""
+    rng, time = np.random.default_rng(0), 0.01 * np.arange(400)
+    moving = np.round((np.sin(3 * time) + 1e-4 * rng.normal(size=400)) / 0.004) * 0.004
+    still = np.full(400, 0.012)
+    both = Configuration(2, 2, (0, 1), (0, 1), ())
+    q = np.stack([moving, still], 1)
+    rest = np.zeros((400, 1))
+    run = Run("r", "r", 0.01, time, q, 0 * q, False, rest, both)
+    noise = pooled([run, replace(run, qpos=q[::-1].copy())])
+    assert noise.std[1] == pytest.approx(0.004 / np.sqrt(12), rel=1e-6)
+    alone = replace(run, qpos=np.stack([still, still], 1))
+    assert pooled([alone]).std[:2].tolist() == [0.0, 0.0]
+
+
 def test_what_cannot_be_told_is_a_bound() -> None:
     for rate in (50, 100, 250):
         run = _run(rate, "jumping", 2e-5, 1e-2)
