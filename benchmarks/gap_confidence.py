@@ -19,7 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.gap_score import brier
+from benchmarks.gap_score import brier, judged
+from easi_jax.gap.decisions import DECIDE
+from easi_jax.gap.model_comparison import confidence
 from train._command import main, say, show_table
 
 RESULTS = Path(__file__).parent / "results"
@@ -27,6 +29,8 @@ LINES = RESULTS / "gap_confidence.jsonl"
 FAMILIES = {"outside": "unknown", "mixed": "mixed"}  # all other kinds: known
 _BINS = 5
 _SURE = 0.8
+_GAPS = 2.5, 5.0, 15.0  # floors, that bins of older lines end at
+_OLDER = "gap_cases.jsonl", "gap_cases_fitted.jsonl", "gap_confidence.jsonl"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,8 +100,6 @@ def fitted(part: Said) -> np.ndarray:
     ``(2,)``."""
     from scipy.optimize import minimize
 
-    from easi_jax.gap.model_comparison import confidence
-
     alone = np.array([confidence(c, 0.0) for c in part.cost])
     odds = np.maximum(alone / np.maximum(part.confidence, 1e-9) - 1.0, 0.0)
 
@@ -108,6 +110,55 @@ def fitted(part: Said) -> np.ndarray:
         return -float(np.sum(np.where(part.there, np.log(p), np.log(1 - p))))
 
     return minimize(unlikely, np.zeros(2), method="Nelder-Mead").x
+
+
+def by_gaps(rows: Sequence[dict[str, Any]], anyway: float) -> Said:
+    """All that was named in some lines, the cost from the gap before and after each
+    effect joined: for lines that do not hold it. The confidence is the curve's, without
+    rivals.
+
+    Args:
+        rows: of ``benchmarks.gap``.
+        anyway: times the floor, within which all counts as open with an effect, too.
+    """
+    cost, there, gap = [], [], []
+    for r in rows:
+        floor, least = r["gap"]["floor"], anyway**2 - 1.0
+        path = [r["gap"]["refit"], *r["gap_after"]]
+        left = [max((x / floor) ** 2 - 1.0, 0.0) + least for x in path]
+        for k, ok in enumerate(r.get("there") or [ok for ok, _ in judged([r])]):
+            without = max(left[k] - left[k + 1], 0.0) + left[-1]
+            cost.append(0.5 * np.log(without / left[-1]))
+            there.append(bool(ok))
+            gap.append(path[0] / floor)
+    edges = np.searchsorted(_GAPS, gap)
+    stated = [confidence(c, 0.0) for c in cost]
+    return Said(*(np.array(x) for x in (stated, cost, there, edges)))
+
+
+def _of_gaps() -> dict[str, Any]:
+    """How true the curve comes by the size of the gap, for two ways to reckon with what
+    is nearly closed."""
+    every = [
+        json.loads(line)
+        for name in _OLDER
+        for line in (RESULTS / name).read_text().splitlines()
+    ]
+    found = {}
+    for name in ("open_from", "closed"):
+        part = by_gaps(every, getattr(DECIDE, name))
+        even, steep = np.exp(fitted(part))
+        sizes = [*map(str, _GAPS), "more"]
+        found[name] = {
+            "all": figures(part.confidence, part.there),
+            "by gap, in floors at most": {
+                size: figures(part.confidence[mine], part.there[mine])
+                for k, size in enumerate(sizes)
+                if (mine := part.family == k).any()
+            },
+            "curve": {"even [nats]": float(even), "steep": float(steep)},
+        }
+    return found
 
 
 def run(config: Config) -> None:
@@ -136,6 +187,7 @@ def run(config: Config) -> None:
         {"lines": len(rows), "commits": sorted({r["commit"] for r in rows})},
         families=told,
         curve={"even [nats]": float(even), "steep": float(steep)},
+        by_gaps=_of_gaps(),
     )
     say(f"fitted anew: even at {even:.2f} nats, steepness {steep:.2g}")
     say(f"written: {path}")

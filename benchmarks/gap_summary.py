@@ -306,6 +306,35 @@ def _confidence(r: dict[str, Any]) -> list[str]:
         "(goals: Brier below 0.08; calibration error below 0.05, of each kind below "
         "0.1; over at least 300 names).",
         markdown_table((*head, "wrong above 0.8"), lines),
+        *_by_gaps(r.get("by_gaps", {})),
+    ]
+
+
+def _by_gaps(r: dict[str, Any]) -> list[str]:
+    """The curve on names of older lines, by the size of the gap."""
+    if not r:
+        return []
+    head = ("gap, in floors at most", "named", "there", "mean confidence")
+    ways = {
+        "open_from": "within 1.25 floors",
+        "closed": "within 1.05 floors, as stated",
+    }
+    lines = [
+        (
+            *(ways[way], size, f["names"], f["there"], f"{f['mean confidence']:.2f}"),
+            *(f"{f['Brier score']:.3f}", f"{f['calibration error']:.3f}"),
+        )
+        for way, told in r.items()
+        for size, f in (
+            *told["by gap, in floors at most"].items(),
+            ("all", told["all"]),
+        )
+    ]
+    return [
+        "The same curve on names of older lines (costs from the gap before and after "
+        "each effect joined, rivals left out; unknown effects among them), by what "
+        "counts as open with an effect, too:",
+        markdown_table(("counts as open", *head, "Brier", "calibration error"), lines),
     ]
 
 

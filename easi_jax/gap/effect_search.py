@@ -355,7 +355,10 @@ class EffectSearch:
         """The effect that is missed least, where nothing is open without it and its
         name is not even probable; none else."""
         without = {p.key: self.at.without(model, [p]) for p in model.places}
-        costs = {key: cost(model, less) for key, less in without.items()}
+        # What is not open may be of any cause.
+        costs = {
+            key: cost(model, less, DECIDE.open_from) for key, less in without.items()
+        }
         for place in sorted(model.places, key=lambda p: costs[p.key]):
             among = rivals[place.key][:RIVALS]
             odds = odds_of(last(model, place), among, self.at.windows.led)
