@@ -1,11 +1,13 @@
 """What a run of ``train.easi`` found, as the physics of a training: ``train.udr --found
-RUN``."""
+RUN``. The folder of the policy keeps it, so that the policy is tested in it later."""
 
 import dataclasses
 from pathlib import Path
 from typing import Any
 
 from train._effects import Given, found_in
+
+FILE = "found.json"  # in a policy's folder, in the form of distribution.json
 
 
 @dataclasses.dataclass(frozen=True)
@@ -17,12 +19,14 @@ class Found:
             the means that were found.
         distribution: over these parameters.
         given: the effects that it has.
+        content: what is to be kept of it.
         note: for the report.
     """
 
     env: Any
     distribution: Any
     given: Given
+    content: dict[str, Any]
     note: str
 
 
@@ -37,11 +41,8 @@ def found_robot(folder: Path, env: Any) -> Found:
 
     from easi_jax.errors import UserError
     from easi_jax.io.runs.folder import read_config
-    from easi_jax.io.runs.schemas import read_distribution, space_of
+    from easi_jax.io.runs.schemas import read_distribution
     from easi_jax.model.distribution import gaussian
-    from easi_jax.model.found_effects import joined, set_by_none
-    from easi_jax.model.parameters import ParameterSpace
-    from easi_jax.simulation.with_effects import env_identified
 
     path = folder / "distribution.json"
     if not path.is_file():
@@ -49,22 +50,50 @@ def found_robot(folder: Path, env: Any) -> Found:
             f"--found {folder}: no distribution.json in it; give a finished run of "
             "train.easi"
         )
-    settings, content = read_config(folder), read_distribution(path)
+    content, given = read_distribution(path), Given(read_config(folder).get("effects"))
     seed = str(content.get("best_seed", next(iter(content["seeds"]))))
     result = content["seeds"][seed]
-    space = space_of(content)
-    given = Given(settings.get("effects"))
-    try:
-        own, values = joined(env.mj_model, ParameterSpace(()), found_in(given.effects))
-        values |= {a: p.nominal for p in own.parameters for a in p.addresses}
-        fixed = set_by_none(env.mj_model, space.addresses, values)
-        identified = env_identified(env, space, result["mean"], fixed)
-    except UserError as error:
-        raise UserError(f"--found {folder}: {error}") from None
+    content = {**content, "seeds": {seed: result}, "best_seed": int(seed)}
+    identified = _identified(env, content, given.effects, f"--found {folder}")
     cov = np.array(result["unit_covariance"], float)
-    drawn = gaussian(space, np.array(result["unit_mean"], float), cov)
+    mean = np.array(result["unit_mean"], float)
     note = (
-        f"physics drawn from what {folder} found: {space.size} parameters, with their "
-        "covariance; parameters that it lacks keep the model's values"
+        f"physics drawn from what {folder} found: {identified.space.size} parameters, "
+        "with their covariance; parameters that it lacks keep the model's values"
     )
-    return Found(identified, drawn, given, note)
+    drawn = gaussian(identified.space, mean, cov)
+    return Found(identified, drawn, given, content, note)
+
+
+def as_found(folder: Path, env: Any, given: Given) -> Any:
+    """The robot of ``env`` with effects, as that which the policies of a folder were
+    trained in was identified, where they were trained under what a run found.
+
+    Raises:
+        UserError: what the folder keeps is damaged, or is of another robot.
+    """
+    from easi_jax.io.runs.schemas import read_distribution
+    from train._effects import robots
+
+    path = folder / FILE
+    if not path.is_file():
+        return robots(env, given)[0]
+    return _identified(env, read_distribution(path), given.effects, str(path))
+
+
+def _identified(
+    env: Any, content: dict[str, Any], effects: dict[str, Any] | None, where: str
+) -> Any:
+    from easi_jax.errors import UserError
+    from easi_jax.io.runs.schemas import space_of
+    from easi_jax.model.found_effects import joined
+    from easi_jax.model.parameters import ParameterSpace
+    from easi_jax.simulation.with_effects import env_identified
+
+    (result,) = content["seeds"].values()
+    try:
+        own, values = joined(env.mj_model, ParameterSpace(()), found_in(effects))
+        values |= {a: p.nominal for p in own.parameters for a in p.addresses}
+        return env_identified(env, space_of(content), result["mean"], values)
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from None

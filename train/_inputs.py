@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-_FILES = "parameters", "mapping", "env", "demonstrations"
+_FILES = "parameters", "mapping", "env", "demonstrations", "retrain"
 _LISTS = "data", "held_out", "stand", "effects_from"
 _RUNS = "udr", "policy", "start_from", "found"  # folders of earlier runs, or files
 _RESULTS = "results.json", "distribution.json"  # of a run folder
@@ -19,9 +19,10 @@ def files_of(config: Any) -> list[Path]:
 
 def _each(config: Any) -> Iterator[Path]:
     from easi_jax.io.models.mjcf import check_assets
+    from envs import REGISTRY
 
-    model = getattr(config, "model", None)
-    if model:
+    model, logs = getattr(config, "model", None), getattr(config, "data", ())
+    if model and str(model) not in REGISTRY:
         yield Path(model)
         yield from check_assets(Path(model), config.allow_assets)
     for name in _FILES:
@@ -32,6 +33,7 @@ def _each(config: Any) -> Iterator[Path]:
         yield from map(Path, getattr(config, name, ()))
     for name in _RUNS:
         given = getattr(config, name, None)
-        if given:
+        if given and not (name == "udr" and logs):
             path = Path(given)
-            yield from [path / r for r in _RESULTS] if path.is_dir() else [path]
+            each = [path / r for r in _RESULTS] if path.is_dir() else [path]
+            yield from filter(Path.is_file, each)

@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from train._effects import Given, robots
+from train._found import as_found
 
 _IMITATES = ("demonstrations", "labelled", "skills", "skill")
 
@@ -68,9 +69,9 @@ def recorded(given: Given, config: Any, training: Any) -> dict[str, Any]:
     """What a run folder keeps of a command's options: of imitation what was given, and
     what the demonstrations were."""
     found = given.recorded(config)
-    for name in _IMITATES:
-        if found[name] is None:
-            del found[name]
+    for name in (*_IMITATES, "found"):
+        if found.get(name) is None:
+            found.pop(name, None)
     shown = getattr(training, "demonstrations", None)
     return found if shown is None else {**found, _DIGEST: shown.digest}
 
@@ -263,7 +264,7 @@ def load_policies(
         )
     if given is None or given.effects is None:
         given = Given(result.get("effects"))
-    env = robots(env_of(folder, result, env_file), given)[0]
+    env = as_found(folder, env_of(folder, result, env_file), given)
     seeds = tuple(result["seeds"])
     training = acting_config(env, result)
     pipe = Pipeline(env, PipelineConfig(training=training))
@@ -364,9 +365,9 @@ def load_udr(folder: Path, env_file: Path | None = None) -> dict[str, Any]:
         )
     env = env_of(folder, config, env_file)
     given = Given(config.get("effects"), config.get("target_effects"))
-    trained, real = robots(env, given)
+    trained = as_found(folder, env, given)
     if config.get("fixed"):
-        trained = real or trained
+        trained = robots(env, given)[1] or trained
     training = training_config(
         *(env, config["env_steps"], config.get("algorithm"), imitation_of(config))
     )
@@ -390,7 +391,7 @@ def load_udr(folder: Path, env_file: Path | None = None) -> dict[str, Any]:
         "policies": pipe.policies(found.state),
         "given": given,
         "config": config,
-        "method": "Fixed" if config.get("fixed") else "UDR",
+        "method": read_policies(folder / "results.json")["methods"][0],
     }
 
 

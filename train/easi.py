@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from train._command import main, say
 from train._easi_config import Config
+from train._found import FILE
 from train._inputs import files_of
 
 # Options that say something of logs alone, of a policy that made them, of a target.
@@ -67,6 +68,11 @@ def _from_target(config: Config) -> None:
     from train._stages import training_curve
 
     udr = load_udr(config.udr, config.env)
+    if (config.udr / FILE).is_file():
+        raise UserError(
+            f"{config.udr} was trained under what {udr['config']['found']} found: give "
+            "a run of train.udr without --found"
+        )
     seeds = config.seeds or udr["seeds"]
     missing = [s for s in seeds if s not in udr["seeds"]]
     if missing:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from train._command import main, say, show_table
+from train._found import FILE
 from train._inputs import files_of
 from train._options import (
     EngineOptions,
@@ -120,6 +121,8 @@ def run(config: Config) -> None:
         overwrite=config.overwrite,
         files=files_of(config),
     ) as folder:
+        if own:
+            folder.write_json(FILE, own.content)
         notes = [*([own.note] if own else []), *effect_notes(given)]
         physics = own.distribution if own else None
         if physics is None:

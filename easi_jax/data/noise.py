@@ -94,10 +94,14 @@ def pooled(runs: Sequence[Run]) -> Noise:
     """Noise ``(2 nv,)`` of runs of one machine; the same must be hidden in all.
 
     The median over runs that tell motion from noise; where none does, over all. At
-    least what the resolution makes of positions (`resolutions`).
+    least what the resolution makes of positions (`resolutions`), and of the velocity of
+    what never moves.
     """
     std, is_bound = _pooled([noise_of(run) for run in runs])
-    least = np.pad(resolutions(runs) / math.sqrt(12.0), (0, len(std) // 2))
+    least = resolutions(runs) / math.sqrt(12.0)
+    still = np.all([np.ptp(run.qvel, axis=0) == 0 for run in runs], axis=0)
+    fitted = least * _fit_gain(max(map(len, runs)), runs[0].dt)
+    least = np.concatenate([least, np.where(still, fitted, 0.0)])
     return Noise(np.maximum(std, least), is_bound)
 
 

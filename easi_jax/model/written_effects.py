@@ -14,6 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from easi_jax.errors import UserError
 from easi_jax.model.addresses import split
 from easi_jax.model.effect_numbers import field_of, fields_that_act
 
@@ -44,10 +45,15 @@ def is_written(address: str) -> bool:
     return kind == "effect" and field_of(quantity) in fields_that_act("model")
 
 
-def keep(spec: mujoco.MjSpec, m: mujoco.MjModel, undo: Undo) -> None:
-    """Writes into ``spec``, of which ``m`` was compiled, how it is without effects."""
+def forget(spec: mujoco.MjSpec) -> None:
+    """Takes out of ``spec`` what an earlier export wrote of how it is without
+    effects."""
     for old in [x for x in spec.numerics if x.name.startswith((_WITHOUT, _WITH))]:
         spec.delete(old)
+
+
+def keep(spec: mujoco.MjSpec, m: mujoco.MjModel, undo: Undo) -> None:
+    """Writes into ``spec``, of which ``m`` was compiled, how it is without effects."""
     theirs = dict(numbers(undo.without))
     for name, value in numbers(m):
         other = np.asarray(theirs[name])
@@ -60,7 +66,11 @@ def keep(spec: mujoco.MjSpec, m: mujoco.MjModel, undo: Undo) -> None:
 
 
 def undone(m: mujoco.MjModel) -> Undo:
-    """The model without effects that its numbers have, and these."""
+    """The model without effects that its numbers have, and these.
+
+    Raises:
+        UserError: a model that was exported is part of another one now.
+    """
     out, values = copy.deepcopy(m), dict[str, float]()
     for i in range(m.nnumeric):
         kept = m.numeric(i)
@@ -69,7 +79,16 @@ def undone(m: mujoco.MjModel) -> Undo:
         elif kept.name.startswith(_WITHOUT):
             *path, last = kept.name.removeprefix(_WITHOUT).split(".")
             target = getattr(reduce(getattr, path, out), last)
+            if np.size(kept.data) != np.size(target):
+                raise UserError(
+                    f"{kept.name}: the model has other parts than that of train.export "
+                    "whose effects it holds; give that one alone"
+                )
             target[:] = np.reshape(kept.data, np.shape(target))
+        elif _WITH in kept.name or _WITHOUT in kept.name:
+            raise UserError(
+                f"{kept.name}: a model of train.export is attached; give that one alone"
+            )
     return Undo(out, values)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from easi_jax.errors import UserError
-from easi_jax.model.found_effects import FoundEffects, joined
+from easi_jax.model.found_effects import FoundEffects, joined, set_by_none
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.simulator import Simulator
 
@@ -46,15 +46,21 @@ def env_identified(
     env: Any, space: ParameterSpace, means: ArrayLike, fixed: Mapping[str, float]
 ) -> Any:
     """An environment with the parameters of ``space`` alone, nominal at ``means (n,)``,
-    SI; others keep the model's values. ``fixed``: values by address besides.
+    SI; others of its own keep their nominal values. ``fixed``: values by address that
+    hold where no parameter sets them.
 
     Raises:
         UserError: as `env_with`, or an address that the robot lacks.
     """
-    values = np.asarray(means, float).tolist()
+    needs_simulator(env, "other parameters")
+    m, (low, high) = env.mj_model, space.bounds
+    values = np.clip(np.asarray(means, float), low, high).tolist()
     each = zip(space.parameters, values, strict=True)
     found = ParameterSpace(tuple(replace(p, nominal=value) for p, value in each))
-    return env_with_space(env, found, fixed)
+    fixed = set_by_none(m, space.addresses, fixed)
+    own = {a: p.nominal for p in env.space.parameters for a in p.addresses}
+    own = set_by_none(m, [*space.addresses, *([a] for a in fixed)], own)
+    return env_with_space(env, found, {**own, **fixed})
 
 
 def env_with_space(

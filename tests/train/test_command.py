@@ -443,5 +443,12 @@ def test_help_of_an_option_is_a_paragraph(
     for field in dataclasses.fields(module.Config):
         assert field.name in said.replace("-", "_") or "_folder" in field.name
     assert "default: None" not in said and "(default: )" not in said
-    for text in re.findall(r'"""(.+?)"""', inspect.getsource(module.Config), re.S)[1:]:
+    texts: dict[str, str] = {}  # what stands under a field, that of a subclass first
+    for cls in module.Config.__mro__[:-1]:
+        below = re.findall(
+            r'^    (\w+): [^\n]+\n    """(.+?)"""', inspect.getsource(cls), re.S | re.M
+        )
+        texts = {**dict(below), **texts}
+    assert {*texts} == {f.name for f in dataclasses.fields(module.Config)}
+    for text in texts.values():
         assert " ".join(text.split()) in said

@@ -1,6 +1,7 @@
 """A policy trained under what a run of ``train.easi`` found."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,9 @@ import pytest
 from easi_jax.errors import UserError
 from easi_jax.model.distribution import draw
 from envs import load
-from train import evaluate, udr
+from train import easi, evaluate, udr
 from train._found import found_robot
+from train._robots import load_policies, load_udr
 
 TEMPLATE = Path(__file__).parents[2] / "examples" / "my_robot" / "env.py"
 _EFFECTS = {
@@ -76,12 +78,28 @@ def test_the_robot_is_as_it_was_identified(tmp_path: Path) -> None:
     assert model.effects is not None
     assert model.effects.coulomb[elbow] == pytest.approx(0.05)
     assert env.space.names[0] == "upper_mass"  # as it was
+    lower = env.mj_model.body("lower").id  # which the run lacks
+    assert model.mjx.body_mass[lower] == pytest.approx(env.mj_model.body_mass[lower])
     keys = jax.random.split(jax.random.key(0), 4000)
     drawn = jax.vmap(lambda k: draw(found.env.space, found.distribution, k))(keys)
     logs = np.log(np.asarray(drawn, float))
     np.testing.assert_allclose(logs.mean(0), np.log([1.0, 1.25]), atol=2e-3)
     np.testing.assert_allclose(logs.std(0), 0.01 * np.log(4.0), rtol=0.05)
     assert np.corrcoef(logs.T)[0, 1] == pytest.approx(0.9, abs=0.02)
+
+
+def test_a_mean_at_its_bound_is_one(tmp_path: Path) -> None:
+    """Single precision may be a little beyond it."""
+    run = _run_of(tmp_path, "body.upper.mass")
+    content = json.loads((run / "distribution.json").read_text())
+    content["parameters"][0] |= {
+        "nominal": 0.2,
+        "initial": [0.1, 0.3],
+        "bounds": [0.01, 0.3],
+    }
+    content["seeds"]["3"]["mean"] = [float(np.float32(0.3))]
+    (run / "distribution.json").write_text(json.dumps(content))
+    assert found_robot(run, load(TEMPLATE)).env.space.nominal == pytest.approx([0.3])
 
 
 def test_what_is_no_result_for_this_robot_is_refused(tmp_path: Path) -> None:
@@ -110,3 +128,11 @@ def test_a_policy_is_trained_and_tested_in_it(tmp_path: Path) -> None:
     asked["out"] = tmp_path / "r.json"
     evaluate.run(evaluate.Config(**asked))
     assert json.loads((tmp_path / "r.json").read_text())["robot"] == "two_link"
+    # In the robot as it was identified, wherever the run has gone.
+    shutil.rmtree(run)
+    known = load_policies(out, env_file=TEMPLATE)
+    assert known["env"].space.names == ("p0", "p1")
+    assert known["env"].space.nominal == pytest.approx([1.0, 1.25])
+    assert load_udr(out, TEMPLATE)["method"] == "EASI"
+    with pytest.raises(UserError, match=r"train\.udr without --found"):
+        easi.run(easi.Config(udr=out, env=TEMPLATE, out=tmp_path / "easi2"))

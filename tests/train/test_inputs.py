@@ -27,8 +27,9 @@ def test_all_that_is_read_is_told(tmp_path: Path) -> None:
     (udr / "results.json").write_text("{}")
     env, log, law = (tmp_path / name for name in ("env.py", "log.csv", "law.py"))
     config = SimpleNamespace(
-        model=scene, allow_assets=(), data=(log,), effects_from=(law,), udr=udr, env=env
+        model=scene, allow_assets=(), data=(log,), effects_from=(law,), env=env
     )
+    config.start_from, config.udr = udr, tmp_path  # logs need no run of train.udr
     own = [scene, env, log, law]
     assert {*files_of(config)} == {*own, mesh, robot, udr / "results.json"}
 

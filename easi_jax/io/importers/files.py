@@ -1,6 +1,7 @@
 """From foreign files to log files: all of them, or none."""
 
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -177,15 +178,18 @@ def _put_in_place(staged: Path, targets: list[Path]) -> None:
         old.mkdir()
         for target in targets:
             target.parent.mkdir(parents=True, exist_ok=True)
-            if target.exists():
-                os.replace(target, old / target.name)
+            if target.exists():  # stays there until it is replaced
+                shutil.copy2(target, old / target.name)
             done.append(target)
             os.replace(staged / target.name, target)
-    except OSError as error:
+    except BaseException as error:
         for target in done:
-            target.unlink(missing_ok=True)
             if (old / target.name).exists():
                 os.replace(old / target.name, target)
+            else:
+                target.unlink(missing_ok=True)
+        if not isinstance(error, OSError):
+            raise
         raise UserError(f"cannot write {targets[0].parent}: {os_reason(error)}") from (
             error
         )

@@ -24,7 +24,7 @@ from easi_jax.model.effect_catalog import CATALOG
 from easi_jax.model.effect_numbers import EffectEntry
 from easi_jax.model.found_laws import public_name
 from easi_jax.model.joint_space import joint_name
-from easi_jax.model.written_effects import Undo, keep, numbers
+from easi_jax.model.written_effects import Undo, forget, keep, numbers
 
 _ASSETS = "assets"  # folder beside the model
 _DIGITS = 17  # of a double, so that it is read as it was
@@ -114,6 +114,7 @@ def _repaired(
             spec = before
         else:
             off += added
+    forget(spec)
     if undo is not None:
         keep(spec, spec.compile(), undo)
     wanted = spec.compile()

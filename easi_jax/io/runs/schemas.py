@@ -23,6 +23,7 @@ TRAINED = {
     "demonstrations_sha256?": str,
     "effects?": {},
     "target_effects?": {},
+    "found?": str,
 }
 POLICIES = {**TRAINED, "methods": [str]}
 _SEED = {

@@ -80,6 +80,7 @@ def test_a_joint_that_never_moves_is_no_better_known_than_others() -> None:
     run = Run("r", "r", 0.01, time, q, 0 * q, False, rest, both)
     noise = pooled([run, replace(run, qpos=q[::-1].copy())])
     assert noise.std[1] == pytest.approx(0.004 / np.sqrt(12), rel=1e-6)
+    assert noise.std[3] > 0.1 * noise.std[2]
     alone = replace(run, qpos=np.stack([still, still], 1))
     assert pooled([alone]).std[:2].tolist() == [0.0, 0.0]
 

@@ -22,10 +22,12 @@ from easi_jax.export.randomization import (
     to_yaml,
 )
 from easi_jax.io.files import to_json
+from easi_jax.io.models.mjcf import mujoco_warnings
 from easi_jax.io.runs.folder import RunFolder
 from easi_jax.model import distribution
 from easi_jax.model.found_effects import EffectEntry, FoundEffects
 from easi_jax.model.parameters import ParameterSpace, declare
+from easi_jax.model.written_effects import undone
 from easi_jax.simulation.mujoco_c import InMujoco
 from easi_jax.simulation.simulator import Simulator
 from envs import make
@@ -280,6 +282,14 @@ def test_effects_in_an_exported_model_count_once(
     for name in ("dof_armature", "geom_friction", "actuator_forcerange"):
         want = np.broadcast_to(getattr(got.model, name), getattr(drawn, name).shape)
         np.testing.assert_allclose(getattr(drawn, name), want, rtol=1e-4, err_msg=name)
+    if as_entries:  # nor may it be part of another model
+        scene = mujoco.MjSpec.from_string("<mujoco><worldbody/></mujoco>")
+        inner = mujoco.MjSpec.from_string(got.xml)
+        scene.attach(inner, prefix="r_", frame=scene.worldbody.add_frame())
+        with mujoco_warnings():
+            both = scene.compile()
+        with pytest.raises(UserError, match="is attached; give that one alone"):
+            undone(both)
     np.testing.assert_allclose(drawn.opt.gravity[0], got.model.opt.gravity, rtol=1e-4)
     np.testing.assert_allclose(drawn.dof_invweight0[0], got.model.dof_invweight0, 1e-4)
 
