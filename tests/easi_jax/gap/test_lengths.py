@@ -129,7 +129,7 @@ def test_a_few_rows_have_no_resolution() -> None:
     m = mujoco.MjModel.from_xml_string(MODEL.format(more=""))
     run = recorded(0)
     short = rows_of(run, 40, 53)
-    assert resolutions(short)[0] > 10 * NOISE
+    assert resolutions([short])[0] > 10 * NOISE
     scales = scales_of(m, [run])
     bounds = Bounds(*(np.zeros(0) for _ in range(3)))
     given = m, [run], [short], scales, bounds, NO_SENSORS, np.full(1, NOISE), 5
