@@ -261,7 +261,10 @@ def test_effects_files_are_checked(tmp_path: Path) -> None:
         ("effects: 3", "with a list"),
         ("effects:\n- {effect: frictoin, columns: {coulomb: 1}}", "unknown effect"),
         ("effects:\n- {effect: coulomb_friction, columns: {culomb: 1}}", "coulomb"),
-        ("effects:\n- {effect: armature, columns: {armature: big}}", "no finite number"),
+        (
+            "effects:\n- {effect: armature, columns: {armature: big}}",
+            "no finite number",
+        ),
         ("effects: []\nrefitted:\n- {to: 1}", "refitted 1"),
     ):
         path.write_text(text)
