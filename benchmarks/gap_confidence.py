@@ -30,6 +30,7 @@ FAMILIES = {"outside": "unknown", "mixed": "mixed"}  # all other kinds: known
 _BINS = 5
 _SURE = 0.8
 _GAPS = 2.5, 5.0, 15.0  # floors, that bins of older lines end at
+_SIZES = *map(str, _GAPS), "more"
 _OLDER = "gap_cases.jsonl", "gap_cases_fitted.jsonl", "gap_confidence.jsonl"
 
 
@@ -56,11 +57,6 @@ class Said:
     cost: np.ndarray
     there: np.ndarray
     family: np.ndarray
-
-    def some(self, which: np.ndarray) -> "Said":
-        """Those of a mask."""
-        fields = dataclasses.fields(self)
-        return Said(*(getattr(self, f.name)[which] for f in fields))
 
 
 def said(rows: Sequence[dict[str, Any]]) -> Said:
@@ -95,6 +91,16 @@ def figures(stated: np.ndarray, there: np.ndarray) -> dict[str, float]:
     }
 
 
+def by_family(part: Said, families: Sequence[str]) -> dict[str, dict[str, float]]:
+    """`figures` of each family that has names."""
+    each = {family: part.family == family for family in families}
+    return {
+        family: figures(part.confidence[mine], part.there[mine])
+        for family, mine in each.items()
+        if mine.any()
+    }
+
+
 def fitted(part: Said) -> np.ndarray:
     """Logarithms of the curve's two numbers that make what was the case most likely,
     ``(2,)``."""
@@ -115,7 +121,7 @@ def fitted(part: Said) -> np.ndarray:
 def by_gaps(rows: Sequence[dict[str, Any]], anyway: float) -> Said:
     """All that was named in some lines, the cost from the gap before and after each
     effect joined: for lines that do not hold it. The confidence is the curve's, without
-    rivals.
+    rivals; families are sizes of the gap.
 
     Args:
         rows: of ``benchmarks.gap``.
@@ -131,9 +137,9 @@ def by_gaps(rows: Sequence[dict[str, Any]], anyway: float) -> Said:
             cost.append(0.5 * np.log(without / left[-1]))
             there.append(bool(ok))
             gap.append(path[0] / floor)
-    edges = np.searchsorted(_GAPS, gap)
+    sizes = np.array(_SIZES)[np.searchsorted(_GAPS, gap)]
     stated = [confidence(c, 0.0) for c in cost]
-    return Said(*(np.array(x) for x in (stated, cost, there, edges)))
+    return Said(*(np.array(x) for x in (stated, cost, there, sizes)))
 
 
 def _of_gaps() -> dict[str, Any]:
@@ -148,14 +154,9 @@ def _of_gaps() -> dict[str, Any]:
     for name in ("open_from", "closed"):
         part = by_gaps(every, getattr(DECIDE, name))
         even, steep = np.exp(fitted(part))
-        sizes = [*map(str, _GAPS), "more"]
         found[name] = {
             "all": figures(part.confidence, part.there),
-            "by gap, in floors at most": {
-                size: figures(part.confidence[mine], part.there[mine])
-                for k, size in enumerate(sizes)
-                if (mine := part.family == k).any()
-            },
+            "by gap, in floors at most": by_family(part, _SIZES),
             "curve": {"even [nats]": float(even), "steep": float(steep)},
         }
     return found
@@ -170,11 +171,8 @@ def run(config: Config) -> None:
         raise UserError(f"{config.lines} is not there; python -m benchmarks.gap --help")
     rows = [json.loads(line) for line in config.lines.read_text().splitlines()]
     every = said(rows)
-    parts = {"all": every}
-    for family in ("known", "mixed", "unknown"):
-        if (every.family == family).any():
-            parts[family] = every.some(every.family == family)
-    told = {k: figures(p.confidence, p.there) for k, p in parts.items()}
+    told = {"all": figures(every.confidence, every.there)}
+    told |= by_family(every, ("known", "mixed", "unknown"))
     even, steep = np.exp(fitted(every))
     show_table(
         "Confidence of train.gap",

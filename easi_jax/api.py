@@ -442,8 +442,8 @@ def train_policy(
         env: a built-in robot (``envs.make``) or an environment of your own
             (``envs.load``), made for an engine.
         estimated: its distribution is drawn from, a sample an episode, with the
-            effects that it was given; what it lacks keeps the model's values. None:
-            uniform over the environment's own ranges.
+            effects that it was given; other parameters keep their nominal values.
+            None: uniform over the environment's own ranges.
         algorithm: ``sac``, ``ppo``, or ``ess_infogail``, which imitates; the
             environment's own where None.
         env_steps: control steps of training; those of the preset where None.

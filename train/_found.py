@@ -51,15 +51,15 @@ def found_robot(folder: Path, env: Any) -> Found:
             "train.easi"
         )
     content, given = read_distribution(path), Given(read_config(folder).get("effects"))
-    seed = str(content.get("best_seed", next(iter(content["seeds"]))))
+    seed = str(content["best_seed"])
     result = content["seeds"][seed]
-    content = {**content, "seeds": {seed: result}, "best_seed": int(seed)}
+    content = {**content, "seeds": {seed: result}}
     identified = _identified(env, content, given.effects, f"--found {folder}")
     cov = np.array(result["unit_covariance"], float)
     mean = np.array(result["unit_mean"], float)
     note = (
         f"physics drawn from what {folder} found: {identified.space.size} parameters, "
-        "with their covariance; parameters that it lacks keep the model's values"
+        "with their covariance; others keep their nominal values"
     )
     drawn = gaussian(identified.space, mean, cov)
     return Found(identified, drawn, given, content, note)

@@ -67,12 +67,12 @@ def _from_target(config: Config) -> None:
     from train._robots import load_udr
     from train._stages import training_curve
 
-    udr = load_udr(config.udr, config.env)
     if (config.udr / FILE).is_file():
         raise UserError(
-            f"{config.udr} was trained under what {udr['config']['found']} found: give "
-            "a run of train.udr without --found"
+            f"{config.udr} was trained under what a run of train.easi found: give a "
+            "run of train.udr without --found"
         )
+    udr = load_udr(config.udr, config.env)
     seeds = config.seeds or udr["seeds"]
     missing = [s for s in seeds if s not in udr["seeds"]]
     if missing:

@@ -123,8 +123,7 @@ def _parameter_files(
     from easi_jax.io.runs.schemas import read_distribution
 
     found = read_distribution(config.run_folder / "distribution.json")
-    first = str(found.get("best_seed", next(iter(found["seeds"]))))
-    seed = first if config.seed is None else str(config.seed)
+    seed = str(found["best_seed"] if config.seed is None else config.seed)
     if seed not in found["seeds"]:
         raise UserError(f"--seed {seed}: the run has {', '.join(found['seeds'])}")
     robot = str(settings.get("robot") or settings.get("model") or "robot")
@@ -167,10 +166,11 @@ def _model_of(config: Config, settings: dict[str, Any]) -> tuple[Path, Any, Any]
     if settings.get("model"):  # of measured logs
         path = Path(config.model or str(settings["model"]))
         named = [path, *check_assets(path, config.allow_assets)]
-        for one in [p for p in named if has_changed(config.run_folder, p)][:1]:
+        changed = [p for p in named if has_changed(config.run_folder, p)]
+        if changed:
             say(
-                f"note: {one} has changed since the run was made: model.xml has what "
-                "was found in the model as it was, and the changes"
+                f"note: {changed[0]} has changed since the run was made: model.xml has "
+                "what was found in the model as it was, and the changes"
             )
         held = None
         if settings.get("held_base"):

@@ -121,11 +121,11 @@ def run(config: Config) -> None:
         overwrite=config.overwrite,
         files=files_of(config),
     ) as folder:
+        notes = effect_notes(given)
         if own:
             folder.write_json(FILE, own.content)
-        notes = [*([own.note] if own else []), *effect_notes(given)]
-        physics = own.distribution if own else None
-        if physics is None:
+            physics, notes = own.distribution, [own.note, *notes]
+        else:
             physics = pipe.point(target) if config.fixed else pipe.udr()
         policies = train_stage(
             *(folder, "train", pipe, keys["udr"], physics, target, config.seeds),

@@ -8,7 +8,7 @@ the model.
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
@@ -237,16 +237,9 @@ def _check_compiled(
             )
 
 
-def _compiled(m: Any, prefix: str = "") -> dict[str, Any]:
+def _compiled(m: Any) -> dict[str, Any]:
     """What of an `mjx.Model` is no array of JAX, and so part of the program."""
-    out = {}
-    for field in dataclasses.fields(m):
-        value, name = getattr(m, field.name), prefix + field.name
-        if dataclasses.is_dataclass(value):
-            out |= _compiled(value, f"{name}.")
-        elif not isinstance(value, jax.Array):
-            out[name] = value
-    return out
+    return {n: v for n, v in _leaves(m) if not isinstance(v, jax.Array)}
 
 
 def _alike(some: Mapping[str, Any], others: Mapping[str, Any]) -> bool:
@@ -261,16 +254,24 @@ def _alike(some: Mapping[str, Any], others: Mapping[str, Any]) -> bool:
 
 def _changed(old: Any, new: Any) -> list[str]:
     """Leaves of an `mjx.Model` that parameters write."""
-    out = []
-    for field in dataclasses.fields(old):
-        a, b = getattr(old, field.name), getattr(new, field.name)
-        if a is b or field.name == "_impl":
-            continue
-        if dataclasses.is_dataclass(a):
-            out += [f"{field.name}.{name}" for name in _changed(a, b)]
-        elif isinstance(b, jax.Array):
-            out.append(field.name)
-    return out
+    was = dict(_leaves(old))
+    return [
+        name
+        for name, value in _leaves(new)
+        if isinstance(value, jax.Array)
+        and value is not was[name]
+        and "_impl" not in name.split(".")
+    ]
+
+
+def _leaves(m: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Name and value of every leaf of an `mjx.Model`."""
+    for field in dataclasses.fields(m):
+        value, name = getattr(m, field.name), prefix + field.name
+        if dataclasses.is_dataclass(value):
+            yield from _leaves(value, f"{name}.")
+        else:
+            yield name, value
 
 
 def _leaf(tree: Any, name: str) -> Any:

@@ -164,16 +164,16 @@ def probability(model: Model, rival: Model) -> float:
     return 0.5 * (1 + erf(t / sqrt(2)))
 
 
-def cost(model: Model, less: Model, anyway: float = DECIDE.closed) -> float:
+def cost(model: Model, less: Model, within: float = DECIDE.closed) -> float:
     """What is left open without an effect, by what is left open with it: half the
     logarithm, so nats for each independent number that was read.
 
     Open is what a cross-validated loss exceeds the noise by, whose own is 1 or a little
-    less. What is within ``anyway`` times the noise counts as left open by both: so well
+    less. What is within ``within`` times the noise counts as left open by both: so well
     is the noise known. Blocks of time are averaged before or after the logarithm,
     whichever is more: what acts seldom shows in few of them.
     """
-    anyway = anyway**2 - 1.0
+    anyway = within**2 - 1.0
     mine, theirs = (np.maximum(m.loss - 1.0, 0.0) + anyway for m in (model, less))
     each = np.mean(np.log(theirs / mine))
     return 0.5 * float(max(each, np.log(theirs.mean() / mine.mean())))

@@ -54,7 +54,8 @@ _WORDS = {int: "a whole number", float: "a number", str: "a text"}
 
 
 def read_distribution(path: Path) -> dict[str, Any]:
-    """What ``distribution.json`` holds, its parameters and seeds of one size.
+    """What ``distribution.json`` holds, its parameters and seeds of one size; the best
+    seed is the first where it does not say.
 
     Raises:
         UserError: it cannot be read, or is another file.
@@ -81,7 +82,7 @@ def read_distribution(path: Path) -> dict[str, Any]:
     if not n or not seeds:
         raise UserError(f"{path}: no parameter or no seed")
     if found.get("best_seed") is None:
-        found.pop("best_seed", None)
+        found["best_seed"] = int(next(iter(seeds)))
     elif str(found["best_seed"]) not in seeds:
         raise UserError(f"{path}: best_seed is none of its seeds")
     return found
