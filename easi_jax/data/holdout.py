@@ -14,6 +14,7 @@ from easi_jax.data.windows import lead_rows, window_steps
 from easi_jax.errors import UserError
 
 HELD_OUT = 0.25  # of the rows, where whole runs are held out
+_MOST = 0.6  # of the rows, or of a run
 _OF_ONE = 0.3  # of a single run
 _BLOCKS = 3  # in which that lies, where each has room for two horizons
 _REACHED = 99.8  # percentile
@@ -26,36 +27,57 @@ def split_held_out(
 ) -> tuple[list[Run], list[Run], str]:
     """Runs to fit, runs held out, and a sentence that says which.
 
-    Of two runs or more, whole runs with a quarter of the rows, and hardly more, whose
-    speeds and drive forces reach about as far as those of the runs left to fit, and
-    rather less far than further; of equals the last. Of a single run blocks that are
-    spread over it (`_blocks_of`).
+    Of two runs or more with room for a prediction, whole runs with a quarter of their
+    rows, and hardly more, whose speeds and drive forces reach about as far as those of
+    the runs left to fit, and rather less far than further; of equals the last. Of a
+    single one blocks that are spread over it (`_blocks_of`), and likewise of the
+    longest where whole runs would be too few rows or nearly all: a bad row near the end
+    of a log parts it in a long run and a short one.
 
     Args:
         horizon: of predictions [s].
 
     Raises:
-        UserError: a single run too short to be split.
+        UserError: runs too short to be split.
     """
-    if len(runs) == 1:
-        return _blocks_of(runs[0], horizon)
-    chosen = _alike(np.array([len(run) for run in runs]), [_reach(m, r) for r in runs])
-    held = [run for i, run in enumerate(runs) if chosen[i]]
+    long = [run for run in runs if len(run) >= _least(run, horizon)]
+    chosen = None
+    if len(long) > 1:
+        rows = np.array([len(run) for run in long])
+        chosen = _alike(rows, [_reach(m, run) for run in long])
+    if chosen is None:
+        longest = max(runs, key=len)
+        parts, held, name = _blocks_of(longest, long or runs, horizon)
+        fit = []
+        for run in runs:
+            fit += parts if run is longest else [run]
+        return fit, held, name
+    held = [run for run, out in zip(long, chosen, strict=True) if out]
     return (
-        [run for i, run in enumerate(runs) if not chosen[i]],
+        [run for run in runs if not any(run is out for out in held)],
         held,
         ", ".join(run.name for run in held),
     )
 
 
-def _alike(rows: np.ndarray, reach: Sequence[np.ndarray]) -> np.ndarray:
+def _least(run: Run, horizon: float) -> int:
+    """Rows of one prediction."""
+    return lead_rows(run.dt) + window_steps(run.dt, horizon) + 1
+
+
+def _alike(rows: np.ndarray, reach: Sequence[np.ndarray]) -> np.ndarray | None:
     """Which of runs with so many ``rows (n,)`` are held out, ``(n,)`` bool: one after
-    the other, beginning with each of them, or with some of very many."""
+    the other, beginning with each of them, or with some of very many. None where these
+    would all be too few rows, or too many."""
     far, number = np.array(reach), np.arange(len(rows))
+
+    def share(sets: np.ndarray) -> np.ndarray:
+        """Of the rows that are in sets ``(S, n)`` bool."""
+        return sets @ rows / rows.sum()
 
     def costs(held: np.ndarray) -> np.ndarray:
         """Of sets ``(S, n)`` bool."""
-        more = np.maximum(held @ rows / rows.sum() - HELD_OUT, 0.0)
+        more = np.maximum(share(held) - HELD_OUT, 0.0)
         each = [_unlike(far, one) for one in held]
         return np.round(np.array(each) + 2 * more, 2)
 
@@ -66,12 +88,14 @@ def _alike(rows: np.ndarray, reach: Sequence[np.ndarray]) -> np.ndarray:
     ends = []
     for first in _some(number):
         held = number == first
-        while held @ rows < HELD_OUT * rows.sum() and held.sum() < len(rows) - 1:
+        while share(held) < HELD_OUT and held.sum() < len(rows) - 1:
             more = _some(number[~held])
             one = order(held | (number == more[:, None]))[: len(rows) // 100 or 1]
             held |= np.isin(number, more[one])
         ends.append(held)
-    return ends[order(np.array(ends))[0]]
+    sets = np.array(ends)
+    sets = sets[(share(sets) >= HELD_OUT) & (share(sets) <= _MOST)]
+    return sets[order(sets)[0]] if len(sets) else None
 
 
 def _some(x: np.ndarray) -> np.ndarray:
@@ -79,31 +103,36 @@ def _some(x: np.ndarray) -> np.ndarray:
     return x[np.unique(np.linspace(0, len(x) - 1, _TRIED).round().astype(int))]
 
 
-def _blocks_of(run: Run, horizon: float) -> tuple[list[Run], list[Run], str]:
-    """30 % of a run in three blocks, each in the middle of a third of it and behind a
-    gap of one horizon; where those would be shorter than two horizons in two, else the
-    last 30 %. What is left between them are runs to fit.
+def _blocks_of(
+    run: Run, beside: Sequence[Run], horizon: float
+) -> tuple[list[Run], list[Run], str]:
+    """30 % of a run, or a quarter of it and the runs ``beside`` it, in three blocks,
+    each in the middle of a third of it and behind a gap of one horizon; where those
+    would be shorter than two horizons in two, else its last rows. What is left between
+    them are runs to fit.
     """
     rows, gap = len(run), window_steps(run.dt, horizon)
-    least = lead_rows(run.dt) + gap + 1  # of one prediction
-    if _OF_ONE * rows < least:
+    least = _least(run, horizon)
+    every = sum(len(other) for other in beside)
+    held = max(int(_OF_ONE * rows), math.ceil(HELD_OUT * every))
+    held = min(held, round(_MOST * rows))
+    if held < least:
         raise UserError(
             f"{run.source}: {rows} rows ({rows * run.dt:.3g} s) are too few to hold "
             f"some out with a horizon of {horizon:g} s, which needs "
             f"{math.ceil(least / _OF_ONE)}: record more, or shorten --horizon"
         )
-    room = int(_OF_ONE * rows / (least + gap))
-    count = min(max(room, 1), _BLOCKS)
-    size = round(_OF_ONE * rows / count)
+    count = min(max(held // (least + gap), 1), _BLOCKS)
+    size = math.ceil(held / count)
     first = [round((k + 0.5) * rows / count - size / 2) for k in range(count)]
     if count == 1:
         first = [rows - size]
     begin = [0, *(f + size for f in first)]
     end = [*(f - gap for f in first), rows]
     fit = [_piece(run, *of) for of in zip(begin, end, strict=True) if of[0] < of[1]]
-    held = [_piece(run, f, f + size) for f in first]
-    times = ", ".join(_span(part) for part in held)
-    return fit, held, f"{100 * _OF_ONE:.0f} % of {run.name}: {times}"
+    out = [_piece(run, f, f + size) for f in first]
+    times = ", ".join(_span(part) for part in out)
+    return fit, out, f"{100 * held / rows:.0f} % of {run.name}: {times}"
 
 
 def _piece(run: Run, first: int, last: int) -> Run:

@@ -24,7 +24,7 @@ from easi_jax.estimation.prediction_error import rms_of_steps
 from easi_jax.estimation.problem import Problem
 from easi_jax.estimation.starts import (
     DRAWS,
-    Simulate,
+    SimulateRows,
     Starts,
     floor,
     known_noise,
@@ -68,32 +68,33 @@ class WindowErrors:
         # Starts are by the positions alone, before velocities help to find them.
         windows = to_device(replace(read, qvel=fitted.qvel))
         faster = jnp.asarray(fitted.qvel - read.qvel)
-        begun = np.arange(self.lead + problem.steps + 1) < start_rows(simulator.dt)
+        length = self.lead + problem.steps + 1
+        begun = np.arange(length) < start_rows(simulator.dt)
         largest = jnp.abs(open_loop.motion(simulator, windows)[..., :nv])
         self.largest = jnp.asarray(np.asarray(largest).max((0, 1)))
 
-        def errors(theta: jax.Array, moved: jax.Array) -> jax.Array:
+        def errors(theta: jax.Array, moved: jax.Array, steps: jax.Array) -> jax.Array:
             first = shift_start(simulator, windows, moved)
             model = simulator.model(theta)
-            found = open_loop.errors_from(simulator, model, first, windows)
+            found = open_loop.errors_from(simulator, model, first, windows, steps)
             begin = moved[:, : 2 * nv].at[:, nv:].add(faster)
             off = jnp.concatenate([begin[:, None], -found[..., : 2 * nv]], 1)
             off = off.at[..., nv:].multiply(begun[:, None])
             return off if seen.any() else off[..., :nv]
 
         still = np.zeros((windows.count, 2 * nv + simulator.mj_model.na), np.float32)
-        like = placed((jnp.zeros(space.size), jnp.asarray(still)))
+        like = placed((jnp.zeros(space.size), jnp.asarray(still), jnp.asarray(0)))
         compiled = jax.jit(errors).lower(*like).compile(quick_compile())
 
-        def simulate(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
-            asked = [
-                placed((jnp.asarray(a, like[0].dtype), jnp.asarray(b, like[1].dtype)))
-                for a, b in zip(x, moved, strict=True)
-            ]
-            return np.stack([jax.device_get(compiled(*both)) for both in asked])
+        def simulate(x: np.ndarray, moved: np.ndarray, rows: int) -> np.ndarray:
+            found = []
+            for asked in zip(x, moved, [rows - 1] * len(x), strict=True):
+                given = map(jnp.asarray, asked, (a.dtype for a in like))
+                found.append(jax.device_get(compiled(*placed(tuple(given)))))
+            return np.stack(found)[:, :, :rows]
 
         self.still, self.count = still, windows.count
-        self.starts = _starts_of(problem, simulate, runs, seen)
+        self.starts = _starts_of(problem, simulate, length, runs, seen)
         if seen.any():
             read = np.ones((windows.count, len(begun), 2 * nv))
             read[..., nv:] = begun[:, None]
@@ -128,7 +129,11 @@ class WindowErrors:
 
 
 def _starts_of(
-    problem: Problem, simulate: Simulate, used: Sequence[Run], seen: np.ndarray
+    problem: Problem,
+    simulate: SimulateRows,
+    length: int,
+    used: Sequence[Run],
+    seen: np.ndarray,
 ) -> Starts:
     """Of windows of the runs ``used`` that begin `lead_rows` before they are measured
     from; velocities that are ``seen (nv,)`` help to find them."""
@@ -145,6 +150,7 @@ def _starts_of(
         motion = np.append(motion, np.maximum(speed, 1e-9))
     return starts_about(
         simulate,
+        length,
         known_noise(noise, motion),
         size,
         np.maximum(wide[m.nv : 2 * m.nv], 1e-9),

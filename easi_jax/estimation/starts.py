@@ -8,7 +8,7 @@ window"). So the same estimator serves every model that is compared, and noise p
 through it says what a perfect model would leave (`floor`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,6 +19,8 @@ from easi_jax.model.separate_trees import turns
 
 # Takes vectors (B, n) and offsets of starts (B, W, s); returns errors (B, W, T, c).
 Simulate = Callable[[np.ndarray, np.ndarray], np.ndarray]
+# The same of so many first rows, T of them.
+SimulateRows = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
 
 DRAWS = 20  # of the noise of each window, for a floor, as the log format asks
 # A start may be off by so much from what the log says of it: so wide that the rows of
@@ -35,6 +37,7 @@ _WORTH = 0.05  # of half the weighted squared error of a row: worth new slopes
 _FAR = 2.0  # times what noise makes of a row: far off
 _NEAREST, _NEAR = 4, 3  # rows at least, and what part of them, that are met first
 _TOGETHER = 4  # draws of the noise that are simulated at once
+_FEW = 0.6  # of a window, at most, that is worth to be simulated alone
 
 
 @dataclass
@@ -57,6 +60,7 @@ class Starts:
         parts: of the machine that each number of a start belongs to, ``(s,)``, the
             first of them those of the channels; all one where None.
         alone: so many channels, the last ones, speak of starts only.
+        begins: errors of the first ``rows`` alone, where these are quicker to simulate.
         slope: of errors with the start, ``(s, W, T, c)``, of the last `linearize`.
         bent: how far errors are from linear there, in the median window: the second
             differences beside the first.
@@ -72,6 +76,7 @@ class Starts:
     parts: np.ndarray | None = None
     read: np.ndarray | None = None
     alone: int = 0
+    begins: Simulate | None = None
     slope: np.ndarray = field(init=False)
     bent: float = field(init=False, default=0.0)
 
@@ -88,29 +93,59 @@ class Starts:
         out.spread = self.known
         return out
 
-    def linearize(self, x: np.ndarray, begin: np.ndarray) -> None:
-        """Takes slopes at a vector ``(n,)`` and offsets ``(W, s)``."""
-        size, (count, _) = len(self.step), begin.shape
-        parts = np.zeros(size, int) if self.parts is None else self.parts
-        turn = turns(parts)
+    def linearize(self, x: np.ndarray, begin: np.ndarray) -> np.ndarray:
+        """Takes slopes at a vector ``(n,)`` and offsets ``(W, s)``; errors there,
+        ``(W, T, c)``."""
+        (more, less), here = self._moved(self.simulate, x, begin, (1.0, -1.0))
+        self._take(0.5 * (more - less))
+        first, second = (
+            np.sqrt(((np.nan_to_num(d) / self.noise) ** 2).sum((0, 2, 3)))
+            for d in (0.5 * (more - less), 0.5 * (more + less))
+        )
+        self.bent = float(np.median(second / np.maximum(first, 1e-300)))
+        return here
+
+    def _slopes_of_rows(self, x: np.ndarray, begin: np.ndarray) -> np.ndarray:
+        """`linearize` for the rows that decide on starts: of those alone, and to one
+        side, where they are simulated alone."""
+        if self.begins is None:
+            return self.linearize(x, begin)
+        (more,), here = self._moved(self.begins, x, begin, (1.0,))
+        self._take(more)
+        return here
+
+    def _moved(
+        self,
+        simulate: Simulate,
+        x: np.ndarray,
+        begin: np.ndarray,
+        signs: Sequence[float],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What errors change by where starts are moved by a step of each sign, what is
+        separate at once, ``(k, turns, W, T, c)``; and errors there."""
+        turn = turns(self._parts)
         most = int(turn.max(initial=-1)) + 1
-        moved = np.broadcast_to(begin, (2 * most + 1, count, size)).copy()
-        at = np.arange(size)
-        moved[turn, :, at] += self.step[:, None]
-        moved[most + turn, :, at] -= self.step[:, None]
-        got = self.simulate(np.repeat(x[None], len(moved), 0), moved).astype(np.float64)
-        more, less, here = got[:most], got[most:-1], got[-1]
-        slope = (more - less)[turn] / (2 * self.step)[:, None, None, None]
+        moved = np.broadcast_to(begin, (len(signs) * most + 1, *begin.shape)).copy()
+        for k, sign in enumerate(signs):
+            at = k * most + turn, slice(None), np.arange(len(turn))
+            moved[at] += sign * self.step[:, None]
+        got = simulate(np.repeat(x[None], len(moved), 0), moved).astype(np.float64)
+        with np.errstate(invalid="ignore"):  # `_take` leaves out what is not finite
+            change = got[:-1] - got[-1]
+        return change.reshape(len(signs), most, *got.shape[1:]), got[-1]
+
+    def _take(self, change: np.ndarray) -> None:
+        """Takes slopes from what errors change by over a step, ``(turns, W, T, c)``."""
+        slope = change[turns(self._parts)] / self.step[:, None, None, None]
         # One prediction in thousands is not finite; it must not spoil all windows.
         self.slope = np.where(np.isfinite(slope), slope, 0.0)
         if self.parts is not None:
-            own = parts[:, None] == parts[: self.slope.shape[-1]]
+            own = self.parts[:, None] == self.parts[: self.slope.shape[-1]]
             self.slope *= own[:, None, None, :]
-        first, second = (
-            np.sqrt(((np.nan_to_num(d) / self.noise) ** 2).sum((0, 2, 3)))
-            for d in (0.5 * (more - less), 0.5 * (more + less) - here)
-        )
-        self.bent = float(np.median(second / np.maximum(first, 1e-300)))
+
+    @property
+    def _parts(self) -> np.ndarray:
+        return np.zeros(len(self.step), int) if self.parts is None else self.parts
 
     @property
     def _weight(self) -> np.ndarray:
@@ -192,26 +227,24 @@ class Starts:
         Returns:
             Offsets ``(W, s)`` and errors ``(W, T, c)``.
         """
-        whole, moved, errors = self.rows, begin, np.zeros(0)
-        before = np.full(len(begin), np.inf)
+        whole, moved = self.rows, begin
+        before, errors = np.zeros(0), np.zeros(0)
         known = np.isfinite(self.noise).sum()
         for k in range(_LINEARIZED):
-            self.linearize(x, moved)
+            start = self._slopes_of_rows(x, moved)
             if k == 0:
-                start = self.simulate(x[None], moved[None])[0]
                 before = self._cost(start[None], moved[None])[0]
                 if np.median(before) > _FAR * whole * known:
                     self.rows = max(_NEAREST, whole // _NEAR)
-                    moved = self.fit(x[None], moved[None])[0][0]
+                    (moved,), _, _ = self._fitted(x[None], moved[None])
                     self.rows = whole
-                    self.linearize(x, moved)
-            (moved,), (errors,) = self.fit(x[None], moved[None])
-            after = self._cost(errors[None], moved[None])[0]
+                    self._slopes_of_rows(x, moved)
+            (moved,), (errors,), (after,) = self._fitted(x[None], moved[None])
             fell = np.minimum(before, 1e300) - after
             before = after
             if np.nanmax(np.where(np.isfinite(after), fell, 0.0)) < _WORTH * whole:
                 break
-        return moved, errors
+        return moved, errors if self.begins is None else self.linearize(x, moved)
 
     def _cost(self, errors: np.ndarray, moved: np.ndarray) -> np.ndarray:
         """Half the weighted squared error of each start, ``(B, W)``."""
@@ -235,10 +268,22 @@ class Starts:
         Returns:
             Offsets ``(B, W, s)`` and errors ``(B, W, T, c)``.
         """
-        more = 0.0 if readings is None else readings
+        moved, errors, _ = self._fitted(x, begin, readings)
+        if self.begins is not None:
+            errors = self.simulate(x, moved) - (0.0 if readings is None else readings)
+        return moved, errors
+
+    def _fitted(
+        self, x: np.ndarray, begin: np.ndarray, readings: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`fit`, errors those of the rows that are simulated for it; and the cost of
+        each start, ``(B, W)``."""
+        simulate = self.simulate if self.begins is None else self.begins
         gain, back = self.gain()
         moved = np.array(begin, float)
-        errors = self.simulate(x, moved) - more
+        errors = simulate(x, moved)
+        more = 0.0 if readings is None else readings[:, :, : errors.shape[2]]
+        errors = errors - more
         cost = self._cost(errors, moved)
         length = np.ones(cost.shape)
         for _ in range(_ROUNDS):
@@ -246,7 +291,7 @@ class Starts:
             step = np.einsum("wstc,bwtc->bws", gain, near, optimize=True)
             step += np.einsum("wsu,bwu->bws", back, moved, optimize=True)
             ahead = moved - length[..., None] * step
-            got = self.simulate(x, ahead) - more
+            got = simulate(x, ahead) - more
             new = self._cost(got, ahead)
             better = new < cost
             gained = np.where(better, np.minimum(cost, 1e300) - new, 0.0)
@@ -256,7 +301,7 @@ class Starts:
             length = np.where(better, 1.0, _SHORTER * length)
             if (gained <= _SETTLED).all():
                 break
-        return moved, errors
+        return moved, errors, cost
 
     def left(self, errors: np.ndarray) -> np.ndarray:
         """What small errors ``(..., W, T, c)`` become where starts are fitted anew."""
@@ -310,7 +355,8 @@ def known_noise(noise: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def starts_about(
-    simulate: Simulate,
+    simulate: SimulateRows,
+    length: int,
     noise: np.ndarray,
     position: np.ndarray,
     speed: np.ndarray,
@@ -324,7 +370,8 @@ def starts_about(
     """Starts of windows that begin where a log says, `lead_rows` early.
 
     Args:
-        simulate: as for `Starts`.
+        simulate: errors of vectors, offsets of starts and so many first rows.
+        length: rows of a window.
         noise: of channels, `known_noise`, positions first, and with ``speeds``
             velocities last; infinite where nobody measured.
         position, speed: motion of each degree of freedom, ``(nv,)``.
@@ -335,7 +382,7 @@ def starts_about(
             positions and ``speeds``.
         speeds: whether velocities help to find starts.
     """
-    nv = len(position)
+    nv, rows = len(position), start_rows(dt)
     known = np.where(np.isfinite(noise), noise, 0.0)[:nv]
     small, part = _DIFFERENCE
     wide = np.maximum(_NOISES * known, _MOTION * position)
@@ -351,16 +398,17 @@ def starts_about(
         for x in (by_rows, curved * by_rows)
     )
     return Starts(
-        simulate,
+        lambda x, moved: simulate(x, moved, length),
         noise,
         np.concatenate([spread, act]),
-        start_rows(dt),
+        rows,
         np.concatenate([step, part * act]),
         wider,
         by_noise,
         parts if len(noise) == nv * (1 + speeds) else None,
         read,
         nv * speeds,
+        (lambda x, moved: simulate(x, moved, rows)) if rows <= _FEW * length else None,
     )
 
 

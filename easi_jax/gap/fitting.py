@@ -251,10 +251,9 @@ class Fitting:
             finer: predictions of the same windows with smaller steps, but of sensors.
         """
         chosen, p = self.selector, self.predictor
-        given = self.plain(x)[None], chosen.blocks, chosen.moved[None]
+        given = self.plain(x)[None], chosen.blocks, chosen.moved[None], self.steps + 1
         own, right = (
-            each.motion(each.errors(*given)[0, : chosen.count, : self.steps + 1])
-            for each in (p, finer)
+            each.motion(each.errors(*given)[0, : chosen.count]) for each in (p, finer)
         )
         error, fast = (a.astype(float) - b for a, b in zip(own, right, strict=True))
         turns = 2 * np.pi * np.round(error / (2 * np.pi))

@@ -100,8 +100,8 @@ class Selector:
         at = self.windows_of(every)
         begun = self.moved if moved is None else moved
         moved = np.broadcast_to(begun[at], (len(x), len(at), begun.shape[1]))
-        found = self.predictor.errors(self.plain(x), self.blocks[every], moved)
-        found = found[:, : len(at), : self.rows]
+        given = self.plain(x), self.blocks[every], moved, self.rows
+        found = self.predictor.errors(*given)[:, : len(at)]
         bounded, lost = finite(found, self.predictor.largest)
         few = lost.mean(1) <= _LOST
         found = np.where(few[:, None, None, None], bounded, found)

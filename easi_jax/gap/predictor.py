@@ -40,6 +40,7 @@ from easi_jax.simulation import native_step
 from easi_jax.simulation.compile_time import expected
 from easi_jax.simulation.engine import Engine
 from easi_jax.simulation.logged import Logged
+from easi_jax.simulation.open_loop import first_steps
 from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.step import Physics, arrived_sensed, arrived_step
 
@@ -384,6 +385,7 @@ class Predictor:
                 np.zeros((batch, len(self.neutral)), np.float32),
                 np.zeros(batch, np.int32),
                 np.zeros((batch, BLOCK, self.size), np.float32),
+                np.int32(self.steps),
             )
             for out in self._without if self.simulator.engine == "mjx" else [left_out]:
                 # Play is for few predictions.
@@ -400,30 +402,35 @@ class Predictor:
         x: jax.Array,
         block: jax.Array,
         moved: jax.Array,
+        steps: jax.Array,
         *windows: jax.Array,
     ) -> jax.Array:
-        def local(items: tuple[jax.Array, ...], *data: jax.Array) -> jax.Array:
-            return jax.vmap(lambda *i: self._block(left_out, data, *i))(*items)
+        def local(items: tuple[jax.Array, ...], steps: Any, *data: jax.Array) -> Any:
+            return jax.vmap(lambda *i: self._block(left_out, data, steps, *i))(*items)
 
-        return sharded_map(local, self.mesh, (x, block, moved), *windows)
+        return sharded_map(local, self.mesh, (x, block, moved), steps, *windows)
 
     def _block(
         self,
         left_out: tuple[str, ...],
         data: tuple[jax.Array, ...],
+        steps: jax.Array,
         x: jax.Array,
         block: jax.Array,
         moved: jax.Array,
     ) -> jax.Array:
         model = self.model(x, left_out)
         some = jax.tree.map(lambda a: a[block], Window(*data))
-        return jax.vmap(lambda w, d: self._window(model, w, d))(some, moved)
+        return jax.vmap(lambda w, d: self._window(model, w, d, steps))(some, moved)
 
-    def _window(self, model: Model, window: Window, moved: jax.Array) -> jax.Array:
+    def _window(
+        self, model: Model, window: Window, moved: jax.Array, steps: jax.Array
+    ) -> jax.Array:
         """Readings less measurements at each row, ``(H + 1, nv + 2 N)``: those of
         sensors where a row's step begins, then where the step before it ends; zero in
         rows in which a sensor was not read. With ``speeds`` then those of velocities,
-        ``nv`` more; zero after the rows that a start is fitted to.
+        ``nv`` more; zero after the rows that a start is fitted to. Rows after the
+        control ``steps`` that are simulated are no predictions.
 
         Where readings are late, the simulation begins by the longest delay earlier, so
         that it starts from what was read until the window's start. Each joint is
@@ -446,11 +453,10 @@ class Predictor:
 
         at_once = None
         if simulator.engine == "mujoco":
-            at_once = native_step.replay(model, physics, arrived)
-        if at_once:
-            qs, vs, readings = at_once
-        else:
-            qs, vs, readings = jax.lax.scan(step, physics, arrived)[1]
+            at_once = native_step.replay(model, physics, arrived, steps)
+        nothing = jnp.zeros((2, len(self.sensors))) if self.sensors else ()
+        still = physics.qpos, physics.qvel, nothing
+        qs, vs, readings = at_once or first_steps(step, physics, arrived, still, steps)
         # From the start, so that readings are plain numbers also where q is not.
         zero = jnp.zeros(nv)
         difference = jax.vmap(simulator.difference, (None, None, 0, None))
@@ -627,8 +633,9 @@ class Predictor:
         x: np.ndarray,
         windows: np.ndarray | None = None,
         moved: np.ndarray | None = None,
+        rows: int | None = None,
     ) -> np.ndarray:
-        """Predicted readings less measured ones, ``(B, W, H + 1, channels)``: at the
+        """Predicted readings less measured ones, ``(B, W, rows, channels)``: at the
         start, and after each step.
 
         Args:
@@ -636,7 +643,10 @@ class Predictor:
             windows: which blocks of `BLOCK` windows, sorted; all where None.
             moved: offsets of start positions, velocities and activations,
                 ``(B, W, 2 nv + na)``.
+            rows: the first of a window, at least those that a start is fitted to; all
+                ``H + 1`` where None.
         """
+        rows = self.steps + 1 if rows is None else rows
         blocks = np.arange(self.blocks) if windows is None else np.asarray(windows)
         count, nb = len(x), len(blocks)
         items = count * nb
@@ -649,17 +659,27 @@ class Predictor:
             whole = np.zeros((count, nb * BLOCK, self.size), np.float32)
             whole[:, : moved.shape[1]] = moved
             offsets = whole.reshape(shape)
-        shape = items, BLOCK, self.steps + 1, self.channels
+        shape = items, BLOCK, rows, self.channels
         out = np.empty(shape, np.float32)
+        steps = self._steps_of(vectors, rows)
         for left_out, chosen in self.by_program(vectors):
             at_once = left_out == next(iter(self._without))
             for part in self._batches(chosen, at_once):
                 program = self._program(left_out, len(part))
                 args = vectors[part], which[part], offsets[part]
-                got = np.asarray(program(*args, *self.data))
-                out[part] = got[..., self._compared]
+                got = np.asarray(program(*args, steps, *self.data))
+                out[part] = got[..., :rows, self._compared]
         out = out.reshape(count, nb * BLOCK, *shape[2:])
         return out[:, : self.count(windows)]
+
+    def _steps_of(self, vectors: np.ndarray, rows: int) -> np.ndarray:
+        """Control steps that are simulated for the first rows of windows, ``()``: with
+        sensors one more, and where readings are late those that they are interpolated
+        between."""
+        columns = enumerate(self.layout.columns, self.own)
+        late = [i for i, c in columns if c.field == "late"]
+        more = bool(self.sensors) + 2 * bool(vectors[:, late].any())
+        return np.int32(min(rows - 1 + more, self.steps + bool(self.sensors)))
 
     def by_program(
         self, vectors: np.ndarray

@@ -43,11 +43,14 @@ def window_starts(
     every = np.arange(len(predictor.windows))
     at = (every if blocks is None else windows_in(blocks))[:count]
 
-    def simulate(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
-        return predictor.errors(x[..., :own], blocks, moved)[:, :count, :rows]
+    length = predictor.steps + 1 if rows is None else rows
+
+    def simulate(x: np.ndarray, moved: np.ndarray, first: int) -> np.ndarray:
+        return predictor.errors(x[..., :own], blocks, moved, first)[:, :count]
 
     return starts_about(
         simulate,
+        length,
         noise,
         scales.position,
         scales.speed,
@@ -55,6 +58,6 @@ def window_starts(
         act,
         runs[0].dt,
         start_parts(m),
-        None if read.all() else read[at, :rows],
+        None if read.all() else read[at, :length],
         predictor.compares_speeds,
     )

@@ -1,6 +1,7 @@
 """Simulating measured segments under a model: logged commands, logged starts."""
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -71,21 +72,31 @@ def _predicted(
     at_once = simulator.replay(model, first, ctrl, steps)
     if at_once is not None:
         return at_once
-    if steps is None:
-        return jax.lax.scan(step, first, ctrl)[1]
     nothing = jnp.zeros((2, *first.sensed.shape)) if senses else ()
-    begun = jax.tree.map(
-        lambda x: jnp.broadcast_to(x, (ctrl.shape[0], *x.shape)),
-        (first.qpos, first.qvel, nothing),
-    )
+    still = first.qpos, first.qvel, nothing
+    return first_steps(step, first, ctrl, still, steps)
+
+
+def first_steps(
+    step: Callable[[Any, jax.Array], tuple[Any, Any]],
+    first: Any,
+    inputs: jax.Array,
+    still: Any,
+    steps: int | jax.Array | None,
+) -> Any:
+    """`jax.lax.scan` over so many of the ``inputs (H, ...)``, all of them where None:
+    what ``step`` returns beside the next state, ``(H, ...)``; ``still`` for others."""
+    if steps is None:
+        return jax.lax.scan(step, first, inputs)[1]
+    rows = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(inputs), *x.shape)), still)
 
     def at(i: jax.Array, carry: Any) -> Any:
-        state, seen = step(carry[0], ctrl[i])
+        state, seen = step(carry[0], inputs[i])
         put = jax.tree.map(lambda row, x: row.at[i].set(x), carry[1], seen)
         return state, put
 
     end = jnp.asarray(steps)
-    return jax.lax.fori_loop(jnp.zeros_like(end), end, at, (first, begun))[1]
+    return jax.lax.fori_loop(jnp.zeros_like(end), end, at, (first, rows))[1]
 
 
 def prediction_residuals(

@@ -48,7 +48,7 @@ def test_runs_to_fit_reach_as_far_as_those_held_out():
         "a third of the rows, not a half"
     )
     short = [make_run(np.zeros(20), f"s{i}", size=c) for i, c in enumerate(sizes * 3)]
-    fit, held, _ = split_held_out(SLIDE, short, 0.2)
+    fit, held, _ = split_held_out(SLIDE, short, 0.1)
     assert len(held) == 3
     top = [max(r.ctrl.max() for r in part) for part in (fit, held)]
     assert top[1] <= top[0] <= 1.1 * top[1]
@@ -91,12 +91,29 @@ def test_a_run_with_no_room_for_a_prediction_is_refused():
         split_held_out(SLIDE, [make_run(np.zeros(86))], 0.2)
 
 
+@pytest.mark.parametrize(
+    "rows", [(1990, 9), (10, 1989), (1900, 100), (1985, 15), (800, 200), (950, 30, 20)]
+)
+def test_pieces_too_short_to_be_held_out_are_fitted(rows: tuple[int, ...]):
+    """As a bad row or a hole near one end of a log makes them."""
+    runs = [make_run(np.zeros(n), f"r{i}", size=1.0) for i, n in enumerate(rows)]
+    fit, held, name = split_held_out(SLIDE, runs, 0.2)
+    longest = int(np.argmax(rows))
+    assert len(held) == 3 and f" % of r{longest}: " in name
+    assert {run.recording for run in held} == {f"r{longest}"}
+    assert all(len(run) >= 26 for run in held), "each has room for a prediction"
+    usable = sum(n for n in rows if n >= 26)
+    assert 0.25 <= sum(map(len, held)) / usable <= 0.35
+    others = {f"r{i}" for i in range(len(rows))} - {f"r{longest}"}
+    assert others < {run.name for run in fit}
+
+
 def test_hundreds_of_runs_are_parted_at_once():
     """As holes every few rows make them of one log."""
     sizes = 2.0 + np.sin(np.arange(400))
     runs = [make_run(np.zeros(20), f"r{i}", size=c) for i, c in enumerate(sizes)]
     began = time.perf_counter()
-    fit, held, _ = split_held_out(SLIDE, runs, 0.2)
+    fit, held, _ = split_held_out(SLIDE, runs, 0.1)
     assert time.perf_counter() - began < 20.0
     assert 100 <= len(held) <= 108 and len(fit) + len(held) == 400
     top = [max(r.ctrl.max() for r in part) for part in (fit, held)]

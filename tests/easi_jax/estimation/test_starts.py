@@ -70,6 +70,33 @@ def test_a_perfect_model_leaves_its_floor(step: float) -> None:
         np.testing.assert_allclose(drawn.mean(0), due.mean(0), rtol=0.1)
 
 
+def test_starts_are_the_same_where_first_rows_are_simulated_alone() -> None:
+    """From far off, and with noise that is not that of the readings."""
+    whole, _ = made(8, pull=1.0)
+    alone, x, far = made(8, pull=1.0)[0], np.zeros(1), np.full((W, 2), 0.05)
+    counts = []
+
+    def begins(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        return whole.simulate(x, moved)[:, :, :ROWS]
+
+    def counted(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        counts.append(len(x))
+        return whole.simulate(x, moved)
+
+    alone.begins, alone.simulate = begins, counted
+    given, wanted = (s.solve(x, far) for s in (alone, whole))
+    assert counts == [5]  # errors and slopes of the end
+    for got, due in zip(given, wanted, strict=True):
+        np.testing.assert_allclose(got, due, atol=1e-3 * NOISE[0])
+    np.testing.assert_allclose(alone.slope, whole.slope, atol=1e-9)
+    readings = NOISE * np.random.default_rng(0).normal(size=(3, W, T, 1))
+    begin = np.repeat(given[0][None], 3, 0)
+    given, wanted = (s.fit(np.zeros((3, 1)), begin, readings) for s in (alone, whole))
+    assert counts == [5, 3]
+    for got, due in zip(given, wanted, strict=True):
+        np.testing.assert_allclose(got, due, atol=1e-9)
+
+
 def test_what_a_model_lacks_is_not_hidden_and_enters_no_floor() -> None:
     starts, _ = made(2, pull=2.0)
     moved, errors = fitted(starts)

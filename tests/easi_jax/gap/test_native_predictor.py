@@ -5,12 +5,14 @@ import numpy as np
 import pytest
 
 from easi_jax.data.scales import scales_of
+from easi_jax.data.windows import start_rows
 from easi_jax.gap.candidates import places
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.window_set import window_set
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import engine, native
+from easi_jax.simulation.engine import Engine
 from tests.easi_jax.gap.test_late_readings import ARM, DT, STEPS, recorded
 
 
@@ -51,3 +53,26 @@ def test_a_window_is_one_call_unless_an_effect_depends_on_the_state(
     np.testing.assert_allclose(stepped, steady, atol=2e-5)
     np.testing.assert_allclose(both, stepped, atol=2e-5)
     assert np.abs(dragged - steady).max() > 1e-3
+
+
+@pytest.mark.parametrize("how", ["mjx", "mujoco"])
+def test_first_rows_alone_are_those_of_the_whole(how: Engine) -> None:
+    """With nothing in the steps, with play, and where readings are late."""
+    m = mujoco.MjModel.from_xml_string(ARM.format(""))
+    run = recorded(m, (0.0,))
+    found = places(m, scales_of(m, [run]))
+    layout = Layout(m, found)
+    windows = window_set(m, [run], 0.2, 0.1)
+    assert windows is not None
+    with engine.using(how):
+        p = Predictor(m, ParameterSpace(()), layout, windows, DT)
+    fields = [c.field for c in layout.columns]
+    vectors = np.repeat(p.neutral[None], 4, 0)
+    for x, (name, size) in zip(
+        vectors[1:], {"drag": 0.02, "width": 0.01, "late": 0.013}.items(), strict=True
+    ):
+        x[fields.index(name)] = size
+    whole = p.errors(vectors)
+    for rows in (start_rows(DT), p.steps):
+        alone = p.errors(vectors, rows=rows)
+        np.testing.assert_allclose(alone, whole[:, :, :rows], atol=2e-6)
