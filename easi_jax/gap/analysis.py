@@ -17,7 +17,12 @@ import numpy as np
 
 from easi_jax.data.recording import Run, physics_steps
 from easi_jax.data.scales import scales_of
-from easi_jax.data.sensor_channels import Sensors, measured_sensors, read_at_end
+from easi_jax.data.sensor_channels import (
+    NO_SENSORS,
+    Sensors,
+    measured_sensors,
+    read_at_end,
+)
 from easi_jax.data.windows import lead_rows, window_rows, window_steps
 from easi_jax.errors import UserError
 from easi_jax.gap import gap_metric as measure
@@ -47,6 +52,11 @@ _SHORT, _MIDDLE, _LONG = 0.05, 0.2, 1.0
 _FITTED = (32, 96)  # windows of one length that fits see
 _LONGEST = 10  # windows at least, of the longest
 _STEPS = 9_600  # physics steps in them
+
+_NO_LAWS = (
+    "no law beyond the table was looked for: feet stick and slip, where errors are not "
+    "linear in a force"
+)
 
 Tell = Callable[[str], None]
 
@@ -295,6 +305,8 @@ class Analysis:
                 self.final, poorer, chosen = other, chosen, richer
         beyond = time.perf_counter() - listed
         outcome = self.final._stated(chosen)
+        if self.search.at.sticks and outcome.verdict == "unexplained":
+            notes.append(_NO_LAWS)
         if poorer is not None and any(f.place.key in laws for f in outcome.found):
             x = self.search.at.plain(poorer.model.fit.x)
             gap = self.held_out.look(x).gap
@@ -366,22 +378,37 @@ class Analysis:
         smaller steps."""
         m, windows = copy.copy(self.m), at.predictor.windows
         m.opt.timestep = self.step / FINER
-        none = {k: getattr(windows, k)[..., :0] for k in ("sensed", "known")}
         own = self.predictor.simulator
         engine = own.engine if own.moves_centers else "mujoco"
-        return self._predictor(m, replace(windows, **none), engine)
+        return self._predictor(m, windows, engine)
 
     def native_predictor(self, at: Fitting) -> Predictor:
-        """Predictions of the windows of ``at`` by native MuJoCo."""
-        if at.predictor.simulator.engine == "mujoco":
-            return at.predictor
+        """Predictions of the windows of ``at`` by native MuJoCo, without sensors."""
+        own = at.predictor
+        if own.simulator.engine == "mujoco" and not own.sensors:
+            return own
         return self._predictor(self.m, filled(at.windows), "mujoco")
+
+    def of_joints(self, at: Fitting, model: Model) -> tuple[Fitting, Model]:
+        """The windows of ``at`` by native MuJoCo without sensors, and a model of them
+        fitted there."""
+        data, nv = self.data, self.m.nv
+        places = np.arange(len(data.noise))
+        some = (places < nv) | (places >= nv + len(data.sensors))
+        given = {k: getattr(data, k)[some] for k in ("motion", "noise", "resolution")}
+        bound = data.noise_is_bound[:nv]
+        data = replace(data, **given, noise_is_bound=bound, sensors=NO_SENSORS)
+        windows, own = unsensed(at.windows), range(self.space.size)
+        predictor, steps = self.native_predictor(at), at.steps
+        out = Fitting(data, predictor, windows, steps, {}, own, self._progress)
+        out.selector.weight = at.selector.weight
+        return out, out.again(model)
 
     def _predictor(
         self, m: mujoco.MjModel, windows: WindowSet, engine: Engine
     ) -> Predictor:
         """Predictions by a model like the one that was recorded, without sensors."""
-        p = self.predictor
+        p, windows = self.predictor, unsensed(windows)
         given = m, self.space, p.layout, windows, self.data.dt, self.fixed
         logged, wait = p.simulator.logged, self._more["wait"]
         return Predictor(*given, logged, wait, engine=engine, speeds=p.speeds)
@@ -400,21 +427,29 @@ class Analysis:
 def proposed_laws(analysis: Analysis, model: Model) -> list[Proposed]:
     """Laws for what a model leaves open in the fitting data.
 
-    None are looked for where sensors are compared, whose readings are not linearized,
-    nor where feet stick and slip.
+    By joints alone where sensors are compared, whose readings are not linearized; none
+    where feet stick and slip.
     """
     at = analysis.search.at
-    if at.predictor.sensors or at.sticks or at.closed_by(model):
+    if at.sticks or at.closed_by(model):
         return []
-    model = at.selector.fit(model.places, model.fit.x)
-    predictor = analysis.native_predictor(at)
-    return LawSearch(at, model, predictor).proposed()
+    if at.predictor.sensors:
+        at, model = analysis.of_joints(at, model)
+    else:
+        model = at.selector.fit(model.places, model.fit.x)
+    return LawSearch(at, model, analysis.native_predictor(at)).proposed()
 
 
 def filled(windows: WindowSet) -> WindowSet:
     """With the last one repeated until they are whole blocks."""
     last = len(windows) - 1
     return windows.take(np.r_[: last + 1, np.full(-(last + 1) % BLOCK, last)])
+
+
+def unsensed(windows: WindowSet) -> WindowSet:
+    """Without readings of sensors."""
+    none = {k: getattr(windows, k)[..., :0] for k in ("sensed", "known")}
+    return replace(windows, **none)
 
 
 @dataclass(frozen=True)

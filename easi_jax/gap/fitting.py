@@ -168,7 +168,8 @@ class Fitting:
     def closed(self, x: np.ndarray) -> bool:
         """Whether nothing is left to explain, whitened at ``x``."""
         errors = self.selector.errors(x[None])[0]
-        return float(np.nanmax(self._beside_floor(x, errors).low)) <= DECIDE.closed
+        found = self._beside_floor(x, errors)
+        return float(found.low[found.judged].max()) <= DECIDE.closed
 
     def misses(self, x: np.ndarray, less: np.ndarray) -> bool:
         """Whether anything is open beside the floor at ``x``, whitened there, under a

@@ -86,7 +86,7 @@ def _not_finite(lost: int, of: int) -> list[str]:
     ]
 
 
-_Intervals = tuple[tuple[float, float] | None, ...]
+_Intervals = tuple[tuple[float, float], ...]
 
 
 def _figures(f: Figures, intervals: _Intervals = ()) -> GapFigures:
@@ -96,10 +96,7 @@ def _figures(f: Figures, intervals: _Intervals = ()) -> GapFigures:
 def _intervals(o: Outcome, found: Openness) -> _Intervals:
     """Of errors of channels, in their units."""
     edges = np.stack([found.low, found.high], 1)[:-1] * o.floor_si[:, None]
-    return tuple(
-        (low, high) if low == low else None  # a channel that is left out has none
-        for low, high in edges.tolist()
-    )
+    return tuple((low, high) for low, high in edges.tolist())
 
 
 def _named(names: Sequence[str], which: np.ndarray) -> tuple[str, ...]:

@@ -16,24 +16,26 @@ class Openness:
     """Errors of each compared channel, then of all together, in units of their floor.
 
     Attributes:
-        ratio: ``(nv + 1,)``; NaN for a channel that is left out.
+        ratio: ``(nv + 1,)``.
         low, high: simultaneous 95 % intervals, ``(nv + 1,)``.
+        judged: all but channels that are left out, ``(nv + 1,)`` bool.
     """
 
     ratio: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    judged: np.ndarray
 
     @property
     def is_open(self) -> np.ndarray:
         """Surely beyond `Decisions.open_from`, ``(nv + 1,)`` bool."""
-        return self.low > DECIDE.open_from
+        return self.judged & (self.low > DECIDE.open_from)
 
     @property
     def undecided(self) -> np.ndarray:
         """Perhaps beyond `Decisions.open_from`, ``(nv + 1,)`` bool: more data would
         tell."""
-        return (self.high > DECIDE.open_from) & ~self.is_open
+        return self.judged & (self.high > DECIDE.open_from) & ~self.is_open
 
 
 def openness(square: np.ndarray, floor: np.ndarray, scale: np.ndarray) -> Openness:
@@ -58,12 +60,8 @@ def openness(square: np.ndarray, floor: np.ndarray, scale: np.ndarray) -> Openne
     # Of many intervals that are to hold together (Bonferroni).
     count = int(used.sum()) + 1
     times = NormalDist().inv_cdf(1 - (1 - DECIDE.interval) / 2 / count)
-    known = np.append(used, True)
-    return Openness(
-        np.where(known, ratio, np.nan),
-        np.where(known, ratio * np.exp(-times * spread), np.nan),
-        np.where(known, ratio * np.exp(times * spread), np.nan),
-    )
+    low, high = (ratio * np.exp(sign * times * spread) for sign in (-1.0, 1.0))
+    return Openness(ratio, low, high, np.append(used, True))
 
 
 def verdict_of(found: bool, refit: Openness, after: Openness) -> str:

@@ -112,14 +112,14 @@ class GapFigures:
         gap: in units of the motion.
         interval: its 95 % interval.
         si: RMS error of each channel, in its unit.
-        si_intervals: simultaneous 95 % intervals of those; None where left out.
+        si_intervals: simultaneous 95 % intervals of those.
         not_finite: windows whose prediction is not.
     """
 
     gap: float
     interval: tuple[float, float]
     si: tuple[float, ...]
-    si_intervals: tuple[tuple[float, float] | None, ...] = ()
+    si_intervals: tuple[tuple[float, float], ...] = ()
     not_finite: int = 0
 
 

@@ -73,7 +73,7 @@ def test_numbers_are_those_that_people_write() -> None:
 def test_a_result_with_nothing_in_it_has_a_report() -> None:
     """No effect, no place of the error, no noise, figures that are not finite."""
     none = GapFigures(
-        float("nan"), (float("nan"), float("nan")), (float("inf"),), (None,), 7
+        float("nan"), 2 * (float("nan"),), (float("inf"),), (2 * (float("nan"),),), 7
     )
     found = result(
         effects=(),

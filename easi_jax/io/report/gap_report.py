@@ -298,13 +298,11 @@ def _channel_json(
     after: float,
     floor: float,
 ) -> dict[str, Any]:
-    """An entry of ``gap_si``; intervals where the channel is compared."""
+    """An entry of ``gap_si``."""
     at = r.channels.index(name)
     out = {"unit": unit, "before": before, "refit": refit, "after": after}
     for key, figures in (("refit_95", r.refit), ("after_95", r.after)):
-        interval = figures.si_intervals[at] if figures.si_intervals else None
-        if interval is not None:
-            out[key] = interval
+        out[key] = figures.si_intervals[at]
     marked = {"floor_is_upper_bound": True} if name in r.bounded else {}
     return {**out, "floor": floor, **marked, "open": name in r.open}
 

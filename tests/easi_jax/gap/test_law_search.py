@@ -1,6 +1,7 @@
 """Laws that nobody listed, from motion to a formula."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -31,26 +32,35 @@ def catalog() -> Iterator[None]:
         yield
 
 
+GYRO = ONE.replace("<geom", '<site name="s"/><geom').replace(
+    "</mujoco>", '<sensor><gyro name="gyro" site="s"/></sensor></mujoco>'
+)
+
+
 def recorded(m: mujoco.MjModel, seed: int, force: Callable) -> Run:
     rng, d, c = np.random.default_rng(seed), mujoco.MjData(m), Configuration.of(m)
     t = DT * np.arange(400)
     rate, phase = rng.uniform(2, 10, 3), rng.uniform(0, 6, 3)
     ctrl = 0.4 * np.sin(rate * t[:, None] + phase).sum(1)[:, None]
-    q = []
+    q, sensed = [], []
     for u in ctrl:
         q.append(d.qpos + NOISE * rng.normal(size=m.nq))
         d.ctrl[:] = u
+        mujoco.mj_forward(m, d)
+        sensed.append(d.sensordata + 0.01 * rng.normal(size=m.nsensordata))
         for _ in range(STEPS):
             d.qfrc_applied[:] = force(d)
             mujoco.mj_step(m, d)
     qpos = np.array(q)
     speed = fitted_velocity(qpos, DT, c)
-    return Run(f"r{seed}", "made", DT, t, qpos, speed, False, ctrl, c)
+    read = {"gyro": np.array(sensed)} if m.nsensordata else {}
+    given = f"r{seed}", "made", DT, t, qpos, speed, False, ctrl, c
+    return replace(Run(*given), sensors=read)
 
 
-def analysis(force: Callable) -> Analysis:
+def analysis(force: Callable, xml: str = ONE) -> Analysis:
     """Without any effect of the catalog, so that it takes seconds."""
-    m = mujoco.MjModel.from_xml_string(ONE)
+    m = mujoco.MjModel.from_xml_string(xml)
     runs = [recorded(m, k, force) for k in range(3)]
     noise = np.array([NOISE, 1.0])
     given = m, ParameterSpace(()), runs[:2], runs[2:], noise, 0.2
@@ -72,15 +82,18 @@ def test_a_cubic_spring_is_found_and_confirmed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("force", "text"),
+    ("force", "text", "xml"),
     [
-        (lambda d: 0.05 * np.abs(d.qvel), "abs(qvel.j)"),
-        (lambda d: 0.15 * d.ctrl * np.abs(d.ctrl), "ctrl.m*abs(ctrl.m)"),
+        (lambda d: 0.05 * np.abs(d.qvel), "abs(qvel.j)", ONE),
+        (lambda d: 0.15 * d.ctrl * np.abs(d.ctrl), "ctrl.m*abs(ctrl.m)", ONE),
+        (lambda d: 0.05 * np.abs(d.qvel), "abs(qvel.j)", GYRO),
     ],
 )
-def test_terms_are_proposed(force: Callable, text: str) -> None:
+def test_terms_are_proposed(force: Callable, text: str, xml: str) -> None:
+    """Also where sensors are compared."""
     with engine.using("mujoco"):
-        a = analysis(force)
+        a = analysis(force, xml)
+        assert len(a.predictor.sensors) == 3 * (xml == GYRO)
         proposed = proposed_laws(a, a._chosen().model)
     assert proposed[0].law.terms[0].text == text
 

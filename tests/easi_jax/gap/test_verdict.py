@@ -18,8 +18,8 @@ def errors(*times: float, seed: int = 0) -> np.ndarray:
 def test_a_small_channel_does_not_hide_behind_a_noisy_one() -> None:
     found = openness(errors(1.0, 3.0, 9.0), FLOOR, SCALE)
     assert found.is_open.tolist() == [False, True, False, False]
-    assert found.ratio[:2] == pytest.approx([1.0, 3.0], rel=0.05)
-    assert np.isnan(found.ratio[2]), "left out"
+    assert found.ratio[:3] == pytest.approx([1.0, 3.0, 9.0], rel=0.05)
+    assert not found.judged[2] and found.low[2] > 8, "left out, but it has its figures"
 
 
 def test_a_perfect_model_of_many_channels_does_not_fail() -> None:
