@@ -423,7 +423,8 @@ def floor(
     """Mean squares of each row that a perfect model would leave, ``(W, T, c)``.
 
     Readings of the model's own motion, from fitted starts ``begin (W, s)`` on, are
-    drawn with noise and resolution, and go through the same fit of starts.
+    drawn with noise and resolution, and go through the same fit of starts, which begins
+    as far off as readings put it.
 
     Args:
         x: the model's vector, ``(n,)``.
@@ -438,6 +439,8 @@ def floor(
     white = np.sqrt(np.maximum(noise**2 - (coarse * least) ** 2, 0.0))
     there = 1.0 if starts.read is None else starts.read
     total, count = np.zeros(exact.shape), np.zeros(len(exact))
+    # What nobody measured begins where it was found.
+    off = np.where(starts.scatter < starts.spread, starts.scatter, 0.0)
     for first in range(0, draws, _TOGETHER):
         many = min(_TOGETHER, draws - first)
         read = exact + white * rng.normal(size=(many, *exact.shape))
@@ -447,7 +450,7 @@ def floor(
         rounded = np.round((read + phase) / size) * size - phase
         read = there * np.where(coarse, rounded, read)
         vectors = np.repeat(x[None], many, 0)
-        at = np.broadcast_to(begin, (many, *begin.shape))
+        at = begin + off * rng.normal(size=(many, *begin.shape))
         _, errors = starts.fit(vectors, at, read)
         fine = np.asarray(np.isfinite(errors).all((2, 3)))
         square = np.where(fine[..., None, None], errors.astype(float) ** 2, 0.0)

@@ -167,19 +167,19 @@ class Fitting:
 
     def closed(self, x: np.ndarray) -> bool:
         """Whether nothing is left to explain, whitened at ``x``."""
-        errors = self.selector.errors(x[None])[0]
-        found = self._beside_floor(x, errors)
+        found = self._beside_floor(x, x)
         return float(found.low[found.judged].max()) <= DECIDE.closed
 
     def misses(self, x: np.ndarray, less: np.ndarray) -> bool:
         """Whether anything is open beside the floor at ``x``, whitened there, under a
         vector ``less`` with starts of its own."""
-        (moved,), _ = self.starts.fit(less[None], self.moved[None])
-        errors = self.selector.errors(less[None], None, moved)[0]
-        return bool(self._beside_floor(x, errors).is_open.any())
+        return bool(self._beside_floor(x, less).is_open.any())
 
-    def _beside_floor(self, x: np.ndarray, errors: np.ndarray) -> Openness:
-        """Errors ``(W, T, c)`` beside the floor at ``x``, whitened there."""
+    def _beside_floor(self, x: np.ndarray, other: np.ndarray) -> Openness:
+        """Errors under a vector, with starts of its own, beside the floor at ``x``,
+        whitened there."""
+        (moved,), _ = self.starts.fit(other[None], self.moved[None])
+        errors = self.selector.errors(other[None], None, moved)[0]
         rng, after, moved = np.random.default_rng(1), self.data.lead + 1, self.moved
         noise = floor(self.starts, x, moved, _DRAWS, self.data.resolution, rng)
         square = measure.squares(self.starts.counted(errors, after))

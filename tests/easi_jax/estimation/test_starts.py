@@ -232,3 +232,25 @@ def test_what_is_not_finite_keeps_its_start() -> None:
     starts.simulate = blown
     moved, _ = fitted(starts)
     assert np.isfinite(moved).all() and not moved[3].any()
+
+
+def test_the_floor_meets_the_wrong_minima_that_readings_lead_to() -> None:
+    """A perfect model whose motion bends at its start, as where a foot touches."""
+    rng, t = np.random.default_rng(11), DT * np.arange(T)[:, None]
+
+    def bent(start: np.ndarray) -> np.ndarray:
+        return np.abs(start[..., :1, None] + start[..., 1:, None] * t)
+
+    true = np.stack([rng.uniform(0.0, 0.02, W), 0.3 * rng.normal(size=W)], 1)
+    read = bent(true) + NOISE * rng.normal(size=(W, T, 1))
+    near = np.array([NOISE[0], 0.05])
+    guess = true + near * rng.normal(size=true.shape)
+    wide = np.array([0.06, 1.0])
+    starts = Starts(
+        lambda x, moved: bent(guess + moved) - read,
+        *(NOISE, wide, ROWS, 0.01 * wide, near, near),
+    )
+    moved, errors = starts.solve(np.zeros(1), np.zeros((W, 2)))
+    got = (errors[:, ROWS:] ** 2).mean()
+    drawn = floor(starts, np.zeros(1), moved, 20, np.zeros(1), np.random.default_rng(0))
+    assert np.sqrt(got / drawn[:, ROWS:].mean()) == pytest.approx(1.0, abs=0.12)
