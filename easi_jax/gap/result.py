@@ -8,7 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from easi_jax.estimation.blocks import scattered
-from easi_jax.estimation.least_squares import OUTCOMES, inverted, result_code
+from easi_jax.estimation.least_squares import (
+    CONVERGED,
+    NOT_DETERMINED,
+    OUTCOMES,
+    inverted,
+    result_code,
+)
 from easi_jax.estimation.posterior import trusted
 from easi_jax.estimation.weights import excess
 from easi_jax.gap.effect_set import Model
@@ -24,6 +30,7 @@ from easi_jax.model.results import Outcome as Ended
 # Sizes of differences, that a number without bounds may be off which no data determine.
 _ANYTHING = 1e3
 _ALIKE = 1e-12  # least eigenvalue of a correlation matrix that is no rounding
+_TELLS = 0.5  # of the deviation without data: less, and data determine a number
 
 
 @dataclass(frozen=True)
@@ -157,9 +164,11 @@ class Numbers:
     ) -> None:
         self.selector, self.model = selector, model
         active = model.fit.active
-        std = np.sqrt(np.diag(fit_covariance(selector, model, pulls))).tolist()
-        self._std = dict(zip(active.tolist(), std, strict=True))
+        std = np.sqrt(np.diag(fit_covariance(selector, model, pulls)))
+        self._std = dict(zip(active.tolist(), std.tolist(), strict=True))
         codes = model.fit.codes(selector.bounds)
+        told = std < _TELLS * _within_bounds(selector, model)
+        codes = np.where((codes == CONVERGED) & ~told, NOT_DETERMINED, codes)
         self._codes = dict(zip(active.tolist(), codes.tolist(), strict=True))
 
     def fitted(self, place: Place) -> dict[int, float]:
@@ -205,6 +214,15 @@ class Numbers:
         ]
 
 
+def _within_bounds(selector: Selector, model: Model) -> np.ndarray:
+    """Standard deviations of a fit's active entries where they may be anything within
+    bounds, ``(a,)``."""
+    bounds, active = selector.bounds, model.fit.active
+    width = bounds.high[active] - bounds.low[active]
+    most = _ANYTHING * bounds.size[active]
+    return np.where(np.isfinite(width), width / np.sqrt(12.0), most)
+
+
 def fit_covariance(
     selector: Selector, model: Model, pulls: Sequence[np.ndarray] = ()
 ) -> np.ndarray:
@@ -229,9 +247,7 @@ def fit_covariance(
     with jax.enable_x64(True):
         left = scattered(*map(jnp.asarray, (normal, normal, score)))
         left *= trusted(excess(jnp.asarray(costs), jnp.asarray(counts)))
-    width = bounds.high[f.active] - bounds.low[f.active]
-    open_ = np.where(np.isfinite(width), width / np.sqrt(12.0), _ANYTHING * size)
-    prior = (size / open_) ** 2
+    prior = (size / _within_bounds(selector, model)) ** 2
     cov = inverted(np.asarray(left), prior, _ALIKE)[0]
     scores = np.reshape(pulls, (len(pulls), len(size)))
     moved = inverted(normal, prior, _ALIKE)[0] @ scores.T

@@ -42,7 +42,7 @@ ELSEWHERE = {
         *("BLOCK", "_ITEMS", "_STEPPED", "_ACCELERATOR_ITEMS", "_ROW", "_PASSES"),
         "_ROUNDED",
     },
-    "result": {"_ANYTHING", "_ALIKE"},
+    "result": {"_ANYTHING", "_ALIKE", "_TELLS"},
     "screening": {
         *("_SHORTLIST", "_STARTS", "_HOPELESS", "_FEW", "_LONG", "_SIMULATED"),
         *("_HOLDS", "_AT_ONCE"),

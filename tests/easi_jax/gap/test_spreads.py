@@ -1,5 +1,6 @@
 """What is stated of a fit's numbers, by linear problems that are known exactly."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +11,7 @@ from easi_jax.gap.batched_least_squares import Bounds, Fitted
 from easi_jax.gap.effect_set import Model
 from easi_jax.gap.fitting import Fitting
 from easi_jax.gap.forward_selection import Selector
-from easi_jax.gap.result import fit_covariance, score_of
+from easi_jax.gap.result import Numbers, fit_covariance, score_of
 
 W, M = 200, 12  # windows, numbers of each
 SIZE = np.array([0.1, 2.0])
@@ -176,3 +177,27 @@ def test_each_row_of_a_run_counts_once() -> None:
     counts = chosen.rows_once()
     assert counts.sum() * M == pytest.approx(24 + 12 + 12)
     np.testing.assert_allclose(counts, [0.75, 0.5, 0.75, 1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("slopes", "outcome"),
+    [
+        ((1.0, 1.0), "converged"),
+        ((1.0, 1e-12), "converged"),  # one number that the data tell is enough
+        ((1e-12, 1e-12), "not determined"),
+    ],
+)
+def test_what_no_data_determine_is_said_so(
+    slopes: tuple[float, float], outcome: str
+) -> None:
+    """Also of numbers that the data show by their sum alone."""
+    wide = Bounds(np.full(2, -1e3), np.full(2, 1e3), SIZE)
+    noise = np.random.default_rng(5).normal(size=(W, M))
+    selector, model = fitted(noise, bounds=wide, columns=lambda *_, **__: np.arange(2))
+    place: Any = None
+    slope = model.fit.slope * slopes
+    told = Numbers(selector, replace(model, fit=replace(model.fit, slope=slope)))
+    assert told.outcome(place) == outcome
+    alike = np.repeat(slope[..., :1], 2, -1) if slopes[0] == 1.0 else slope
+    told = Numbers(selector, replace(model, fit=replace(model.fit, slope=alike)))
+    assert told.outcome(place) == "not determined"
