@@ -99,8 +99,11 @@ def with_speeds(
         Runs to fit, held-out ones, noise, ``(2 nv,)`` or ``(nv,)``, and notes.
     """
     nv, runs, dt = m.nv, [*fit, *held], fit[0].dt
-    if len(noise) == nv or not all(run.qvel_measured for run in runs):
-        return fit, held, noise[:nv], []
+    lack = sorted({run.recording for run in runs if not run.qvel_measured})
+    if len(noise) == nv or lack:
+        some = any(run.qvel_measured for run in runs)
+        told = f"velocities are left unused, since {', '.join(lack)} has none"
+        return fit, held, noise[:nv], [told] if some else []
     right = set_right(runs, tangent_names(m), of_model(m, dt))
     noise = noise * np.append(np.ones(nv), right.noisier)
     fit, held = right.runs[: len(fit)], right.runs[len(fit) :]

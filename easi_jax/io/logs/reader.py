@@ -229,7 +229,7 @@ class _Reader:
         self.notes[f"{self.path}: {text}"] = None
 
     def read(self) -> list[Run]:
-        table = self.mapping.rename(read_table(self.path))
+        table = self._unnumbered(self.mapping.rename(read_table(self.path)))
         for text in table.notes:
             self.note(text)
         given = self.path, table.columns, self.columns, self.model
@@ -328,6 +328,17 @@ class _Reader:
             f"{', '.join(empty)}: give a command in each row, as it was held; leave "
             "joints that nobody read out (--unmeasured)"
         )
+
+    def _unnumbered(self, table: Table) -> Table:
+        """``table`` in which sensors of one number have no ``.0``."""
+        single = {n[0] for n in self.columns.sensors.values() if len(n) == 1}
+        single -= table.columns.keys()
+
+        def plain(name: str) -> str:
+            short = name.removesuffix(".0")
+            return short if short in single else name
+
+        return replace(table, columns={plain(n): c for n, c in table.columns.items()})
 
     def _without_hidden(self, table: Table) -> Table:
         """``table`` without columns of hidden joints, of which is told."""

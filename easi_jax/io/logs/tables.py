@@ -194,7 +194,7 @@ def _read_csv(path: Path) -> tuple[dict[str, list[str]], tuple[str, ...]]:
         raise UserError(f"{path}: not a CSV file ({error})") from None
     if not rows:
         raise UserError(f"{path} is empty")
-    header = [" ".join(name.split()) for name in rows.pop(0)]
+    header = [name.strip() for name in rows.pop(0)]
     if all(_is_number(name) for name in header):
         raise UserError(f"{path}: the first row must name the columns")
     if _has_index(header, rows):
@@ -250,6 +250,8 @@ def _npz_column(archive: np.lib.npyio.NpzFile, name: str) -> np.ndarray | str:
         return "something that is no array"
     if array.ndim != 1:
         return f"a {array.ndim}-dimensional array"
+    if array.dtype.kind == "S":
+        return np.char.decode(array, "utf-8")
     if array.dtype.kind not in "biufU":
         return f"values of type {array.dtype}"
     return array
@@ -292,11 +294,19 @@ def _parquet_column(column: pyarrow.ChunkedArray) -> np.ndarray | str:
     if types.is_dictionary(kind):
         kind = kind.value_type
         column = column.cast(kind)
-    if types.is_string(kind) or types.is_large_string(kind):
+    if types.is_binary(kind) or types.is_large_binary(kind):
+        kind = pyarrow.string()
+        column = column.cast(kind)
+    texts = types.is_string, types.is_large_string, types.is_string_view
+    if any(is_text(kind) for is_text in texts):
         return np.array([text or "" for text in column.to_pylist()], dtype=np.str_)
+    if types.is_integer(kind) and not column.null_count:
+        return column.to_numpy()  # as labels of runs they have no room in a float
     if types.is_boolean(kind) or types.is_null(kind):
         column = column.cast(pyarrow.int8())
-    elif not (types.is_integer(kind) or types.is_floating(kind)):
+    elif not any(
+        of(kind) for of in (types.is_integer, types.is_floating, types.is_decimal)
+    ):
         return f"values of type {kind}"
     return column.cast(pyarrow.float64(), safe=False).to_numpy()
 

@@ -12,6 +12,7 @@ from easi_jax.data.velocity_lag import error_of_means
 from easi_jax.data.windows import lead_rows
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.analysis import Analysis
+from easi_jax.gap.recorded import with_speeds
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import engine
@@ -126,3 +127,15 @@ def test_what_velocities_are_off_by_is_told_from_noise(
     wrong = [replace(run, qvel=1.05 * run.qvel) for run in runs]
     found = error_of_means(wrong, noise, rows, late)
     np.testing.assert_allclose(found, off, rtol=0.15)
+
+
+def test_velocities_that_one_run_lacks_are_left_unused_and_it_is_said(
+    arm: tuple[mujoco.MjModel, list[Run]],
+) -> None:
+    m, runs = arm
+    fit = [replace(runs[0], qvel_measured=False), *runs[1:-1]]
+    _, _, noise, notes = with_speeds(m, fit, runs[-1:], np.ones(2 * m.nv))
+    assert len(noise) == m.nv
+    assert notes == [f"velocities are left unused, since {runs[0].name} has none"]
+    fit = [replace(run, qvel_measured=False) for run in runs]
+    assert with_speeds(m, fit[:-1], fit[-1:], np.ones(2 * m.nv))[3] == []

@@ -4,6 +4,7 @@ import io
 import os
 import zipfile
 from dataclasses import replace
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -331,6 +332,9 @@ def test_sensors_are_optional_and_may_have_gaps(tmp_path, cart):
     assert len(run) == ROWS
     np.testing.assert_array_equal(run.sensors["encoder"][:, 0], slow)
     np.testing.assert_array_equal(run.sensors["imu"][4], [0, 1, 2])
+    columns["sensor.encoder.0"] = columns.pop("sensor.encoder")  # of one number
+    (run,) = read_logs(save(tmp_path / "b.npz", columns), cart).runs
+    np.testing.assert_array_equal(run.sensors["encoder"][:, 0], slow)
     del columns["sensor.imu.2"]
     log = read_logs(save(tmp_path / "b.csv", columns), cart)
     assert "imu" not in log.runs[0].sensors
@@ -594,6 +598,40 @@ def test_empty_cells_are_non_finite(tmp_path, cart):
     nulls = table.set_column(1, "qpos.slider", [[None, *[0.0] * (ROWS - 1)]])
     pyarrow.parquet.write_table(nulls, tmp_path / "a.parquet")
     assert [len(r) for r in read_logs(tmp_path / "a.parquet", cart).runs] == [ROWS - 1]
+
+
+def test_kinds_of_columns_of_parquet_and_npz(tmp_path, cart):
+    """Long whole numbers and text of any kind as labels, decimals as numbers."""
+    columns = cart_columns()
+    large = 1_700_000_000_000_000_000 + (np.arange(ROWS) >= ROWS // 2)
+    decimals = [Decimal(f"{x:.6f}") for x in columns["qpos.pole"]]
+    text = ["a"] * (ROWS // 2) + ["b"] * (ROWS - ROWS // 2)
+    kinds = [
+        pyarrow.array(large),
+        pyarrow.array(text, pyarrow.string_view()),
+        pyarrow.array([t.encode() for t in text]),
+    ]
+    for k, label in enumerate(kinds):
+        table = pyarrow.table({**columns, "qpos.pole": decimals, "run": label})
+        path = tmp_path / f"{k}.parquet"
+        pyarrow.parquet.write_table(table, path)
+        runs = read_logs(path, cart).runs
+        assert [len(run) for run in runs] == [ROWS // 2, ROWS - ROWS // 2]
+        pole = np.concatenate([run.qpos[:, 1] for run in runs])
+        np.testing.assert_allclose(pole, columns["qpos.pole"], atol=1e-6)
+    columns["run"] = np.array([t.encode() for t in text])
+    log = read_logs(save(tmp_path / "a.npz", columns), cart)
+    assert [run.name for run in log.runs] == ["a/a", "a/b"]
+
+
+def test_names_may_have_two_spaces(tmp_path):
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><joint name="a  b"/><geom size="1"/></body>'
+        "</worldbody></mujoco>"
+    )
+    time = 0.01 * np.arange(ROWS)
+    path = save(tmp_path / "a.csv", {"time": time, " qpos.a  b ": np.sin(time)})
+    assert len(read_logs(path, model).runs[0]) == ROWS
 
 
 def test_holes(tmp_path, cart):
