@@ -127,7 +127,7 @@ class Analysis:
                 f"{lead_rows(dt) * dt:.3g} s before it: record more, or shorten "
                 "--horizon"
             )
-        seen = filled(reported)
+        seen, lengths = filled(reported), self._cut(cut, fit)
         self.predictor = Predictor(
             mj_model,
             space,
@@ -139,6 +139,7 @@ class Analysis:
             wait,
             sensors,
             speeds=len(noise) > mj_model.nv,
+            length=max(lengths, default=0),
         )
         self.data = recorded(
             mj_model,
@@ -153,7 +154,7 @@ class Analysis:
         self.step = dt / self.predictor.simulator.substeps
         steps = self.predictor.steps
         self.reported = self._fitting(self.predictor, reported, steps)
-        lengths = self._lengths(cut, fit, steps)
+        lengths = self._lengths(lengths)
         middle = window_steps(dt, _MIDDLE) + self.data.lead
         settles = max(
             (k for k, f in enumerate(lengths) if f.steps <= middle), default=0
@@ -165,24 +166,29 @@ class Analysis:
         own, given = range(self.space.size), (self.data, predictor, windows, steps)
         return Fitting(*given, self._ignored, own, self._progress)
 
-    def _lengths(
-        self, cut: "WindowsOf", fit: Sequence[Run], reported: int
-    ) -> list[Fitting]:
-        """Windows that fits see, the shortest first; of the lengths that no run has
+    def _cut(self, cut: "WindowsOf", fit: Sequence[Run]) -> dict[int, WindowSet]:
+        """Windows that fits see, by their length; of the lengths that no run has
         windows of, none."""
-        dt, lead, found = fit[0].dt, self.data.lead, {}
+        found = {}
         for seconds, few in ((_MIDDLE, _FITTED[0]), (_LONG, _LONGEST)):
-            steps = window_steps(dt, seconds) + lead
-            if steps == reported:
-                found[steps] = self.reported
-                continue
             windows = cut.some(fit, seconds, few)
             if windows is not None:
+                found[windows.ctrl.shape[1]] = windows
+        return found
+
+    def _lengths(self, cut: Mapping[int, WindowSet]) -> list[Fitting]:
+        """Fits of all lengths, the shortest first."""
+        data, reported, found = self.data, self.reported.steps, {}
+        for steps, windows in cut.items():
+            if steps == reported:
+                found[steps] = self.reported
+            else:
                 predictor = self.predictor.on(filled(windows))
                 found[steps] = self._fitting(predictor, windows, steps)
         if not found:
             return [self.reported]
-        least, first = window_steps(dt, _SHORT) + lead, found[min(found)]
+        first = found[min(found)]
+        least = window_steps(data.dt, _SHORT) + data.lead
         if least < first.steps:
             given = first.predictor, first.windows, least
             found[least] = self._fitting(*given)

@@ -117,7 +117,7 @@ class LinearResponse:
     def _program(self, fun: Any, left_out: tuple[str, ...]) -> Any:
         """``fun`` of this module, its first argument shared out among devices; kept
         with those of the predictor."""
-        p, key = self.predictor, (fun, left_out, self.rows)
+        p, key = self.predictor, (fun, left_out, self.rows, self.predictor.steps)
         if key not in p.programs:
 
             def whole(sharded: Any, *shared: Any) -> Any:

@@ -144,6 +144,7 @@ class Predictor:
         channels: numbers that are compared: ``nv + N``, and velocities.
         largest: motion that was measured in a window, ``(channels,)``.
         steps: control steps of a window, those before its start counted.
+        length: those that programs have room for; what is longer is filled up.
         data: the windows in blocks, on all devices of ``mesh``.
         programs: others' that were compiled for windows like these.
         size: of a start state: positions, velocities, activations, ``2 nv + na``.
@@ -162,10 +163,12 @@ class Predictor:
         sensors: Sensors = NO_SENSORS,
         engine: Engine | None = None,
         speeds: bool = False,
+        length: int = 0,
     ) -> None:
         """``fixed``: what the machine has and MJCF cannot say, by address; ``logged``:
         states of the log that the windows are from; ``wait`` shows what compiles;
-        ``sensors``: that ``windows.sensed`` are of."""
+        ``sensors``: that ``windows.sensed`` are of; ``length``: control steps of the
+        longest windows that will be predicted, if longer than ``windows``."""
         self._wait, self.speeds = wait, speeds
         self.simulator = Simulator(
             opened(mj_model), space, dt, fixed=fixed, logged=logged, engine=engine
@@ -211,21 +214,26 @@ class Predictor:
             if not left_out or told:
                 self._without[left_out] = np.array(told, int)
         self._without = dict(reversed(self._without.items()))
-        self._take(windows)
+        self._take(windows, length)
 
-    def _take(self, windows: WindowSet) -> None:
+    def _take(self, windows: WindowSet, length: int = 0) -> None:
         """Predicts these windows, by programs of their own."""
         self.windows, self.steps = windows, windows.ctrl.shape[1]
-        moved = np.abs(self._unwrapped(windows.read)).max((0, 1))
-        moved = np.where(self.wrapped, np.minimum(moved, np.pi), moved)
-        span = np.ptp(self._sensors_of(windows.sensed), axis=(0, 1))
-        fastest = np.abs(windows.read_speed).max((0, 1))
-        self.largest = np.concatenate([moved, span, fastest])[: self.channels]
+        self.length = max(self.steps, length)
+        self.largest = self._largest(windows)
         # By powers of two, so that the program of one log often serves the next.
         self._room = 1 << (self.blocks - 1).bit_length()
         self.data = self._placed(windows)
         self._compiled: dict[tuple[tuple[str, ...], int], Callable[[], Any]] = {}
         self.programs: dict[Any, Any] = {}
+
+    def _largest(self, windows: WindowSet) -> np.ndarray:
+        """Motion that was measured in a window, ``(channels,)``."""
+        moved = np.abs(self._unwrapped(windows.read)).max((0, 1))
+        moved = np.where(self.wrapped, np.minimum(moved, np.pi), moved)
+        span = np.ptp(self._sensors_of(windows.sensed), axis=(0, 1))
+        fastest = np.abs(windows.read_speed).max((0, 1))
+        return np.concatenate([moved, span, fastest])[: self.channels]
 
     @property
     def _compared(self) -> np.ndarray:
@@ -255,9 +263,16 @@ class Predictor:
             return jax.device_put(np.asarray(x, np.float32).reshape(shape), whole)
 
         given = {f: getattr(padded, f) for f in Window._fields}
-        given |= {"read": read, "sensed": sensed, "known": known}
+        more = self.length - windows.ctrl.shape[1]
+        given |= {
+            "ctrl": np.append(padded.ctrl, np.repeat(padded.last[:, None], more, 1), 1),
+            "read": _filled(read, more),
+            "read_speed": _filled(padded.read_speed, more),
+            "sensed": _filled(sensed, more),
+            "known": _filled(known, more),
+        }
         if not self.speeds:
-            given["read_speed"] = padded.read_speed[..., :0]
+            given["read_speed"] = given["read_speed"][..., :0]
         return Window(**{name: blocks(x) for name, x in given.items()})
 
     def _sensors_of(self, each: np.ndarray, planned: float = 0.0) -> np.ndarray:
@@ -324,16 +339,20 @@ class Predictor:
 
     def on(self, windows: WindowSet) -> "Predictor":
         """The same predictions of other windows: by the programs that are compiled
-        where those are as long, with as much before and after their starts, and no
+        where those are no longer, with as much before and after their starts, and no
         more than `capacity`."""
-        parts = ("ctrl", "past", "speed")
-        mine = [getattr(self.windows, f).shape[1:] for f in parts]
-        theirs = [getattr(windows, f).shape[1:] for f in parts]
-        other = copy.copy(self)
-        if mine != theirs or len(windows) > self.capacity:
-            other._take(windows)
+        mine, theirs = (
+            [getattr(w, f).shape[1:] for f in ("past", "speed")]
+            for w in (self.windows, windows)
+        )
+        other, steps = copy.copy(self), windows.ctrl.shape[1]
+        fits = steps <= self.length and len(windows) <= self.capacity
+        if mine != theirs or not fits:
+            other._take(windows, self.length)
         else:
-            other.windows, other.data = windows, other._placed(windows)
+            other.windows, other.steps = windows, steps
+            other.largest = other._largest(windows)
+            other.data = other._placed(windows)
         return other
 
     def model(
@@ -385,7 +404,7 @@ class Predictor:
                 np.zeros((batch, len(self.neutral)), np.float32),
                 np.zeros(batch, np.int32),
                 np.zeros((batch, BLOCK, self.size), np.float32),
-                np.int32(self.steps),
+                np.int32(self.length),
             )
             for out in self._without if self.simulator.engine == "mjx" else [left_out]:
                 # Play is for few predictions.
@@ -426,7 +445,7 @@ class Predictor:
     def _window(
         self, model: Model, window: Window, moved: jax.Array, steps: jax.Array
     ) -> jax.Array:
-        """Readings less measurements at each row, ``(H + 1, nv + 2 N)``: those of
+        """Readings less measurements at each row, ``(length + 1, nv + 2 N)``: those of
         sensors where a row's step begins, then where the step before it ends; zero in
         rows in which a sensor was not read. With ``speeds`` then those of velocities,
         ``nv`` more; zero after the rows that a start is fitted to. Rows after the
@@ -491,12 +510,12 @@ class Predictor:
     def _sensor_errors(
         self, window: Window, early: jax.Array, readings: jax.Array
     ) -> jax.Array:
-        """Of `_window`, those of sensors, ``(H + 1, 2 N)``, from the simulated
-        ``readings (H + 1, 2, N)``."""
+        """Of `_window`, those of sensors, ``(length + 1, 2 N)``, from the simulated
+        ``readings (length + 1, 2, N)``."""
         start = len(window.speed) // 2
         first = start - early / self.simulator.dt
         row, after = _ahead(first)
-        row += jnp.arange(self.steps + 1)
+        row += jnp.arange(self.length + 1)
         read = jnp.broadcast_to(row[:, None], (len(row), len(self.sensors)))
         known = _between(window.known, read) > 0
         read = _between(window.sensed, read)
@@ -559,11 +578,12 @@ class Predictor:
     ) -> tuple[jax.Array, jax.Array, Physics, jax.Array]:
         """Where a window begins ``(nq,)``, what its joints are compared with ``(H + 1,
         nv)``, its first state, and what reaches the actuators in the physics steps of
-        each row after it, ``(H, substeps, nu)``, one row more with sensors."""
+        each of the H rows after it, ``(H, substeps, nu)``, one more with sensors; H is
+        `length`."""
         w, simulator, e, nv = window, self.simulator, model.effects, self.nv
         assert e is not None
         early, now = self._when(w, e)
-        row = _ahead(now)[0] + jnp.arange(self.steps + 1)[:, None]
+        row = _ahead(now)[0] + jnp.arange(self.length + 1)[:, None]
         read = _between(w.read, row)
         first, v = (_between(x, now[None])[0] for x in (w.read, w.speed))
         q, v = self._true(model, w, simulator.move(w.start_qpos, first - e.bias), v)
@@ -679,7 +699,7 @@ class Predictor:
         columns = enumerate(self.layout.columns, self.own)
         late = [i for i, c in columns if c.field == "late"]
         more = bool(self.sensors) + 2 * bool(vectors[:, late].any())
-        return np.int32(min(rows - 1 + more, self.steps + bool(self.sensors)))
+        return np.int32(min(rows - 1 + more, self.length + bool(self.sensors)))
 
     def by_program(
         self, vectors: np.ndarray
@@ -709,6 +729,11 @@ class Predictor:
     def count(self, windows: np.ndarray | None) -> int:
         """Number of windows in some blocks; all where None."""
         return len(self.windows) if windows is None else len(windows) * BLOCK
+
+
+def _filled(x: np.ndarray, rows: int) -> np.ndarray:
+    """``x (W, T, n)`` with its last row so many more times."""
+    return np.append(x, np.repeat(x[:, -1:], rows, 1), 1)
 
 
 def _between(x: jax.Array, row: jax.Array) -> jax.Array:

@@ -76,3 +76,29 @@ def test_first_rows_alone_are_those_of_the_whole(how: Engine) -> None:
     for rows in (start_rows(DT), p.steps):
         alone = p.errors(vectors, rows=rows)
         np.testing.assert_allclose(alone, whole[:, :, :rows], atol=2e-6)
+
+
+@pytest.mark.parametrize("how", ["mjx", "mujoco"])
+def test_windows_of_every_length_go_through_one_program(how: Engine) -> None:
+    m = mujoco.MjModel.from_xml_string(ARM.format(""))
+    run = recorded(m, (0.0,))
+    layout = Layout(m, places(m, scales_of(m, [run])))
+    short, long = (window_set(m, [run], s, 0.1) for s in (0.2, 0.6))
+    assert short is not None and long is not None
+    given, late = (m, ParameterSpace(()), layout), [c.field for c in layout.columns]
+    with engine.using(how):
+        alone = Predictor(*given, short, DT)
+        p = Predictor(*given, short, DT, length=long.ctrl.shape[1])
+    vectors = np.repeat(alone.neutral[None], 2, 0)
+    vectors[1, late.index("late")] = 0.013
+    errors, whole = p.errors(vectors), alone.errors(vectors)
+    assert errors.shape == whole.shape
+    # Where readings are late, rows beyond the last are simulated, not extrapolated.
+    np.testing.assert_allclose(errors[0], whole[0], atol=2e-6)
+    np.testing.assert_allclose(errors[1, :, :-2], whole[1, :, :-2], atol=2e-6)
+    more = p.on(long.take(np.arange(8)))
+    assert more._compiled is p._compiled and more.steps > p.steps
+    alone = alone.on(long.take(np.arange(8)))
+    assert alone._compiled is not p._compiled
+    np.testing.assert_allclose(more.errors(vectors), alone.errors(vectors), atol=2e-5)
+    np.testing.assert_array_equal(more.largest, alone.largest)
