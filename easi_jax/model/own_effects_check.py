@@ -6,8 +6,11 @@ neutral numbers it changes nothing; at others it gives finite numbers for joints
 actuators that the model has; and it does not take longer than what it is added to.
 """
 
+import contextvars
+import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import Future
 from typing import Any
 
 import jax
@@ -22,6 +25,7 @@ from easi_jax.model.effects import Effects
 from easi_jax.model.own_laws import Law
 
 _MOST_SECONDS = 1.0  # of one call as Python, or of all calls compiled
+_PATIENCE = 10.0  # s, with a first call
 _STATES = 256  # in the compiled call
 _NEAR = 1e-4  # of the largest: rounding of single precision, compiled or not
 _SIZES = 0.3, 0.7  # of the range of each number, where a law is tried
@@ -111,13 +115,39 @@ class _Checked:
                     self._refuse(
                         f'"{name}" is no {kind} of the model{nearest(name, self.known)}'
                     )
-                shape = jnp.shape(x)
+                shape = None if x is None or isinstance(x, str) else jnp.shape(x)
+                real = shape is not None and not jnp.iscomplexobj(x)
+                if not real:
+                    self._refuse(f'"{name}" gets {x!r:.40}, which is no real number')
                 if shape:
                     self._refuse(f'"{name}" gets shape {shape}, not a single number')
                 numbers.append(jnp.asarray(x, jnp.float32) - self.unchanged(at, name))
         if not numbers:
             self._refuse("it returns nothing")
         return jnp.stack(numbers)
+
+    def _ended(self, *args: Any) -> jax.Array:
+        """`_call`, of which nobody knows yet whether it ends."""
+        ended: Future[jax.Array] = Future()
+
+        def called() -> None:
+            try:
+                ended.set_result(self._call(*args))
+            except BaseException as error:
+                ended.set_exception(error)
+
+        context = contextvars.copy_context()
+        threading.Thread(target=context.run, args=(called,), daemon=True).start()
+        try:
+            return ended.result(_PATIENCE)
+        except TimeoutError:
+            if ended.done():
+                raise
+            self._refuse(
+                f"it has not returned after {_PATIENCE:g} s, and a fit calls it "
+                "millions of times; is there a loop without end?"
+            )
+            raise
 
     def _tried(self, function: Any, *args: Any) -> Any:
         try:
@@ -138,7 +168,7 @@ class _Checked:
         # As jax's, which divide by zero without a word, as in a program.
         one = tuple(jnp.asarray(x[0]) for x in self.states)
         given = jnp.asarray(known)
-        first = np.asarray(self._tried(self._call, given, *one))
+        first = np.asarray(self._tried(self._ended, given, *one))
         # At the first call jax makes the operations ready.
         begin = time.perf_counter()
         second = np.asarray(self._tried(self._call, given, *one))

@@ -16,6 +16,7 @@ from easi_jax.gap.candidates import places
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.io.models.effects_file import parsed_effects
 from easi_jax.io.models.own_effects_file import read_all, read_own_effects
+from easi_jax.model import own_effects_check
 from easi_jax.model.effect_catalog import CATALOG, Scales
 from easi_jax.model.effect_numbers import EFFECT_TABLE, NUMBERS, OWN_LAWS
 from easi_jax.model.found_effects import joined
@@ -202,6 +203,9 @@ TAIL = "\nX = OwnEffect('x', '{a}', (Number('a', '1', 0.0, 1.0),), force=f, on='
         ("def f(now, p):\n    time.sleep(1.2)\n    return p.a", "quicker"),
         ("def f(now, p):\n    return p.a if now.time > 1 else 0.0", "jnp.where"),
         ("def f(now, p):\n    return {}", "nothing"),
+        ("def f(now, p):\n    p.a", "None, which is no real number"),
+        ("def f(now, p):\n    return '0.1'", "'0.1', which is no real number"),
+        ("def f(now, p):\n    return {'elbow': 1j * p.a}", "no real number"),
     ],
 )
 def test_what_cannot_be_believed_is_refused(
@@ -215,6 +219,22 @@ def test_what_cannot_be_believed_is_refused(
     ):
         check_own_effects(arm)
     assert "mine.py, line " in str(told.value)
+
+
+def test_a_function_that_never_ends_is_refused(
+    arm: mujoco.MjModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(own_effects_check, "_PATIENCE", 0.5)
+    path = tmp_path / "mine.py"
+    body = "def f(now, p):\n    while not seen:\n        time.sleep(0.05)"
+    path.write_text(HEAD + body + TAIL)
+    (effect,) = read_own_effects(path)
+    with (
+        registered([effect]),
+        pytest.raises(UserError, match=r"mine.py, line \d+: .*loop without end"),
+    ):
+        check_own_effects(arm)
+    effect.force.__globals__["seen"].append(1)  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(
