@@ -5,10 +5,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from benchmarks.circles import RADII, STEPS, Circles, circle, off_path, played
 from easi_jax.errors import UserError
+from easi_jax.rl import judge as judging
 from easi_jax.rl.config import EssInfoGailConfig, PaperEssInfoGailConfig, PpoConfig
 from easi_jax.rl.demonstrations import Demonstrations, demonstrations_of
 from easi_jax.rl.ess_infogail import Coded, Codes, EssInfoGail, relaxed
@@ -194,6 +196,101 @@ def test_what_does_not_count_is_not_learned_from() -> None:
         for windows in (noise, wild)
     ]
     jax.tree.map(np.testing.assert_array_equal, *found)
+
+
+COSTS = ("real_cost", "gradient_penalty", "logit_cost", "weight_cost", "code_cost")
+SKILL_COSTS = ("conditional_cost", "marginal_cost", "prior_cost")
+
+
+@pytest.mark.parametrize("which", COSTS)
+def test_each_part_of_the_judges_loss(which: str) -> None:
+    """Binary cross-entropy, the slope at demonstrations (Mescheder et al., 2018),
+    squares of weights, the error of the code: each alone, with half of the windows
+    counting."""
+    alone = {**dict.fromkeys(COSTS, 0.0), which: 0.7}
+    judge = judge_of(skills=2, continuous=True, **alone)
+    params = judge.init(jax.random.key(0)).params
+    rng = np.random.default_rng(1)
+    real, n = judge.real[:20], judge.real.shape[1]
+    windows = jnp.asarray(rng.normal(size=(30, n)), jnp.float32)
+    code, counts = rng.uniform(size=30), np.arange(30) % 2
+    fake = Batch(windows, jnp.asarray(code), jnp.asarray(counts, jnp.float32))
+    got = float(judge._real_loss(params, real, fake)[0])
+
+    def read(x: Any) -> Any:
+        return jax.tree.map(lambda a: np.asarray(a, float), judge.read(params, x))
+
+    some, kernels = counts > 0, [x["kernel"] for x in params["params"].values()]
+    step = 1e-2 * np.eye(n)
+    slope = [(read(real + e).real - read(real - e).real) / 2e-2 for e in step]
+    want = {
+        "real_cost": np.log1p(np.exp(-read(real).real)).mean()
+        + np.log1p(np.exp(read(windows).real))[some].mean(),
+        "gradient_penalty": np.square(slope).sum(0).mean(),
+        "logit_cost": np.square(params["params"]["real"]["kernel"]).sum(),
+        "weight_cost": sum(np.square(k).sum() for k in kernels),
+        "code_cost": ((read(windows).code - code) ** 2)[some].mean(),
+    }
+    assert got == pytest.approx(0.7 * want[which], rel=2e-3)
+
+
+@pytest.mark.parametrize("which", SKILL_COSTS)
+def test_each_part_of_the_skills_loss(which: str) -> None:
+    """Regularized information maximization (Krause et al., 2010): sure of each window,
+    all skills alike over them, and near to the prior; by the ramp."""
+    costs = {**dict.fromkeys((*SKILL_COSTS, "label_cost"), 0.0), which: 0.7}
+    judge = judge_of(skills=3, given=circles((0.5, 1.0, 2.0), 20, 1), **costs)
+    params, prior = judge.init(jax.random.key(0)).params, np.array([0.6, 0.3, 0.1])
+    given = judge.real, judge.labelled, judge.labels, jnp.asarray(prior)
+    got, mean = judge._skill_loss(params, *given, jnp.asarray(0.25))
+    logits = np.asarray(judge.read(params, judge.real).skill, float)
+    q = np.exp(logits) / np.exp(logits).sum(1, keepdims=True)
+    np.testing.assert_allclose(mean, q.mean(0), rtol=1e-5)
+    want = {
+        "conditional_cost": -(q * np.log(q)).sum(1).mean(),
+        "marginal_cost": (q.mean(0) * np.log(q.mean(0))).sum(),
+        "prior_cost": -(q.mean(0) * np.log(prior)).sum(),
+    }
+    assert float(got) == pytest.approx(0.25 * 0.7 * want[which], rel=1e-4)
+
+
+@pytest.mark.parametrize("twice", [False, True])
+def test_steps_of_a_shared_trunk(twice: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One step down the sum of both losses; or two, each with an optimizer of its
+    own and the second from where the first led."""
+    monkeypatch.setattr(judging, "_drawn", lambda key, n, of: jnp.arange(n) % of)
+    judge = judge_of(skills=2, shared_trunk_twice=twice, judge_updates=1)
+    state, c = judge.init(jax.random.key(0)), judge.config
+    n = c.judge_batch
+    windows = jax.random.normal(jax.random.key(5), (n, judge.real.shape[1]))
+    fake = Batch(windows, jnp.zeros(n), jnp.ones(n))
+    got, _ = judge.updates(state, fake, jax.random.key(1), 0.5, 1e-3)
+
+    def taken(x: jax.Array) -> jax.Array:
+        return x[jnp.arange(n) % len(x)]
+
+    labelled = (taken(x) for x in (judge.labelled, judge.labels))
+    given = taken(judge.unlabelled), *labelled, jnp.full(2, 0.5), 0.5
+
+    def judged(p: Any) -> Any:
+        return judge._real_loss(p, taken(judge.real), fake)[0]
+
+    def skilled(p: Any) -> Any:
+        return judge._skill_loss(p, *given)[0]
+
+    def step(p: Any, loss: Any, rate: float) -> Any:
+        own = optax.adamw(rate, weight_decay=c.judge_decay)
+        change, _ = own.update(jax.grad(loss)(p), own.init(p), p)
+        return optax.apply_updates(p, change)
+
+    if twice:
+        want = step(state.params, judged, 1e-3)
+        want = step(want, skilled, c.skill_learning_rate)
+    else:
+        want = step(state.params, lambda p: judged(p) + skilled(p), 1e-3)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), got.params, want
+    )
 
 
 def test_rewards_are_of_their_forms() -> None:
