@@ -64,7 +64,8 @@ class TrainingOptions:
     """Control steps of each training; the robot's preset where not given."""
     algorithm: str | None = None
     """sac, ppo, or ess_infogail, which imitates --demonstrations (ess_infogail_paper:
-    as published, defects included); the robot's own where not given."""
+    as published, defects included; sac_paper: the paper's networks, rates and steps,
+    hours of two cores); the robot's own where not given."""
     demonstrations: Path | None = None
     """Log of motion to imitate, made by train.demonstrate or recorded: a run is an
     episode, and SKILL:NAME as its name labels it."""

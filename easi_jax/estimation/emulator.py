@@ -39,6 +39,9 @@ _OUTLIER = 4.0  # standard deviations
 _BLOCKS = 20  # of the log, whose scatter says how sure the fit is
 BEYOND = 0.5  # of the initial range, that a round may lie outside of it
 _LEAST = 0.1  # share of what an information says, that scores scatter
+# Times what blocks of time scatter, that channels surely scatter more: 5 % of
+# chi-squares of two numbers are beyond.
+_APART = 3.0
 _UNITS = 2  # rounds in which a fit learns how much it leaves
 PRIOR = 12.0  # information of a uniform initial range, unit coordinates
 
@@ -154,21 +157,31 @@ class _Emulator:
             rest = r - np.einsum("kac,a->kc", both, step, optimize=True)
             excess = float((counts @ rest**2).sum() / (counts.sum() * r.shape[1]))
             excess = max(excess, 1e-12)
-        scatter = _scattered(score / excess, information / excess)
+        of_channels = np.einsum("kac,kc,k->ca", both, rest, counts, optimize=True)
+        scores = score / excess, of_channels @ share.T / excess
+        scatter = _scattered(*scores, information / excess)
         cov = inverse @ (scatter + prior) @ inverse
         return _Fit(self.middle + step, cov, excess)
 
 
-def _scattered(score: np.ndarray, information: np.ndarray) -> np.ndarray:
+def _scattered(
+    score: np.ndarray, of_channels: np.ndarray, information: np.ndarray
+) -> np.ndarray:
     """Covariance ``(n, n)`` of the sum of scores ``(K, n)`` of pieces: along each
     principal direction of their ``information`` as much as sums over blocks of the log
-    scatter. That is less than it where noise of readings is what is left, since what a
-    row is off by the next one takes back."""
+    scatter, or those ``of_channels (C, n)`` at the fit where these scatter surely more.
+
+    Blocks scatter less than the information where noise of readings is what is left,
+    since what a row is off by the next one takes back. Channels disagree where the
+    model errs the same way all the time, which blocks do not show.
+    """
     values, vectors = np.linalg.eigh(information)
     count = min(_BLOCKS, len(score))
     blocks = np.array([b.sum(0) for b in np.array_split(score, count)])
     along = ((blocks - blocks.mean(0)) @ vectors).var(0, ddof=1) * count
-    return (vectors * np.maximum(along, _LEAST * values)) @ vectors.T
+    along = np.maximum(along, _LEAST * values)
+    apart = ((of_channels @ vectors) ** 2).sum(0)
+    return (vectors * np.where(apart > _APART * along, apart, along)) @ vectors.T
 
 
 def matched(

@@ -102,6 +102,11 @@ class SacConfig:
 
 
 @dataclass(frozen=True)
+class PaperSacConfig(SacConfig):
+    """SAC as the paper's reference trains it: the values of `SacConfig`."""
+
+
+@dataclass(frozen=True)
 class PpoConfig:
     """Proximal policy optimization. Raises UserError for values that cannot work."""
 

@@ -13,6 +13,7 @@ from easi_jax.errors import UserError, nearest
 from easi_jax.rl.config import (
     EssInfoGailConfig,
     PaperEssInfoGailConfig,
+    PaperSacConfig,
     PpoConfig,
     SacConfig,
 )
@@ -64,6 +65,8 @@ _IMITATION: dict[str, TrainingConfig] = {
     "ess_infogail": _ESS,
     "ess_infogail_paper": _PAPER_ESS,
 }
+# Control steps of the reference; those of `SacConfig` for others.
+_PAPER_STEPS = {"ant": 10_000_000, "ballbalance": 6_000_000}
 _GENERAL: dict[str, TrainingConfig] = {"sac": _SAC, "ppo": _PPO}
 PRESETS: dict[str, dict[str, TrainingConfig]] = {
     "cartpole": _GENERAL,
@@ -107,7 +110,9 @@ def training_preset(env: Any, algorithm: str | None = None) -> TrainingConfig:
         UserError: no algorithm of that name.
     """
     own = getattr(env, "training", None) or PRESETS.get(env.name, _GENERAL)
-    mine = {**own, **{k: v for k, v in _IMITATION.items() if k not in own}}
+    steps = _PAPER_STEPS.get(env.name, PaperSacConfig.env_steps)
+    more = {**_IMITATION, "sac_paper": PaperSacConfig(env_steps=steps)}
+    mine = {**own, **{k: v for k, v in more.items() if k not in own}}
     if algorithm is None:
         return next(iter(mine.values()))
     if algorithm not in mine:
@@ -174,6 +179,7 @@ _MOST_WINDOWS = 100_000
 
 _NAMES: dict[type[TrainingConfig], str] = {
     SacConfig: "sac",
+    PaperSacConfig: "sac_paper",
     PpoConfig: "ppo",
     EssInfoGailConfig: "ess_infogail",
     PaperEssInfoGailConfig: "ess_infogail_paper",

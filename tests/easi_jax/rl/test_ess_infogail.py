@@ -453,7 +453,7 @@ def test_settings_that_cannot_work_are_refused() -> None:
 
 
 def test_presets_have_names() -> None:
-    for name in ("ess_infogail", "ess_infogail_paper", "ppo", "sac"):
+    for name in ("ess_infogail", "ess_infogail_paper", "ppo", "sac", "sac_paper"):
         assert algorithm_of(training_preset(Circles(), name)) == name
     imitates = training_preset(Circles(), "ess_infogail")
     assert isinstance(imitates, EssInfoGailConfig)
