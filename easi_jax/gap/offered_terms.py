@@ -20,7 +20,7 @@ _WIDTH = 0.005  # of the speeds, over which a sign turns
 _BENDS = 0.003, 0.01, 0.03, 0.1  # of the range, that bristles bend by
 _LAGS = 0.05, 0.2, 1.0  # s
 _WARMS = 3.0, 10.0, 30.0  # s
-_PAIRED = 6  # joints, of which all pairs are tried
+_PAIRED = 6  # joints, of which all pairs are tried; of more those next to each other
 # How many more parts than a number times one power: what says as much with fewer comes
 # first.
 _PLAIN, _TWO, _THREE = 1, 2, 3
@@ -47,19 +47,43 @@ def offered(m: mujoco.MjModel, scales: Scales) -> list[Offered]:
     found = [t for name in joints for t in _along(m, scales, name)]
     for a in range(m.nu):
         found += _of_drive(m, scales, a)
-    of_kind = [
-        [name for name, j in joints.items() if is_hinge(m, j) == hinge]
-        for hinge in (True, False)
-    ]
-    for names in of_kind:
-        if len(names) <= _PAIRED:
-            for pair in itertools.combinations(names, 2):
-                for share in (1.0, -1.0):
-                    found += _along_both(m, scales, pair, share)
-    for one, other in itertools.permutations(joints, 2):
-        if len(joints) <= _PAIRED:
-            found += _of_other(m, scales, one, other)
+    every = itertools.combinations(joints, 2)
+    few = len(joints) <= _PAIRED
+    pairs = [p for p in every if few or _adjoin(m, *(joints[n] for n in p))]
+    for pair in pairs:
+        one, other = (is_hinge(m, joints[name]) for name in pair)
+        for share in (1.0, -1.0) if one == other else ():
+            found += _along_both(m, scales, pair, share)
+    drives = {name: a for a in range(m.nu) if (name := _driven(m, a))}
+    for pair in pairs:
+        for at, other in (pair, pair[::-1]):
+            found += _of_other(m, scales, at, other)
+            if other in drives:
+                found += _of_others_drive(m, scales, at, drives[other])
     return found
+
+
+def _adjoin(m: mujoco.MjModel, one: int, other: int) -> bool:
+    """Whether no joint is between two."""
+
+    def moved_by(body: int) -> int:
+        """The next body from it on towards the world that a joint moves."""
+        while body and not m.body_jntnum[body]:
+            body = int(m.body_parentid[body])
+        return body
+
+    a, b = (int(m.jnt_bodyid[j]) for j in (one, other))
+    above = [moved_by(int(m.body_parentid[body])) for body in (a, b)]
+    return a == b or above[0] == b or above[1] == a
+
+
+def _driven(m: mujoco.MjModel, a: int) -> str:
+    """The joint that an actuator moves; nothing where one of the two has no name, or it
+    moves something else."""
+    if m.actuator_trntype[a] != mujoco.mjtTrn.mjTRN_JOINT or not m.actuator(a).name:
+        return ""
+    j = int(m.actuator_trnid[a, 0])
+    return m.joint(j).name if j in scalar_dofs(m) else ""
 
 
 def _dof(m: mujoco.MjModel, name: str) -> int:
@@ -102,12 +126,9 @@ def _along(m: mujoco.MjModel, s: Scales, name: str) -> Iterator[Offered]:
 
 def _of_drive(m: mujoco.MjModel, s: Scales, a: int) -> Iterator[Offered]:
     """Of a command, at the joint that it moves."""
-    if m.actuator_trntype[a] != mujoco.mjtTrn.mjTRN_JOINT or not m.actuator(a).name:
+    name = _driven(m, a)
+    if not name:
         return
-    j = int(m.actuator_trnid[a, 0])
-    if j not in scalar_dofs(m) or not m.joint(j).name:
-        return
-    name = m.joint(j).name
     u = name_of("ctrl", m.actuator(a).name)
     q, v = name_of("qpos", name), name_of("qvel", name)
     for text, parts in (
@@ -149,5 +170,17 @@ def _of_other(m: mujoco.MjModel, s: Scales, at: str, other: str) -> Iterator[Off
         *((q, _PLAIN), (v, _PLAIN), (sign, _PLAIN), (f"{v}*abs({v})", _TWO)),
         *((f"{q}**2", _PLAIN), (f"{q}*{mine}", _TWO), (f"{own}*{q}", _TWO)),
         *((f"{own}*abs({q})", _TWO), (f"{name_of('qvel', at)}*{v}", _TWO)),
+    ):
+        yield Offered(((at, 1.0),), Term(text), parts)
+
+
+def _of_others_drive(
+    m: mujoco.MjModel, s: Scales, at: str, a: int
+) -> Iterator[Offered]:
+    """At one joint, of the command of another."""
+    u = name_of("ctrl", m.actuator(a).name)
+    for text, parts in (
+        *((u, _PLAIN), (f"{u}*abs({u})", _TWO), (f"abs({u})", _TWO)),
+        (f"sign({u}, {_WIDTH * s.command[a]:.3g})", _TWO),
     ):
         yield Offered(((at, 1.0),), Term(text), parts)

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -111,6 +113,38 @@ def test_laws_of_an_earlier_analysis_are_not_offered() -> None:
         given = a.m, a.space, a.data.scales
         assert not [p for p in Places(*given).known if p.startswith(name)]
         assert f"{name}@j" in Places(*given, only=[f"{name}@j"]).known
+
+
+def test_what_is_offered_between_joints() -> None:
+    """Of few joints all pairs, also with each other's commands; of many those next to
+    each other."""
+
+    def pairs(count: int) -> set[tuple[int, int]]:
+        body = ""
+        for k in reversed(range(count)):
+            body = (
+                f'<body pos="0 0 -0.1"><joint name="{k}" axis="0 1 0"/>'
+                f'<geom size="0.02"/><body><geom size="0.01"/>{body}</body></body>'
+            )
+        drive = '<motor name="m" joint="0"/>'
+        m = mujoco.MjModel.from_xml_string(
+            f"<mujoco><worldbody>{body}</worldbody><actuator>{drive}</actuator></mujoco>"
+        )
+        ones = np.ones(m.nv)
+        given = {k: ones for k in ("position", "speed", "span", "torque", "inertia")}
+        scales: Any = SimpleNamespace(**given, command=np.ones(1))
+        found, texts = set(), []
+        for t in offered(m, scales):
+            about = {int(n) for kind, n in t.term.names if kind != "ctrl"}
+            about |= {int(n) for n, _ in t.acts}
+            found |= {tuple(sorted(about))} if len(about) == 2 else set()
+            if ("ctrl", "m") in t.term.names and t.acts[0][0] == "1":
+                texts.append(t.term.text)
+        assert "ctrl.m" in texts
+        return found
+
+    assert pairs(3) == {(0, 1), (0, 2), (1, 2)}
+    assert pairs(8) == {(k, k + 1) for k in range(7)}
 
 
 def test_what_the_table_has_is_not_offered() -> None:
