@@ -78,12 +78,15 @@ class Matched:
         excess: mean square of what the emulator leaves of the log, in units of what it
             leaves of simulations; about 1 where the robot is like the model.
         lost: individuals that did not stay finite and on their feet.
+        disagree: whether channels surely ask for different values, so that what is
+            stated is widened by it.
     """
 
     mean: np.ndarray
     cov: np.ndarray
     excess: float
     lost: int
+    disagree: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,7 @@ class _Fit:
     mean: np.ndarray
     cov: np.ndarray
     excess: float
+    disagree: bool
 
 
 @dataclass(frozen=True)
@@ -159,17 +163,18 @@ class _Emulator:
             excess = max(excess, 1e-12)
         of_channels = np.einsum("kac,kc,k->ca", both, rest, counts, optimize=True)
         scores = score / excess, of_channels @ share.T / excess
-        scatter = _scattered(*scores, information / excess)
+        scatter, disagree = _scattered(*scores, information / excess)
         cov = inverse @ (scatter + prior) @ inverse
-        return _Fit(self.middle + step, cov, excess)
+        return _Fit(self.middle + step, cov, excess, disagree)
 
 
 def _scattered(
     score: np.ndarray, of_channels: np.ndarray, information: np.ndarray
-) -> np.ndarray:
+) -> tuple[np.ndarray, bool]:
     """Covariance ``(n, n)`` of the sum of scores ``(K, n)`` of pieces: along each
     principal direction of their ``information`` as much as sums over blocks of the log
-    scatter, or those ``of_channels (C, n)`` at the fit where these scatter surely more.
+    scatter, or those ``of_channels (C, n)`` at the fit where these scatter surely more;
+    and whether they do.
 
     Blocks scatter less than the information where noise of readings is what is left,
     since what a row is off by the next one takes back. Channels disagree where the
@@ -181,7 +186,8 @@ def _scattered(
     along = ((blocks - blocks.mean(0)) @ vectors).var(0, ddof=1) * count
     along = np.maximum(along, _LEAST * values)
     apart = ((of_channels @ vectors) ** 2).sum(0)
-    return (vectors * np.where(apart > _APART * along, apart, along)) @ vectors.T
+    more = apart > _APART * along
+    return (vectors * np.where(more, apart, along)) @ vectors.T, bool(more.any())
 
 
 def matched(
@@ -277,7 +283,8 @@ def _corrected(
     if len(fits) > 1:
         cov = cov + np.diag(means.var(0, ddof=1)) / len(fits)
     excess = float(np.mean([f.excess for f in fits]))
-    return Matched(np.clip(means.mean(0), *bounds), cov, excess, lost)
+    disagree = sum(f.disagree for f in fits) > len(fits) / 2
+    return Matched(np.clip(means.mean(0), *bounds), cov, excess, lost, disagree)
 
 
 def _regressed(

@@ -101,6 +101,11 @@ class Found:
             for name, at in zip(search.space.names, beyond, strict=True)
             if at
         ]
+        if self.fit.disagree:
+            notes.append(
+                "some readings ask for other values than others do, by more than their "
+                "noise: the model lacks something, and spreads are widened by it"
+            )
         if self.fit.excess > _LACKING:
             notes.append(
                 f"the log errs from its prediction by {self.fit.excess**0.5:.2g} times "

@@ -392,16 +392,18 @@ def test_export_says_what_is_wrong(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.fixture(scope="module")
-def log(chain: Path) -> Path:
-    """What the policy's robot measured where its gear is 1.2, not 2."""
-    known = load_policies(chain / "udr", env_file=ENV)
+def measured(run: Path, to: Path, mode: bool = False) -> Path:
+    """What the robot of a run's policy measured where its gear is 1.2, not 2; actions
+    are drawn, or the policy's ``mode``."""
+    known = load_policies(run, env_file=ENV)
     env = known["env"]
     policy = jax.tree.map(lambda x: x[0], known["policies"])
+
+    def chosen(obs: jax.Array, key: jax.Array) -> jax.Array:
+        return act(policy, obs, key, mode)
+
     rollout = jax.jit(
-        lambda theta, key: policy_rollout(
-            *(env, env.model(theta), lambda obs, k: act(policy, obs, k), key, 600)
-        )
+        lambda theta, key: policy_rollout(env, env.model(theta), chosen, key, 600)
     )
     seg = rollout(jnp.array([1.2, 0.1]), jax.random.key(3))
     rng = np.random.default_rng(0)
@@ -411,8 +413,13 @@ def log(chain: Path) -> Path:
         "qvel.hinge": np.asarray(seg.qvel[:, 0]) + 1e-3 * rng.standard_normal(600),
         "ctrl.motor": np.asarray(seg.ctrl[:, 0, 0]),
     }
-    np.savez(chain / "log.npz", **columns)
-    return chain / "log.npz"
+    np.savez(to, **columns)
+    return to
+
+
+@pytest.fixture(scope="module")
+def log(chain: Path) -> Path:
+    return measured(chain / "udr", chain / "log.npz")
 
 
 FROM_POLICY = (
@@ -436,6 +443,25 @@ def test_a_run_folders_policy_identifies_its_robot(chain: Path, log: Path) -> No
     written = mujoco.MjModel.from_xml_path(str(out / "export" / "model.xml"))
     assert written.actuator_gear[0, 0] == pytest.approx(gear[1], rel=1e-4)
     assert "gear" in (out / "export" / "randomization.yaml").read_text()
+
+
+def test_an_onnx_is_a_policy_too(
+    chain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its mode, as it is played on a machine: it stands still, and nothing can be told
+    of it. One of another robot is refused."""
+    command(export, chain / "udr", "--env", ENV, "--to", "onnx", "--out", tmp_path)
+    log = measured(chain / "udr", tmp_path / "log.npz", mode=True)
+    given = ("--data", log, "--policy", tmp_path / "policy.onnx")
+    settings = [x for x in FROM_POLICY if x != "--sampled"]
+    command(easi, *given, "--out", tmp_path / "run", *settings)
+    told = json.loads((tmp_path / "run" / "distribution.json").read_text())
+    assert told["seeds"]["0"]["flags"] == ["not determined"] * 2
+    assert any("gear leaves no trace" in note for note in told["notes"])
+    said = refused(
+        capsys, easi, *given, "--robot", "cartpole", "--out", tmp_path / "other"
+    )
+    assert "policy.onnx" in said
 
 
 def test_a_policy_that_did_not_send_the_logs_commands_is_told(

@@ -113,3 +113,39 @@ def test_no_individual_on_its_feet_is_no_number() -> None:
     assert np.isnan(found.mean).all() and found.lost > 0
     errors = one_row_errors(falls, np.full(3, 0.5), log, jax.random.key(0))
     assert np.isnan(errors).all()
+
+
+class TwoReadings(Springs):
+    """The mass is read by two sensors; one of them is scaled by ``gain``."""
+
+    def __init__(self, gain: float = 1.0) -> None:
+        super().__init__()
+        self.gain = gain
+
+    def read(self, unit: np.ndarray, rng: np.random.Generator, rows: int) -> Pieces:
+        p = super().read(unit, rng, rows)
+        other = unit.copy()
+        # As if the second one were on a spring that is stiffer.
+        other[:, 0] += np.log(self.gain) / np.log(4.0)
+        q = super().read(other, rng, rows)
+        before = np.concatenate([p.before, q.before], -1)
+        change = np.concatenate([p.change, q.change], -1)
+        return Pieces(before, change, p.weight)
+
+
+def test_channels_that_disagree_widen_what_is_stated() -> None:
+    """A log that errs the same way all the time, which blocks of it do not show."""
+    truth, start = np.array([0.5, 0.5, 0.5]), np.full(3, 0.5)
+    springs, told = cast(Simulations, TwoReadings()), {}
+    for gain in (1.0, 1.5):
+        p = TwoReadings(gain).read(truth[None], np.random.default_rng(3), 600)
+        log = Pieces(p.before[0], p.change[0], p.weight[0])
+        told[gain] = matched(springs, log, start, jax.random.key(0))
+    right, wrong = told[1.0], told[1.5]
+    assert wrong.disagree and not right.disagree
+    std = {k: float(np.sqrt(f.cov[0, 0])) for k, f in told.items()}
+    assert std[1.5] > 2 * std[1.0]
+    # One sensor asks for this stiffness, the other for half as much again.
+    apart = np.log(1.5) / np.log(4.0)
+    assert abs(wrong.mean[0] - truth[0] - 0.5 * apart) < 0.5 * apart
+    assert abs(wrong.mean[0] - truth[0]) < 3 * std[1.5]

@@ -17,6 +17,7 @@ from easi_jax.model.found_laws import FoundLaw, add_law, public_name
 from easi_jax.model.law_terms import Known, Term
 from easi_jax.model.own_effects import registered
 from easi_jax.model.parameters import ParameterSpace
+from easi_jax.simulation.engine import Engine
 from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.with_effects import simulator_with
 
@@ -108,15 +109,16 @@ def test_memories_follow() -> None:
     np.testing.assert_allclose(path[k], 1 - np.exp(-np.sin(t[k]) / 0.1), rtol=2e-3)
 
 
-def test_a_law_is_simulated_as_mujoco_does(m: mujoco.MjModel) -> None:
-    """Friction on the sum of two speeds, and a bristle, on native MuJoCo."""
+@pytest.mark.parametrize("how", ["mujoco", "mjx"])
+def test_a_law_is_simulated_as_mujoco_does(m: mujoco.MjModel, how: Engine) -> None:
+    """Friction on the sum of two speeds, and a bristle, by either engine."""
     law = FoundLaw(
         (("a", 1.0), ("left-wrist", 1.0)),
         (Term(f"sign({SUM}, 0.2)"), Term(f"dahl({SUM}, 0.05)")),
     )
     name = add_law(law)
     fixed = {f"effect.{name}.a.c1": -0.3, f"effect.{name}.a.c2": -0.2}
-    s = Simulator(m, ParameterSpace(()), 0.01, fixed=fixed, engine="mujoco")
+    s = Simulator(m, ParameterSpace(()), 0.01, fixed=fixed, engine=how)
     model = s.model(jnp.zeros(0))
     first = s.start(jnp.array([0.1, -0.2]), jnp.array([2.0, 1.0]), model)
 
