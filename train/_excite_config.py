@@ -44,8 +44,12 @@ class Config(EngineOptions, OwnEffectsOptions, BaseOptions):
     gap: Path | None = None
     """Results of train.gap for this model: only what those data could not tell apart
     counts."""
-    effects: tuple[str, ...] = ()
+    only: tuple[str, ...] = ()
     """Only these effects count, such as coulomb_friction; not given: all."""
+    effects: Path | None = None
+    """Effects that the machine has and the model lacks (effects.yaml of train.gap):
+    commands are tried with them; those that MJCF has no word for are named and left
+    out."""
     data: tuple[Path, ...] = ()
     """Earlier logs; sensor noise, control rate and the size of effects come from
     them."""

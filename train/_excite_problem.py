@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from easi_jax.model.effect_catalog import Scales
     from easi_jax.model.parameters import ParameterSpace
     from train._excite_config import Config
+    from train._gap_problem import GivenModel
 
 Strengths = Mapping[str, Mapping[str, float]]  # by effect, then by column
 _NOISE = 1e-3  # rad, m
@@ -70,10 +71,10 @@ def read_excite_problem(config: "Config") -> ExciteProblem:
     if not config.model:
         raise UserError("give --model M.xml (or a robot's name)")
     _check_numbers(config, LEAD)
-    check_names(config.effects)
+    check_names(config.only)
     _check_out(config)
     model = read_model(config.model, config.allow_assets, held_of(config))
-    m = model.mj_model
+    m, notes = _with_effects(config, model)
     if not m.nu:
         raise UserError(f"{config.model}: the model has no actuator to excite")
     space = (
@@ -84,7 +85,6 @@ def read_excite_problem(config: "Config") -> ExciteProblem:
     joints = {joint_name(m, j): qd for j, qd in scalar_dofs(m).items()}
     of_joint = {n: d for n, (_, d) in joints.items()}
     of_actuator = {m.actuator(a).name: a for a in range(m.nu)}
-    notes = []
     dt, noise, scales = _from_data(config, m, notes)
     if config.rate is not None:
         dt = 1.0 / config.rate
@@ -109,6 +109,37 @@ def read_excite_problem(config: "Config") -> ExciteProblem:
         strengths,
         [*notes, *more],
     )
+
+
+def _with_effects(
+    config: "Config", model: "GivenModel"
+) -> "tuple[mujoco.MjModel, list[str]]":
+    """The model with what --effects says, and notes on what MJCF cannot."""
+    import numpy as np
+
+    from easi_jax.errors import UserError
+    from easi_jax.export.mjcf import identified_model
+    from easi_jax.model.found_effects import FoundEffects, joined
+    from easi_jax.model.parameters import ParameterSpace
+    from easi_jax.simulation.simulator import Simulator
+    from train._effects import found_in, read_given
+
+    m, given = model.mj_model, read_given(config)
+    found = found_in(given.effects, str(config.effects))
+    if not found:
+        return m, []
+    if config.held_base:
+        raise UserError(
+            "--effects goes without --held-base: give a model whose base is held"
+        )
+    none = ParameterSpace(())
+    joined(m, none, found)  # refuses what the model has no place for
+    _, own = joined(m, none, FoundEffects(own=found.own))
+    machine = Simulator(m, none, m.opt.timestep, fixed=own)
+    with_them = identified_model(model.source, machine, np.zeros(0), found.physical)
+    left = ", ".join(with_them.left)
+    told = f"not in the model that commands are tried with: {left}"
+    return with_them.model, [told] if left else []
 
 
 def _noise(

@@ -30,7 +30,7 @@ def run(config: Config) -> None:
         tests,
         problem.noise,
         config.horizon,
-        config.effects,
+        config.only,
         problem.pairs,
         problem.strengths,
         problem.scales,

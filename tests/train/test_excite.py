@@ -25,9 +25,16 @@ XML = """
   <actuator><motor name="motor" joint="hinge" ctrlrange="-2 2"/></actuator>
 </mujoco>
 """
+FOUND = """
+effects:
+- {effect: coulomb_friction, at: hinge, kind: joint, columns: {coulomb: 0.15}}
+- {effect: constant_force, at: hinge, kind: joint, columns: {constant: 0.02}}
+refitted:
+- {address: joint.hinge.damping, value: 0.08}
+"""
 FEW = (
     *("--horizon", "0.1"),
-    *("--effects", "armature", "coulomb_friction", "actuator_delay"),
+    *("--only", "armature", "coulomb_friction", "actuator_delay"),
 )
 
 
@@ -39,6 +46,10 @@ def run(*args: object) -> None:
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("robot") / "rod.xml"
     path.write_text(XML)
+    entry = "effects: [{{effect: {}, at: {}, kind: joint, columns: {{{}}}}}]\n"
+    other = entry.format("coulomb_friction", "knee", "coulomb: 0.1")
+    (path.parent / "other.yaml").write_text(other)
+    (path.parent / "found.yaml").write_text(FOUND)
     return path
 
 
@@ -64,6 +75,25 @@ def test_the_commands_are_a_log_that_mujoco_repeats(robot: Path, results: Path) 
     np.testing.assert_allclose(np.array(seen), told.qpos, atol=1e-5)
     assert 0.3 < np.abs(told.qpos).max() <= 1.35 + 1e-6
     assert np.abs(told.ctrl).max() <= 2.0
+
+
+def test_commands_are_tried_with_effects_that_were_found(
+    robot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = ("--effects", robot.parent / "found.yaml")
+    given = ("--model", robot, *found, "--duration", 8, "--horizon", "0.1")
+    run(*given, "--only", "armature", "--out", tmp_path / "out")
+    m = mujoco.MjModel.from_xml_path(str(robot))
+    (told,) = read_logs([tmp_path / "out" / "commands.csv"], m).runs
+    m.dof_frictionloss[0], m.dof_damping[0] = 0.15, 0.08
+    d, seen = mujoco.MjData(m), []
+    for u in told.ctrl:
+        seen.append(d.qpos.copy())
+        d.ctrl[:] = u
+        mujoco.mj_step(m, d, 2)
+    np.testing.assert_allclose(np.array(seen), told.qpos, atol=1e-5)
+    said = "not in the model that commands are tried with: constant_force@hinge"
+    assert said in " ".join(capsys.readouterr().out.split())
 
 
 def test_what_is_told_of_them(results: Path) -> None:
@@ -142,8 +172,10 @@ def test_pairs_of_a_gap_and_less_motion(
         ({"--noise": "hinge=-1"}, "--noise"),
         ({"--max-speed": "hing=1"}, 'did you mean "hinge"'),
         ({"--amplitude": "much"}, "--amplitude"),
-        ({"--effects": "armatur"}, 'did you mean "armature"'),
-        ({"--effects": "viscous_damping"}, "already cover it"),
+        ({"--only": "armatur"}, 'did you mean "armature"'),
+        ({"--only": "viscous_damping"}, "already cover it"),
+        ({"--effects": "no.yaml"}, "no.yaml"),
+        ({"--effects": "{robot}/other.yaml"}, 'knee" names no joint'),
         ({"--gap": "nowhere"}, "nowhere"),
         ({"--data": "no.csv"}, "no.csv"),
         ({"--out": "{tmp}/a.txt"}, "NAME.csv"),
@@ -166,7 +198,7 @@ def test_mistakes_end_with_one_line(
         **change,
     }
     args = [
-        part.replace("{tmp}", str(tmp_path)).replace("{old}", str(results))
+        part.format(tmp=tmp_path, old=results, robot=robot.parent)
         for name, value in options.items()
         if value is not None
         for part in (name, value)
