@@ -5,7 +5,7 @@ MuJoCo writes the numbers back into a model's text; see
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -116,6 +116,34 @@ def _delayed(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
     actuator.delay, actuator.interp = delay, _LINEAR
     actuator.nsample = math.ceil(delay / m.opt.timestep) + 2
     return True
+
+
+def tendon(acts: Sequence[tuple[str, float]], words: Mapping[str, str]) -> InMjcf:
+    """A fixed tendon along a sum of joints with shares, whose numbers an effect's are.
+
+    Args:
+        acts: joints with the share of each.
+        words: for each number of the effect stiffness, damping or frictionloss: the
+            tendon has as much of it as the number is below zero.
+    """
+
+    def build(spec: mujoco.MjSpec, m: mujoco.MjModel, e: EffectEntry) -> bool:
+        if any(e.columns[column] > 0 for column in words):
+            return False
+        added = spec.add_tendon(name=f"{e.effect}@{e.at}")
+        for joint, share in acts:
+            added.wrap_joint(joint, share)
+        added.springlength = [0.0, 0.0]  # not that of the model's first pose
+        for column, word in words.items():
+            value = getattr(added, word)
+            size = -e.columns[column]
+            if np.ndim(value):
+                value[0] = size  # of a polynomial
+            else:
+                setattr(added, word, size)
+        return True
+
+    return InMjcf(lambda m, e: None, build)
 
 
 def _body(m: mujoco.MjModel, e: EffectEntry) -> None:

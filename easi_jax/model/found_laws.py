@@ -5,6 +5,7 @@ its numbers ``c1``, ``c2``, ...: one for each term (`easi_jax.model.law_terms`).
 name is ``found_law`` to people and files; within the catalog each has one of its own.
 """
 
+import ast
 import math
 import re
 import zlib
@@ -17,6 +18,7 @@ import mujoco
 
 from easi_jax.errors import UserError, nearest
 from easi_jax.model.effect_catalog import CATALOG, Effect, Part, Site, Spot
+from easi_jax.model.effect_mjcf import InMjcf, tendon
 from easi_jax.model.effect_numbers import (
     EFFECT_TABLE,
     NUMBERS,
@@ -27,7 +29,7 @@ from easi_jax.model.effect_numbers import (
     own_row,
 )
 from easi_jax.model.joint_space import tangent_units
-from easi_jax.model.law_terms import Known, Term
+from easi_jax.model.law_terms import Known, Term, name_of
 from easi_jax.model.own_laws import Now
 from easi_jax.model.quantities import Entry, Inert, joint_unit, scalar_only
 
@@ -167,8 +169,57 @@ def add_law(law: FoundLaw, sizes: Sequence[float] = ()) -> str:
         far = _FAR * abs(size)
         parts.append(Part(column, number, "1", -far, far, _SMALL * abs(size)))
     site = Site(tuple(parts), (sizes,), able=lambda o: _fits(law, o))
-    CATALOG[name] = Effect(name, law.sentence, {"joint": site})
+    CATALOG[name] = Effect(name, law.sentence, {"joint": site}, mjcf=_in_mjcf(law))
     return name
+
+
+def _in_mjcf(law: FoundLaw) -> InMjcf | None:
+    """How MJCF says it: what depends on a sum of joints alone, and acts along that, may
+    be a tendon. None where it has no word for a term."""
+    if len(law.acts) < 2:
+        return None
+    words = [_word(law, term) for term in law.terms]
+    columns = [f"{law.name}.{number}" for number in law.numbers]
+    known = dict(zip(columns, words, strict=True))
+    return tendon(law.acts, known) if all(words) else None
+
+
+def _word(law: FoundLaw, term: Term) -> str:
+    """What a tendon calls a term."""
+    along = {
+        kind: _plain(" + ".join(f"{x:g} * {name_of(kind, j)}" for j, x in law.acts))
+        for kind in ("qpos", "qvel")
+    }
+    tree = term.tree
+    if isinstance(tree, ast.Call) and ast.unparse(tree.func) == "sign":
+        inside = _plain(ast.unparse(tree.args[0]))
+        return "frictionloss" if inside == along["qvel"] else ""
+    words = {along["qpos"]: "stiffness", along["qvel"]: "damping"}
+    return words.get(_plain(ast.unparse(tree)), "")
+
+
+def _plain(text: str) -> tuple[tuple[str, float], ...]:
+    """Names with the factor of each in a sum; no names of what is none."""
+    shares: dict[str, float] = {}
+
+    def add(node: ast.expr, share: float) -> bool:
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+            return add(node.operand, -share)
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Sub):
+            sign = 1.0 if isinstance(node.op, ast.Add) else -1.0
+            return add(node.left, share) and add(node.right, sign * share)
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult):
+            try:
+                return add(node.right, share * ast.literal_eval(node.left))
+            except ValueError:
+                return False
+        if not isinstance(node, ast.Attribute | ast.Subscript):
+            return False
+        shares[ast.unparse(node)] = share
+        return True
+
+    whole = add(ast.parse(text, mode="eval").body, 1.0)
+    return tuple(sorted(shares.items())) if whole else ()
 
 
 def _fits(law: FoundLaw, o: Spot) -> bool:

@@ -12,7 +12,8 @@ import pytest
 from easi_jax.data.law_states import memory_path
 from easi_jax.errors import UserError
 from easi_jax.io.models.effects_file import read_effects, write_effects
-from easi_jax.model.found_effects import FoundEffects, joined
+from easi_jax.io.models.repaired_mjcf import repaired_model
+from easi_jax.model.found_effects import EffectEntry, FoundEffects, joined
 from easi_jax.model.found_laws import FoundLaw, add_law, public_name
 from easi_jax.model.law_terms import Known, Term
 from easi_jax.model.own_effects import registered
@@ -139,6 +140,54 @@ def test_a_law_is_simulated_as_mujoco_does(m: mujoco.MjModel, how: Engine) -> No
         mujoco.mj_step(m, d)
     np.testing.assert_allclose(end.qpos, d.qpos, atol=3e-5)
     np.testing.assert_allclose(end.hidden, [z], atol=1e-4)
+
+
+DIFFERENCE = '(qpos.a - qpos["left-wrist"])'
+
+
+@pytest.mark.parametrize(
+    ("share", "terms", "numbers", "said"),
+    [
+        (-1.0, [DIFFERENCE, DIFFERENCE.replace("qpos", "qvel")], (-2.0, -0.05), True),
+        (1.0, [f"sign({SUM}, 0.02)"], (-0.3,), True),
+        (1.0, [SUM], (0.1,), False),  # drives on
+        (1.0, [f"{SUM}*abs({SUM})"], (-0.1,), False),
+        (1.0, [DIFFERENCE], (-2.0,), False),  # acts along another sum
+    ],
+)
+def test_a_tendon_says_what_two_joints_share(
+    m: mujoco.MjModel,
+    share: float,
+    terms: list[str],
+    numbers: tuple[float, ...],
+    said: bool,
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "m.xml").write_text(XML)
+    law = FoundLaw((("a", 1.0), ("left-wrist", share)), tuple(map(Term, terms)))
+    each = zip(law.numbers, numbers, strict=True)
+    columns = {f"{law.name}.{k}": x for k, x in each}
+    entry = EffectEntry(add_law(law), "a", "joint", columns, {})
+    written = repaired_model(tmp_path / "m.xml", [entry])
+    assert written.left == ([] if said else ["found_law@a"])
+    assert written.model.ntendon == int(said)
+    if not said:
+        return
+    fixed = {entry.address(k): x for k, x in columns.items()}
+    s = Simulator(m, ParameterSpace(()), 0.01, fixed=fixed, engine="mujoco")
+    model, d = s.model(jnp.zeros(0)), mujoco.MjData(written.model)
+    state = s.start(jnp.array([0.4, -0.2]), jnp.array([2.0, 1.0]), model)
+    d.qpos[:], d.qvel[:], d.ctrl[:] = (0.4, -0.2), (2.0, 1.0), 0.1
+    step = jax.jit(lambda x: s.step(model, x, jnp.array([0.1])))
+    for _ in range(20):
+        state = step(state)
+        mujoco.mj_step(written.model, d, 5)
+    # Forces of laws are explicit; those of tendons are what the integrator makes them.
+    np.testing.assert_allclose(state.qpos, d.qpos, atol=5e-3)
+    free = mujoco.MjData(m)
+    free.qpos[:], free.qvel[:], free.ctrl[:] = (0.4, -0.2), (2.0, 1.0), 0.1
+    mujoco.mj_step(m, free, 100)
+    assert np.abs(free.qpos - d.qpos).max() > 0.05
 
 
 FILE = """
