@@ -86,11 +86,18 @@ class Starts:
         out.slope = self.slope[:, some]
         return out
 
-    @property
-    def as_read(self) -> "Starts":
-        """These starts, as far off as the noise of their rows says, and no farther."""
+    def as_read(self, positions: int) -> "Starts":
+        """These starts, as far off as the noise of their rows says, and no farther.
+
+        So many channels, the first, are positions: a window begins where its first row
+        says, which then has no error of its own.
+        """
         out = self.part(slice(None))
-        out.spread = self.known
+        out.spread, out.slope = self.known, self.slope.copy()
+        out.slope[:, :, 0, :positions] = 0.0
+        shape = self.slope.shape[1:]
+        out.read = np.ones(shape) if self.read is None else self.read.copy()
+        out.read[:, 0, :positions] = 0.0
         return out
 
     def linearize(self, x: np.ndarray, begin: np.ndarray) -> np.ndarray:

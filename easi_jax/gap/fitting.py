@@ -149,7 +149,7 @@ class Fitting:
         if self.sticks:
             chosen.moved = still
             starts.linearize(x, still)
-            starts, errors = starts.as_read, chosen.errors(x[None])[0]
+            starts, errors = starts.as_read(data.m.nv), chosen.errors(x[None])[0]
         rms = np.sqrt(np.mean(errors.astype(float) ** 2, (0, 1)))
         chosen.residuals = make_residuals(
             starts, data.lead, _LET_PASS * rms, self.channels.scale

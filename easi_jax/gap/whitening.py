@@ -116,7 +116,8 @@ def make_residuals(
         refit = np.eye(n) - free[w] @ np.linalg.solve(normal, seen.T)
         refit = unit[:, None] * refit
         plain[w][kept] = refit[some] @ lower
-        floor[w] = ((refit**2) @ white[w].reshape(-1))[keep].sum() / n
+        left = (refit**2) @ white[w].reshape(-1) + ((refit @ free[w]) ** 2).sum(1)
+        floor[w] = left[keep].sum() / n
     live = white.reshape(count, n)[:, kept] > 0
     return Residuals(groups, scale, root, plain, floor, live)
 

@@ -105,6 +105,28 @@ def test_what_a_model_lacks_is_not_hidden_and_enters_no_floor() -> None:
     assert got > 5 * np.sqrt(drawn[:, ROWS:].mean())
 
 
+def test_a_start_as_read_counts_its_row_once() -> None:
+    """A right model whose windows begin where their first rows say."""
+    rng = np.random.default_rng(12)
+    true = rng.normal(size=(W, 2))
+    read = path(true) + NOISE * rng.normal(size=(W, T, 1))
+    known = np.array([NOISE[0], 0.05])
+    guess = true + known * rng.normal(size=true.shape)
+    guess[:, 0] = read[:, 0, 0]
+    starts = Starts(
+        lambda x, moved: path(guess + moved) - read,
+        *(NOISE, 30 * known, ROWS, 0.1 * known, known, known),
+    )
+    errors = starts.linearize(np.zeros(1), np.zeros((W, 2)))
+    found = make_residuals(starts.as_read(1), 5, np.full(1, 1e-9), np.ones(1))
+    white = found.whitened(found.grouped(errors[None]))[0]
+    some = found.live.all(0)
+    assert np.square(white[:, some]).mean() == pytest.approx(1.0, abs=0.03)
+    assert np.abs(np.square(white[:, some]).mean(0) - 1).max() < 0.35
+    expected = float(np.sqrt(found.floor.mean()))
+    assert found.gap(white) == pytest.approx(expected, rel=0.05)
+
+
 def test_noise_is_read_off_the_first_rows() -> None:
     starts, _ = made(3)
     starts.noise = 3 * NOISE
@@ -217,7 +239,7 @@ def test_what_is_not_linear_is_told() -> None:
     starts.simulate = sticking
     starts.linearize(x, still)
     assert starts.bent == pytest.approx(1.0, abs=0.01)
-    assert (starts.as_read.spread < starts.spread).all()
+    assert (starts.as_read(1).spread < starts.spread).all()
 
 
 def test_what_is_not_finite_keeps_its_start() -> None:
