@@ -392,7 +392,7 @@ def paragraphs(rows: list[dict[str, Any]]) -> list[str]:
         right = np.mean(list(map(_is_right, clean)))
         said += [
             "`python -m benchmarks.floor`: the model is right, so the gap should be "
-            "the floor, and nothing be named but late velocities; commits "
+            "the floor, and nothing be named but late and filtered velocities; commits "
             f"{commits_of(clean)}. Goal for channels, in every margin: median within "
             f"{NEAR} of 1 and 95 % between {WIDE[0]} and {WIDE[1]}, those aside whose "
             "floor is stated as an upper bound; missed where a 95 % interval excludes "

@@ -39,9 +39,7 @@ _OUTLIER = 4.0  # standard deviations
 _BLOCKS = 20  # of the log, whose scatter says how sure the fit is
 BEYOND = 0.5  # of the initial range, that a round may lie outside of it
 _LEAST = 0.1  # share of what an information says, that scores scatter
-# Times what blocks of time scatter, that channels surely scatter more: 5 % of
-# chi-squares of two numbers are beyond.
-_APART = 3.0
+_CHANCE = 0.05  # of a right model, that its channels are taken to disagree
 _UNITS = 2  # rounds in which a fit learns how much it leaves
 PRIOR = 12.0  # information of a uniform initial range, unit coordinates
 
@@ -162,6 +160,7 @@ class _Emulator:
             excess = float((counts @ rest**2).sum() / (counts.sum() * r.shape[1]))
             excess = max(excess, 1e-12)
         of_channels = np.einsum("kac,kc,k->ca", both, rest, counts, optimize=True)
+        of_channels -= of_channels.mean(0)  # the pull of what was known before
         scores = score / excess, of_channels @ share.T / excess
         scatter, disagree = _scattered(*scores, information / excess)
         cov = inverse @ (scatter + prior) @ inverse
@@ -186,7 +185,8 @@ def _scattered(
     along = ((blocks - blocks.mean(0)) @ vectors).var(0, ddof=1) * count
     along = np.maximum(along, _LEAST * values)
     apart = ((of_channels @ vectors) ** 2).sum(0)
-    more = apart > _APART * along
+    # Of chi-squares of two numbers, one for each direction.
+    more = apart > np.log(len(values) / _CHANCE) * along
     return (vectors * np.where(more, apart, along)) @ vectors.T, bool(more.any())
 
 

@@ -251,7 +251,14 @@ class Starts:
             before = after
             if np.nanmax(np.where(np.isfinite(after), fell, 0.0)) < _WORTH * whole:
                 break
-        return moved, errors if self.begins is None else self.linearize(x, moved)
+        if self.begins is None:
+            return moved, errors
+        errors = self.linearize(x, moved)
+        lost = ~np.isfinite(errors).all((1, 2))
+        if lost.any():  # after the rows that were simulated
+            moved = np.where(lost[:, None], begin, moved)
+            errors = self.linearize(x, moved)
+        return moved, errors
 
     def _cost(self, errors: np.ndarray, moved: np.ndarray) -> np.ndarray:
         """Half the weighted squared error of each start, ``(B, W)``."""
@@ -276,8 +283,14 @@ class Starts:
             Offsets ``(B, W, s)`` and errors ``(B, W, T, c)``.
         """
         moved, errors, _ = self._fitted(x, begin, readings)
-        if self.begins is not None:
-            errors = self.simulate(x, moved) - (0.0 if readings is None else readings)
+        if self.begins is None:
+            return moved, errors
+        more = 0.0 if readings is None else readings
+        errors = self.simulate(x, moved) - more
+        lost = ~np.isfinite(errors).all((2, 3))
+        if lost.any():  # after the rows that were simulated
+            moved = np.where(lost[..., None], begin, moved)
+            errors = self.simulate(x, moved) - more
         return moved, errors
 
     def _fitted(

@@ -440,6 +440,8 @@ def proposed_laws(analysis: Analysis, model: Model) -> list[Proposed]:
     if at.sticks or at.closed_by(model):
         return []
     if at.predictor.sensors:
+        if not np.isfinite(at.channels.scale[: analysis.m.nv]).any():
+            return []  # no joint moves
         at, model = analysis.of_joints(at, model)
     else:
         model = at.selector.fit(model.places, model.fit.x)

@@ -47,24 +47,26 @@ def offered(m: mujoco.MjModel, scales: Scales) -> list[Offered]:
     found = [t for name in joints for t in _along(m, scales, name)]
     for a in range(m.nu):
         found += _of_drive(m, scales, a)
-    every = itertools.combinations(joints, 2)
-    few = len(joints) <= _PAIRED
-    pairs = [p for p in every if few or _adjoin(m, *(joints[n] for n in p))]
-    for pair in pairs:
-        one, other = (is_hinge(m, joints[name]) for name in pair)
-        for share in (1.0, -1.0) if one == other else ():
+    kind = {name: is_hinge(m, j) for name, j in joints.items()}
+    driven = [(_driven(m, a), a) for a in range(m.nu)]
+    for pair in itertools.combinations(joints, 2):
+        one, other = (kind[name] for name in pair)
+        near = _adjoin(m, *(joints[name] for name in pair))
+        alike = one == other and (near or [*kind.values()].count(one) <= _PAIRED)
+        for share in (1.0, -1.0) if alike else ():
             found += _along_both(m, scales, pair, share)
-    drives = {name: a for a in range(m.nu) if (name := _driven(m, a))}
-    for pair in pairs:
+        if not (near or len(joints) <= _PAIRED):
+            continue
         for at, other in (pair, pair[::-1]):
             found += _of_other(m, scales, at, other)
-            if other in drives:
-                found += _of_others_drive(m, scales, at, drives[other])
+            for a in (a for name, a in driven if name == other):
+                found += _of_others_drive(m, scales, at, a)
     return found
 
 
 def _adjoin(m: mujoco.MjModel, one: int, other: int) -> bool:
-    """Whether no joint is between two."""
+    """Whether one of two joints moves the other, with none between them; or both move
+    one body."""
 
     def moved_by(body: int) -> int:
         """The next body from it on towards the world that a joint moves."""

@@ -9,7 +9,7 @@ one size.
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -496,7 +496,7 @@ class Predictor:
             fast = vs[begun] + self._misread_speed(model, window, qs[begun], vs[begun])
             fast = _later(fast, after)[: self._started]
             row += jnp.arange(self._started)[:, None]
-            fast -= _between(window.read_speed, row)
+            fast -= _at(window.read_speed, row)
             out.append(jnp.pad(fast, [(0, len(vs) - len(fast)), (0, 0)]))
         return jnp.concatenate(out, 1)
 
@@ -517,8 +517,8 @@ class Predictor:
         row, after = _ahead(first)
         row += jnp.arange(self.length + 1)
         read = jnp.broadcast_to(row[:, None], (len(row), len(self.sensors)))
-        known = _between(window.known, read) > 0
-        read = _between(window.sensed, read)
+        known = _at(window.known, read) > 0
+        read = _at(window.sensed, read)
         readings = self.sensors.reading.alike(readings, read[:, None])
         flat = readings.reshape(len(readings), -1)
         flat = _later(flat, jnp.broadcast_to(after, flat.shape[1:]))
@@ -584,7 +584,7 @@ class Predictor:
         assert e is not None
         early, now = self._when(w, e)
         row = _ahead(now)[0] + jnp.arange(self.length + 1)[:, None]
-        read = _between(w.read, row)
+        read = _at(w.read, row)
         first, v = (_between(x, now[None])[0] for x in (w.read, w.speed))
         q, v = self._true(model, w, simulator.move(w.start_qpos, first - e.bias), v)
         q = simulator.move(q, moved[:nv])
@@ -742,9 +742,19 @@ def _between(x: jax.Array, row: jax.Array) -> jax.Array:
     Catmull and Rom's cubic: exact at whole rows.
     """
     x = jnp.concatenate([x, 2 * x[-1:] - x[-2:-1], 3 * x[-1:] - 2 * x[-2:-1]])
-    whole = jnp.floor(row).astype(jnp.int32)
-    s, column = row - whole, jnp.arange(x.shape[1])
-    a, b, c, d = (x[whole + k, column] for k in (-1, 0, 1, 2))
+    whole = jnp.floor(row)
+    near = [_at(x, whole + k) for k in (-1, 0, 1, 2)]
+    return _cubic(near, row - whole)
+
+
+def _at(x: jax.Array, row: jax.Array) -> jax.Array:
+    """Columns of ``x (T, n)`` at whole rows ``(K, n)``."""
+    return x[row.astype(jnp.int32), jnp.arange(x.shape[1])]
+
+
+def _cubic(near: Sequence[jax.Array], s: jax.Array) -> jax.Array:
+    """Between the second and the third of four values, a share ``s`` of the way."""
+    a, b, c, d = near
     slope_b, slope_c = (c - a) / 2, (d - b) / 2
     third = 2 * (b - c) + slope_b + slope_c
     second = 3 * (c - b) - 2 * slope_b - slope_c
@@ -768,4 +778,4 @@ def _later(x: jax.Array, rows: jax.Array) -> jax.Array:
         return [(3 * (a - b) + c)[None], (6 * a - 8 * b + 3 * c)[None]]
 
     whole = jnp.concatenate([beyond(first)[0], x, *beyond(last)])
-    return _between(whole, 1.0 + jnp.arange(len(x))[:, None] + rows)
+    return _cubic([whole[k : k + len(x)] for k in range(4)], rows)

@@ -25,7 +25,7 @@ from easi_jax.model.effects import Effects
 from easi_jax.model.own_laws import Law
 
 _MOST_SECONDS = 1.0  # of one call as Python, or of all calls compiled
-_PATIENCE = 10.0  # s, with a first call
+_PATIENCE = 60.0  # s, with a first call, which compiles
 _STATES = 256  # in the compiled call
 _NEAR = 1e-4  # of the largest: rounding of single precision, compiled or not
 _SIZES = 0.3, 0.7  # of the range of each number, where a law is tried

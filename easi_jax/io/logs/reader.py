@@ -229,7 +229,8 @@ class _Reader:
         self.notes[f"{self.path}: {text}"] = None
 
     def read(self) -> list[Run]:
-        table = self._unnumbered(self.mapping.rename(read_table(self.path)))
+        table = self.mapping.rename(read_table(self.path))
+        self.columns = self._as_numbered(table)
         for text in table.notes:
             self.note(text)
         given = self.path, table.columns, self.columns, self.model
@@ -329,16 +330,16 @@ class _Reader:
             "joints that nobody read out (--unmeasured)"
         )
 
-    def _unnumbered(self, table: Table) -> Table:
-        """``table`` in which sensors of one number have no ``.0``."""
-        single = {n[0] for n in self.columns.sensors.values() if len(n) == 1}
-        single -= table.columns.keys()
-
-        def plain(name: str) -> str:
-            short = name.removesuffix(".0")
-            return short if short in single else name
-
-        return replace(table, columns={plain(n): c for n, c in table.columns.items()})
+    def _as_numbered(self, table: Table) -> LogColumns:
+        """The model's columns, sensors of one number with ``.0`` where ``table`` has
+        them so."""
+        sensors, known = dict(self.columns.sensors), set(self.columns.known)
+        for name, columns in sensors.items():
+            numbered = f"{columns[0]}.0"
+            other = numbered in table.columns and numbered not in known
+            if len(columns) == 1 and other and columns[0] not in table.columns:
+                sensors[name] = (numbered,)
+        return replace(self.columns, sensors=sensors)
 
     def _without_hidden(self, table: Table) -> Table:
         """``table`` without columns of hidden joints, of which is told."""

@@ -251,7 +251,8 @@ def _npz_column(archive: np.lib.npyio.NpzFile, name: str) -> np.ndarray | str:
     if array.ndim != 1:
         return f"a {array.ndim}-dimensional array"
     if array.dtype.kind == "S":
-        return np.char.decode(array, "utf-8")
+        with contextlib.suppress(UnicodeDecodeError):
+            return np.char.decode(array, "utf-8")
     if array.dtype.kind not in "biufU":
         return f"values of type {array.dtype}"
     return array
@@ -295,8 +296,9 @@ def _parquet_column(column: pyarrow.ChunkedArray) -> np.ndarray | str:
         kind = kind.value_type
         column = column.cast(kind)
     if types.is_binary(kind) or types.is_large_binary(kind):
-        kind = pyarrow.string()
-        column = column.cast(kind)
+        with contextlib.suppress(pyarrow.ArrowInvalid):  # no text
+            column = column.cast(pyarrow.string())
+            kind = column.type
     texts = types.is_string, types.is_large_string, types.is_string_view
     if any(is_text(kind) for is_text in texts):
         return np.array([text or "" for text in column.to_pylist()], dtype=np.str_)

@@ -256,6 +256,26 @@ def test_what_is_not_finite_keeps_its_start() -> None:
     assert np.isfinite(moved).all() and not moved[3].any()
 
 
+def test_a_start_from_which_a_window_blows_up_later_is_taken_back() -> None:
+    """Of which the rows that are simulated alone know nothing."""
+    starts, _ = made(6)
+    plain, x, still = starts.simulate, np.zeros(1), np.zeros((W, 2))
+
+    def blown(x: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        out, far = plain(x, moved), np.abs(moved).max(-1) > 1.0
+        out[:, :, 20:] = np.where(far[..., None, None], np.nan, out[:, :, 20:])
+        return out
+
+    starts.simulate = blown
+    starts.begins = lambda x, moved: plain(x, moved)[:, :, :ROWS]
+    moved, errors = starts.solve(x, still)
+    assert np.isfinite(errors).all()
+    kept = ~moved.any(1)
+    assert 0.1 < kept.mean() < 0.7, "speeds beyond 1 m/s"
+    moved, errors = starts.fit(x[None], still[None])
+    assert np.isfinite(errors).all() and (~moved.any(2) == kept).mean() > 0.95
+
+
 def test_the_floor_meets_the_wrong_minima_that_readings_lead_to() -> None:
     """A perfect model whose motion bends at its start, as where a foot touches."""
     rng, t = np.random.default_rng(11), DT * np.arange(T)[:, None]

@@ -333,8 +333,12 @@ def test_sensors_are_optional_and_may_have_gaps(tmp_path, cart):
     np.testing.assert_array_equal(run.sensors["encoder"][:, 0], slow)
     np.testing.assert_array_equal(run.sensors["imu"][4], [0, 1, 2])
     columns["sensor.encoder.0"] = columns.pop("sensor.encoder")  # of one number
-    (run,) = read_logs(save(tmp_path / "b.npz", columns), cart).runs
+    path = save(tmp_path / "b.npz", columns)
+    (run,) = read_logs(path, cart).runs
     np.testing.assert_array_equal(run.sensors["encoder"][:, 0], slow)
+    (tmp_path / "m.yaml").write_text("scale: {sensor.encoder.0: 0.5}")
+    (run,) = read_logs(path, cart, tmp_path / "m.yaml").runs
+    np.testing.assert_array_equal(run.sensors["encoder"][:, 0], 0.5 * slow)
     del columns["sensor.imu.2"]
     log = read_logs(save(tmp_path / "b.csv", columns), cart)
     assert "imu" not in log.runs[0].sensors
@@ -619,6 +623,12 @@ def test_kinds_of_columns_of_parquet_and_npz(tmp_path, cart):
         assert [len(run) for run in runs] == [ROWS // 2, ROWS - ROWS // 2]
         pole = np.concatenate([run.qpos[:, 1] for run in runs])
         np.testing.assert_allclose(pole, columns["qpos.pole"], atol=1e-6)
+    blob = [b"\xff\xfe"] * ROWS  # no text, and nothing that a log needs
+    table = pyarrow.table({**columns, "blob": blob})
+    pyarrow.parquet.write_table(table, tmp_path / "blob.parquet")
+    assert "blob" in said(read_logs(tmp_path / "blob.parquet", cart), "ignored")
+    np.savez(tmp_path / "blob.npz", **columns, blob=np.array(blob))
+    assert "blob" in said(read_logs(tmp_path / "blob.npz", cart), "ignored")
     columns["run"] = np.array([t.encode() for t in text])
     log = read_logs(save(tmp_path / "a.npz", columns), cart)
     assert [run.name for run in log.runs] == ["a/a", "a/b"]
