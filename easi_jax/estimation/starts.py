@@ -254,7 +254,7 @@ class Starts:
         if self.begins is None:
             return moved, errors
         errors = self.linearize(x, moved)
-        lost = ~np.isfinite(errors).all((1, 2))
+        lost = np.asarray(~np.isfinite(errors).all((1, 2)))
         if lost.any():  # after the rows that were simulated
             moved = np.where(lost[:, None], begin, moved)
             errors = self.linearize(x, moved)
@@ -287,7 +287,7 @@ class Starts:
             return moved, errors
         more = 0.0 if readings is None else readings
         errors = self.simulate(x, moved) - more
-        lost = ~np.isfinite(errors).all((2, 3))
+        lost = np.asarray(~np.isfinite(errors).all((2, 3)))
         if lost.any():  # after the rows that were simulated
             moved = np.where(lost[..., None], begin, moved)
             errors = self.simulate(x, moved) - more

@@ -656,7 +656,9 @@ class Predictor:
         rows: int | None = None,
     ) -> np.ndarray:
         """Predicted readings less measured ones, ``(B, W, rows, channels)``: at the
-        start, and after each step.
+        start, and after each step. Where readings are late, those of the last two rows
+        lie between rows that are simulated beyond them, with the last command held, or
+        at the end of `length` on a parabola.
 
         Args:
             x: vectors, ``(B, n)``.
@@ -666,7 +668,7 @@ class Predictor:
             rows: the first of a window, at least those that a start is fitted to; all
                 ``H + 1`` where None.
         """
-        rows = self.steps + 1 if rows is None else rows
+        wanted = self.steps + 1 if rows is None else rows
         blocks = np.arange(self.blocks) if windows is None else np.asarray(windows)
         count, nb = len(x), len(blocks)
         items = count * nb
@@ -679,16 +681,16 @@ class Predictor:
             whole = np.zeros((count, nb * BLOCK, self.size), np.float32)
             whole[:, : moved.shape[1]] = moved
             offsets = whole.reshape(shape)
-        shape = items, BLOCK, rows, self.channels
+        shape = items, BLOCK, wanted, self.channels
         out = np.empty(shape, np.float32)
-        steps = self._steps_of(vectors, rows)
+        steps = self._steps_of(vectors, wanted)
         for left_out, chosen in self.by_program(vectors):
             at_once = left_out == next(iter(self._without))
             for part in self._batches(chosen, at_once):
                 program = self._program(left_out, len(part))
                 args = vectors[part], which[part], offsets[part]
                 got = np.asarray(program(*args, steps, *self.data))
-                out[part] = got[..., :rows, self._compared]
+                out[part] = got[..., :wanted, self._compared]
         out = out.reshape(count, nb * BLOCK, *shape[2:])
         return out[:, : self.count(windows)]
 
@@ -699,7 +701,9 @@ class Predictor:
         columns = enumerate(self.layout.columns, self.own)
         late = [i for i, c in columns if c.field == "late"]
         more = bool(self.sensors) + 2 * bool(vectors[:, late].any())
-        return np.int32(min(rows - 1 + more, self.length + bool(self.sensors)))
+        return np.asarray(
+            min(rows - 1 + more, self.length + bool(self.sensors)), np.int32
+        )
 
     def by_program(
         self, vectors: np.ndarray

@@ -72,9 +72,8 @@ def test_numbers_are_those_that_people_write() -> None:
 
 def test_a_result_with_nothing_in_it_has_a_report() -> None:
     """No effect, no place of the error, no noise, figures that are not finite."""
-    none = GapFigures(
-        float("nan"), 2 * (float("nan"),), (float("inf"),), (2 * (float("nan"),),), 7
-    )
+    unknown = float("nan"), float("nan")
+    none = GapFigures(float("nan"), unknown, (float("inf"),), (unknown,), 7)
     found = result(
         effects=(),
         refitted=(),

@@ -264,13 +264,14 @@ def test_steps_of_a_shared_trunk(twice: bool, monkeypatch: pytest.MonkeyPatch) -
     n = c.judge_batch
     windows = jax.random.normal(jax.random.key(5), (n, judge.real.shape[1]))
     fake = Batch(windows, jnp.zeros(n), jnp.ones(n))
-    got, _ = judge.updates(state, fake, jax.random.key(1), 0.5, 1e-3)
+    how = jnp.asarray(0.5), jnp.asarray(1e-3)
+    got, _ = judge.updates(state, fake, jax.random.key(1), *how)
 
     def taken(x: jax.Array) -> jax.Array:
         return x[jnp.arange(n) % len(x)]
 
-    labelled = (taken(x) for x in (judge.labelled, judge.labels))
-    given = taken(judge.unlabelled), *labelled, jnp.full(2, 0.5), 0.5
+    labelled = taken(judge.labelled), taken(judge.labels)
+    given = taken(judge.unlabelled), *labelled, jnp.full(2, 0.5), how[0]
 
     def judged(p: Any) -> Any:
         return judge._real_loss(p, taken(judge.real), fake)[0]
