@@ -160,10 +160,10 @@ class _Judge:
         places = sorted(self.model.places, key=lambda p: -costs[p.key])
         found = []
         for k, place in enumerate(places):
-            model = self.model
+            model, figures = self.model, self.end.figures
             if k + 1 < len(places):
                 model = self.at.without(self.model, places[k + 1 :])
-            figures = self.held_out.figures(self.at.plain(model.fit.x))
+                figures = self.held_out.figures(self.at.plain(model.fit.x))
             odds, same = self._odds(last(self.model, place), rivals[place.key])
             parts = self._parts(model.fit.x, place, figures) if place.shared else ()
             mine = {place.key, *(p.place.key for p in parts)}
@@ -173,7 +173,7 @@ class _Judge:
                     numbers.values(place),
                     confidence(costs[place.key], odds),
                     [k for k in dict.fromkeys(p.key for p in same) if k not in mine],
-                    figures.gap if k + 1 < len(places) else self.end.figures.gap,
+                    figures.gap,
                     numbers.fitted(place),
                     numbers.deviations(place),
                     parts,
