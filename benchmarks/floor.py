@@ -5,13 +5,12 @@
 Machines of one or two joints are recorded by MuJoCo itself, with the timestep and the
 integrator of the owner's model, at control rates from 50 to 1,000 Hz, slow and fast,
 their readings plain, with velocities (also late or filtered ones) or in coarse steps;
-one drive has
-an activation, one joint is read by nobody, one machine is driven by its own readings,
-one runs against its end stop, one slides on a foot. ``train.gap`` then sees the true
-model and the logs: its gap should be its floor, and the verdict ``no_gap``. With
-``--hidden`` the machine has an effect that the model lacks, as strong as raises the gap
-to about three floors, which should be found. One line a case is added to
-``floor.jsonl``; a run that was stopped goes on, and several share the work by
+one drive has an activation, one joint is read by nobody, one machine is driven by its
+own readings, one runs against its end stop, one slides on a foot. ``train.gap`` then
+sees the true model and the logs: its gap should be its floor, and the verdict
+``no_gap``. With ``--hidden`` the machine has an effect that the model lacks, as strong
+as raises the gap to about three floors, which should be found. One line a case is added
+to ``floor.jsonl``; a run that was stopped goes on, and several share the work by
 ``--shard``.
 """
 

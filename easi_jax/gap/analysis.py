@@ -127,7 +127,7 @@ class Analysis:
                 f"{lead_rows(dt) * dt:.3g} s before it: record more, or shorten "
                 "--horizon"
             )
-        seen, lengths = filled(reported), self._cut(cut, fit)
+        seen, every = filled(reported), self._cut(cut, fit)
         self.predictor = Predictor(
             mj_model,
             space,
@@ -139,7 +139,7 @@ class Analysis:
             wait,
             sensors,
             speeds=len(noise) > mj_model.nv,
-            length=max(lengths, default=0),
+            length=max(every, default=0),
         )
         self.data = recorded(
             mj_model,
@@ -154,7 +154,7 @@ class Analysis:
         self.step = dt / self.predictor.simulator.substeps
         steps = self.predictor.steps
         self.reported = self._fitting(self.predictor, reported, steps)
-        lengths = self._lengths(lengths)
+        lengths = self._lengths(every)
         middle = window_steps(dt, _MIDDLE) + self.data.lead
         settles = max(
             (k for k, f in enumerate(lengths) if f.steps <= middle), default=0

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.model.effect_catalog import Scales
-from easi_jax.model.joint_space import is_hinge, scalar_dofs
+from easi_jax.model.joint_space import driven_joint, is_hinge, scalar_dofs
 from easi_jax.model.law_terms import Term, name_of
 
 _WIDTH = 0.005  # of the speeds, over which a sign turns
@@ -82,10 +82,10 @@ def _adjoin(m: mujoco.MjModel, one: int, other: int) -> bool:
 def _driven(m: mujoco.MjModel, a: int) -> str:
     """The joint that an actuator moves; nothing where one of the two has no name, or it
     moves something else."""
-    if m.actuator_trntype[a] != mujoco.mjtTrn.mjTRN_JOINT or not m.actuator(a).name:
+    j = driven_joint(m, a)
+    if j is None or j not in scalar_dofs(m) or not m.actuator(a).name:
         return ""
-    j = int(m.actuator_trnid[a, 0])
-    return m.joint(j).name if j in scalar_dofs(m) else ""
+    return m.joint(j).name
 
 
 def _dof(m: mujoco.MjModel, name: str) -> int:

@@ -144,7 +144,7 @@ class Predictor:
         channels: numbers that are compared: ``nv + N``, and velocities.
         largest: motion that was measured in a window, ``(channels,)``.
         steps: control steps of a window, those before its start counted.
-        length: those that programs have room for; what is longer is filled up.
+        length: those that programs have room for; shorter windows are filled up.
         data: the windows in blocks, on all devices of ``mesh``.
         programs: others' that were compiled for windows like these.
         size: of a start state: positions, velocities, activations, ``2 nv + na``.

@@ -15,6 +15,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from easi_jax.errors import UserError, nearest
 from easi_jax.model.effect_catalog import CATALOG, Effect, Part, Site, Spot
@@ -29,7 +30,7 @@ from easi_jax.model.effect_numbers import (
     own_row,
 )
 from easi_jax.model.joint_space import tangent_units
-from easi_jax.model.law_terms import Known, Term, name_of
+from easi_jax.model.law_terms import Known, Term
 from easi_jax.model.own_laws import Now
 from easi_jax.model.quantities import Entry, Inert, joint_unit, scalar_only
 
@@ -185,41 +186,23 @@ def _in_mjcf(law: FoundLaw) -> InMjcf | None:
 
 
 def _word(law: FoundLaw, term: Term) -> str:
-    """What a tendon calls a term."""
-    along = {
-        kind: _plain(" + ".join(f"{x:g} * {name_of(kind, j)}" for j, x in law.acts))
-        for kind in ("qpos", "qvel")
-    }
-    tree = term.tree
+    """What a tendon along a law's joints calls a term, by its value at a state."""
+    tree, inside, turns = term.tree, term, False
     if isinstance(tree, ast.Call) and ast.unparse(tree.func) == "sign":
-        inside = _plain(ast.unparse(tree.args[0]))
-        return "frictionloss" if inside == along["qvel"] else ""
-    words = {along["qpos"]: "stiffness", along["qvel"]: "damping"}
-    return words.get(_plain(ast.unparse(tree)), "")
-
-
-def _plain(text: str) -> tuple[tuple[str, float], ...]:
-    """Names with the factor of each in a sum; no names of what is none."""
-    shares: dict[str, float] = {}
-
-    def add(node: ast.expr, share: float) -> bool:
-        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-            return add(node.operand, -share)
-        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Sub):
-            sign = 1.0 if isinstance(node.op, ast.Add) else -1.0
-            return add(node.left, share) and add(node.right, sign * share)
-        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult):
-            try:
-                return add(node.right, share * ast.literal_eval(node.left))
-            except ValueError:
-                return False
-        if not isinstance(node, ast.Attribute | ast.Subscript):
-            return False
-        shares[ast.unparse(node)] = share
-        return True
-
-    whole = add(ast.parse(text, mode="eval").body, 1.0)
-    return tuple(sorted(shares.items())) if whole else ()
+        inside, turns = Term(ast.unparse(tree.args[0])), True
+    if inside.memories:
+        return ""
+    rng = np.random.default_rng(0)
+    names = sorted({name for _, name in inside.names} | {j for j, _ in law.acts})
+    q, v, u = (
+        dict(zip(names, x, strict=True)) for x in rng.normal(size=(3, len(names)))
+    )
+    value = inside.value(Known(q, v, u, rng.normal()))
+    along = [sum(share * x[joint] for joint, share in law.acts) for x in (q, v)]
+    position, speed = np.isclose(value, along, rtol=1e-5)
+    if turns:
+        return "frictionloss" if speed else ""
+    return "stiffness" if position else "damping" if speed else ""
 
 
 def _fits(law: FoundLaw, o: Spot) -> bool:

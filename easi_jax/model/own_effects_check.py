@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -80,7 +80,7 @@ class _Checked:
             "reading": lambda known, name: known.qpos[name],
         }[what]
 
-    def _refuse(self, why: str) -> None:
+    def _refuse(self, why: str) -> NoReturn:
         at = getattr(self.function, "__code__", None)
         line = f", line {at.co_firstlineno}" if at else ""
         name = f"{self.law.name!r}"
@@ -147,7 +147,6 @@ class _Checked:
                 f"it has not returned after {_PATIENCE:g} s, and a fit calls it "
                 "millions of times; is there a loop without end?"
             )
-            raise
 
     def _tried(self, function: Any, *args: Any) -> Any:
         try:

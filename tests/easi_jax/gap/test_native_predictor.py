@@ -9,22 +9,26 @@ from easi_jax.data.windows import start_rows
 from easi_jax.gap.candidates import places
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.predictor import Predictor
-from easi_jax.gap.window_set import window_set
+from easi_jax.gap.window_set import WindowSet, window_set
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import engine, native
 from easi_jax.simulation.engine import Engine
 from tests.easi_jax.gap.test_late_readings import ARM, DT, STEPS, recorded
 
 
+def made(seconds: float, longest: float) -> tuple[mujoco.MjModel, Layout, WindowSet]:
+    """An arm, columns of all effects, and windows of its run."""
+    m = mujoco.MjModel.from_xml_string(ARM.format(""))
+    run = recorded(m, (0.0,))
+    windows = window_set(m, [run], seconds, longest)
+    assert windows is not None
+    return m, Layout(m, places(m, scales_of(m, [run]))), windows
+
+
 def test_a_window_is_one_call_unless_an_effect_depends_on_the_state(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    m = mujoco.MjModel.from_xml_string(ARM.format(""))
-    run = recorded(m, (0.0,))
-    found = places(m, scales_of(m, [run]))
-    layout = Layout(m, found)
-    windows = window_set(m, [run], 0.05, 0.0)
-    assert windows is not None
+    m, layout, windows = made(0.05, 0.0)
     with engine.using("mujoco"):
         p = Predictor(m, ParameterSpace(()), layout, windows, DT)
     steps = p.steps * STEPS
@@ -58,12 +62,7 @@ def test_a_window_is_one_call_unless_an_effect_depends_on_the_state(
 @pytest.mark.parametrize("how", ["mjx", "mujoco"])
 def test_first_rows_alone_are_those_of_the_whole(how: Engine) -> None:
     """With nothing in the steps, with play, and where readings are late."""
-    m = mujoco.MjModel.from_xml_string(ARM.format(""))
-    run = recorded(m, (0.0,))
-    found = places(m, scales_of(m, [run]))
-    layout = Layout(m, found)
-    windows = window_set(m, [run], 0.2, 0.1)
-    assert windows is not None
+    m, layout, windows = made(0.2, 0.1)
     with engine.using(how):
         p = Predictor(m, ParameterSpace(()), layout, windows, DT)
     fields = [c.field for c in layout.columns]
@@ -80,11 +79,8 @@ def test_first_rows_alone_are_those_of_the_whole(how: Engine) -> None:
 
 @pytest.mark.parametrize("how", ["mjx", "mujoco"])
 def test_windows_of_every_length_go_through_one_program(how: Engine) -> None:
-    m = mujoco.MjModel.from_xml_string(ARM.format(""))
-    run = recorded(m, (0.0,))
-    layout = Layout(m, places(m, scales_of(m, [run])))
-    short, long = (window_set(m, [run], s, 0.1) for s in (0.2, 0.6))
-    assert short is not None and long is not None
+    m, layout, short = made(0.2, 0.1)
+    long = made(0.6, 0.1)[2]
     given, late = (m, ParameterSpace(()), layout), [c.field for c in layout.columns]
     with engine.using(how):
         alone = Predictor(*given, short, DT)
