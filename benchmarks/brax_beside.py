@@ -106,11 +106,7 @@ def solve(cell: Cell) -> dict[str, Any]:
         is; ``steps`` asked for, which both round up; ``steps_per_s``; ``seconds`` in
         all, compiling included.
     """
-    import jax
-    import numpy as np
-
     from easi_jax.baselines.policies import quiet
-    from easi_jax.rl.evaluate import evaluate
     from easi_jax.rl.presets import training_preset
     from envs import make
 
@@ -118,10 +114,21 @@ def solve(cell: Cell) -> dict[str, Any]:
     settings = quiet(training_preset(env, cell.algorithm))
     if cell.env_steps is not None:
         settings = dataclasses.replace(settings, env_steps=cell.env_steps)
+    return tried({"ours": ours, "brax": by_brax}[cell.way], env, settings, cell.seed)
+
+
+def tried(
+    train: Callable[[Any, Any, int], "Trained"], env: Any, settings: Any, seed: int
+) -> dict[str, Any]:
+    """What a training leads to; see `solve`."""
+    import jax
+    import numpy as np
+
+    from easi_jax.rl.evaluate import evaluate
+
     begun = time.monotonic()
-    train = {"ours": ours, "brax": by_brax}[cell.way]
-    act, policy, speed, steps = train(env, settings, cell.seed)
-    keys = jax.random.split(jax.random.key(10_000 + cell.seed), EPISODES)
+    act, policy, speed, steps = train(env, settings, seed)
+    keys = jax.random.split(jax.random.key(10_000 + seed), EPISODES)
     returns = jax.jit(lambda p, k: evaluate(env, env.model(), p, act, k))(policy, keys)
     return {
         "return": float(np.nanmean(np.asarray(returns))),

@@ -137,6 +137,10 @@ class PpoConfig:
     max_gradient: float = 1.0
     """Norm that gradients are cut to."""
 
+    clip_apart: bool = False
+    """Policy and value are each cut to it; else both together, where the gradient of a
+    value that errs by much leaves the policy's next to nothing."""
+
     discount: float = 0.99
     """Per control step."""
 

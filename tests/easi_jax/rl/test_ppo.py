@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax.training.agents.ppo.losses import PPONetworkParams
 from jax.sharding import Mesh
 
 from easi_jax.devices.mesh import make_mesh
@@ -174,6 +175,28 @@ def test_one_seed_uses_all_devices(ppo: Ppo, trained: Trained) -> None:
     chex.assert_trees_all_close(told, also, atol=1e-4)
     assert np.isfinite(told["eval_return"]).all()
     assert not both.returns.sharding.is_fully_replicated
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_a_policy_clipped_apart_does_not_hear_of_the_value(ppo: Ppo, apart: bool):
+    """A value that errs by much, once, takes the policy's next step away with it."""
+    config = replace(ppo.config, clip_apart=apart)
+    other = Ppo(ppo.env, config, bind=lambda theta: theta, draw=lambda dist, key: dist)
+    params = PPONetworkParams(policy=jnp.zeros(2), value=jnp.zeros(3))  # type: ignore
+
+    def steps(*errors: float) -> Any:
+        state, moved = other._optimizer.init(params), []
+        for error in errors:
+            given = params.replace(policy=jnp.full(2, 1e-3), value=jnp.full(3, error))
+            change, state = other._optimizer.update(
+                given, state, params, kl=jnp.zeros(())
+            )
+            moved.append(change.policy)
+        return moved
+
+    small, large = steps(0.0, 0.0), steps(1e3, 0.0)
+    alike = [np.allclose(a, b, rtol=1e-3) for a, b in zip(small, large, strict=True)]
+    assert alike[1] == apart
 
 
 @pytest.mark.parametrize(
