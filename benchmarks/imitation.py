@@ -8,16 +8,11 @@ ess_infogail``) and one that PPO trains by hand-made rewards, with the same step
 plays each at the demonstrated speeds. ``three skills`` are trot, pace and bound at
 once, 1, 0.22 and 0.05 of the episodes of the first, with labels on one step in 200.
 
-``UDR in the twin`` and ``EASI in the twin`` are the paper's Fig. 7 with this
-controller: it is trained under random physics, walks 40 s at 1.4 m/s in the twin of
-`benchmarks.twin` (NOT hardware), and imitates again under what EASI finds in this log.
+The paper's experiments with this controller are ``python -m benchmarks.paper fig7
+--robot go2-imitating``, and its others.
 """
 
 import dataclasses
-import fcntl
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -26,19 +21,17 @@ import numpy as np
 from benchmarks._cells import Share, run_cells
 from benchmarks._common import RESULTS, commits_of, markdown_table
 from benchmarks._page import Section, those
+from benchmarks.demonstrated import demonstrated, ran
 from train._command import main
 
 SPEEDS = (0.4, 0.8, 1.2, 1.6)  # m/s
 ESS, PPO, THREE = "Ess-InfoGAIL", "PPO, hand-made rewards", "three skills"
-UDR, EASI = "UDR in the twin", "EASI in the twin"
-METHODS = (ESS, PPO, UDR, EASI, THREE)
+METHODS = (ESS, PPO, THREE)
 GAITS = ("trot", "pace", "bound")
-SHARES = (1.0, 0.224, 0.05)
 LABELLED = 0.005
 NOISE = 0.1  # of actions, that of the demonstrations
 EPISODES = 10  # of each speed
 _FORWARD = "forward=0.4:1.6"
-_LONGEST = 4 * 3600.0  # s, of a command
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,9 +69,6 @@ def run(config: Config) -> None:
 
 def told(row: dict[str, Any]) -> str:
     """A line on a cell."""
-    if "spectrum" in row:
-        away = row["spectrum"]["distance_db"]
-        return f"tracking error {row['tracking_error']}, motion {away} dB off"
     if "nmi" in row:
         return f"NMI {row['nmi']:.2f}, prior off by {row['prior']:.2f}"
     return f"told apart {row['told_apart']:.2f}, {row['seconds']:.0f} s"
@@ -88,8 +78,6 @@ def solve(cell: Cell, config: Config) -> dict[str, Any]:
     """Trains what is missing, plays, measures."""
     if cell.method == THREE:
         return _three(cell, config)
-    if cell.method in (UDR, EASI):
-        return _in_twin(cell, config)
     shown, shown_s = demonstrated(config.folder, ("trot",), config.env_steps)
     words = ["--robot", "go2", "--fixed", "--option", _FORWARD]
     if cell.method == ESS:
@@ -102,46 +90,6 @@ def solve(cell: Cell, config: Config) -> dict[str, Any]:
 
 
 _IMITATES = ["rewarded=command", "--algorithm", "ess_infogail", "--demonstrations"]
-
-
-def demonstrated(
-    folder: Path, gaits: tuple[str, ...], env_steps: int
-) -> tuple[Path, float]:
-    """The log of demonstrations, and the seconds that making it took."""
-    from train.demonstrate import LOG
-
-    out = folder / f"shown_{'_'.join(gaits)}_{env_steps}"
-    shares = ["--shares", *SHARES] if len(gaits) > 1 else []
-    seconds = ran(
-        *("train.demonstrate", out, "--gaits", *gaits, *shares),
-        *("--env-steps", env_steps),
-    )
-    return out / LOG, seconds
-
-
-def ran(module: str, out: Path, *words: object) -> float:
-    """Seconds of a command with the run folder ``out``, now or before.
-
-    Raises:
-        RuntimeError: it failed; it has said why.
-    """
-    from easi_jax.io.files import atomic_write, read_json, to_json
-
-    told = out / "seconds.json"
-    out.parent.mkdir(parents=True, exist_ok=True)
-    # Another process may be at it: its result will do.
-    with Path(f"{out}.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if told.exists():
-            return float(read_json(told)["seconds"])
-        begun = time.monotonic()
-        given = [*map(str, words), "--out", str(out), "--resume"]
-        done = subprocess.run([sys.executable, "-m", module, *given], timeout=_LONGEST)
-        if done.returncode:
-            raise RuntimeError(f"{module} failed with {done.returncode}")
-        seconds = time.monotonic() - begun
-        atomic_write(told, to_json({"seconds": seconds}))
-    return seconds
 
 
 # -- what is measured ------------------------------------------------------------------
@@ -274,49 +222,6 @@ def _three(cell: Cell, config: Config) -> dict[str, Any]:
     }
 
 
-def _in_twin(cell: Cell, config: Config) -> dict[str, Any]:
-    """Fig. 7 of the paper: spectrum of joint motion, and speed over commands."""
-    import jax
-
-    from benchmarks import paper_twin
-    from benchmarks.paper_cells import Cell as PaperCell
-    from benchmarks.twin import GO2, Twin
-    from benchmarks.twin_measures import rounded, spectra, tracking
-    from train._robots import load_udr
-
-    shown = demonstrated(config.folder, ("trot",), config.env_steps)[0]
-    out = config.folder / f"udr_{config.env_steps}_{cell.seed}"
-    seconds = ran(
-        *("train.udr", out, "--robot", "go2", "--option", _FORWARD, *_IMITATES, shown),
-        *("--seeds", cell.seed, "--env-steps", config.env_steps),
-    )
-    udr = load_udr(out)
-    env, walker = udr["env"], paper_twin.walker()
-    first = jax.tree.map(lambda x: x[0], udr["policies"])
-    twin = Twin(env, GO2)
-    logs = paper_twin.walked(twin, first, 2 * cell.seed)
-    row: dict[str, Any] = {
-        "stands_for": "hardware, which it is not: a simulation in MuJoCo C",
-        "seconds": seconds,
-    }
-    policy, theta = first, None
-    if cell.method == EASI:
-        place = config.folder / f"twin_{config.env_steps}_{cell.seed}"
-        place.mkdir(parents=True, exist_ok=True)
-        as_in_paper = PaperCell("EASI default", "go2", paper_twin.TWIN, cell.seed)
-        found = paper_twin.identified(as_in_paper, place, walker, first, twin, logs)
-        policy = paper_twin.trained(
-            as_in_paper, place, env, found, training=udr["training"]
-        )
-        theta = found["mean"]
-        row |= {k: found[k] for k in ("names", "mean", "std", "identify_s")}
-    seed = 2 * cell.seed + 1  # other starts than those that were logged
-    row |= tracking(twin, policy, seed)
-    row["spectrum"] = spectra(walker, first, seed, paper_twin.LOGGED, logs, theta)
-    row["logged_falls"] = len(logs) - 1
-    return row | {"nominal": rounded(walker.space.nominal)}
-
-
 # -- the page --------------------------------------------------------------------------
 
 
@@ -379,35 +284,6 @@ def _skills(rows: list[dict[str, Any]]) -> list[str]:
     ]
 
 
-def _twins(rows: list[dict[str, Any]]) -> list[str]:
-    lines = [
-        (
-            *(r["method"], r["seed"]),
-            "-"
-            if r["spectrum"]["distance_db"] is None
-            else f"{r['spectrum']['distance_db']:.1f}",
-            ", ".join("-" if v is None else f"{v:.2f}" for v in r["speed"]),
-            "-" if r["tracking_error"] is None else f"{r['tracking_error']:.3f}",
-            f"{sum(r['fallen'])} of {4 * len(r['fallen'])}",
-        )
-        for r in rows
-    ]
-    commands = ", ".join(f"{v:g}" for v in rows[0]["commands"])
-    return [
-        "Fig. 7 of the paper with this controller, in a twin, which is a simulation "
-        f"and no hardware (commits {commits_of(rows)}). The first policy's motion in "
-        "the twin is compared with that in the model: nominal for UDR, as found for "
-        f"EASI. Speeds are at commands of {commands} m/s:",
-        markdown_table(
-            (
-                *("method", "seed", "motion off by [dB]", "speeds in the twin [m/s]"),
-                *("RMS speed error [m/s]", "falls"),
-            ),
-            lines,
-        ),
-    ]
-
-
 SECTIONS = (
     Section(
         "## A Go2 that imitates",
@@ -415,9 +291,6 @@ SECTIONS = (
         "imitation",
         _walks,
         those(lambda r: "speeds" in r),
-    ),
-    Section(
-        "", "imitation.jsonl", "imitation", _twins, those(lambda r: "spectrum" in r)
     ),
     Section("", "imitation.jsonl", "imitation", _skills, those(lambda r: "nmi" in r)),
 )

@@ -13,6 +13,29 @@ EPISODES = 100
 # Control steps that a search may simulate: what EASI takes at most, its finish
 # included; where not given, that of the paper's 50 generations.
 BUDGETS = {"cartpole": 60_000_000}
+
+
+@dataclasses.dataclass(frozen=True)
+class Machine:
+    """What a cell calls a robot.
+
+    Attributes:
+        robot: built-in.
+        algorithm: of all its trainings; its preset's where None.
+        options: of the robot, ``NAME=VALUE``.
+    """
+
+    robot: str
+    algorithm: str | None = None
+    options: tuple[str, ...] = ()
+
+
+# Built-in robots with another controller than their presets'. The paper's Go2 imitates:
+# its reward is the command alone, and it is taught a trot at 0.4 to 1.6 m/s.
+IMITATING = "go2-imitating"
+CONTROLLED = {
+    IMITATING: Machine("go2", "ess_infogail", ("rewarded=command", "forward=0.4:1.6"))
+}
 # Their trainings go on from UDR's networks, as GARAT's does.
 WARM = ("Oracle, warm start", "EASI default, warm start")
 
@@ -23,7 +46,7 @@ class Cell:
 
     Attributes:
         method: a name in `METHODS`.
-        robot: built-in robot.
+        robot: built-in robot, or a name in `CONTROLLED`.
         target: the machine: nominal but for ``NAME*FACTOR``; empty: nominal.
         seed: of everything random.
         trajectories: demonstrations.
@@ -47,6 +70,35 @@ class Cell:
     policy: bool = True
     curves: bool = False
     options: tuple[str, ...] = ()
+
+    @property
+    def machine(self) -> Machine:
+        """The robot and what controls it."""
+        own = CONTROLLED.get(self.robot, Machine(self.robot))
+        return dataclasses.replace(own, options=(*own.options, *self.options))
+
+    def env(self) -> Any:
+        """The robot as an environment."""
+        from envs import open_env
+
+        return open_env(self.machine.robot, None, self.machine.options)
+
+    def training(self, env: Any, folder: Path) -> Any:
+        """Settings of its trainings; what these imitate is made in ``folder`` where it
+        is not there yet."""
+        from train._robots import training_config
+
+        shown = self.shown(folder)
+        imitated = {} if shown is None else {"demonstrations": shown}
+        return training_config(env, self.env_steps, self.machine.algorithm, imitated)
+
+    def shown(self, folder: Path) -> Path | None:
+        """The log of what its policies imitate, if they do."""
+        from benchmarks.demonstrated import demonstrated
+
+        if self.robot != IMITATING:
+            return None
+        return demonstrated(folder, ("trot",), self.env_steps)[0]
 
     @property
     def key(self) -> str:
@@ -81,7 +133,7 @@ def identifiers() -> dict[str, Callable[[Cell], Any]]:
 
     def easi(preset: str, refine: bool) -> Callable[[Cell], Any]:
         return lambda cell: Easi(
-            search_config(preset, cell.settings, cell.robot), refine
+            search_config(preset, cell.settings, cell.machine.robot), refine
         )
 
     return {
@@ -105,7 +157,7 @@ def learners() -> dict[str, Callable[[Cell], Any]]:
     return {
         "Oracle": lambda _: Oracle(),
         WARM[0]: lambda _: Oracle(warm_start=True),
-        "FineTune": lambda cell: FineTune(random_steps=_random(cell.robot)),
+        "FineTune": lambda cell: FineTune(random_steps=_random(cell.machine.robot)),
         "FineTune, no random actions": lambda _: FineTune(random_steps=0),
         "GARAT": lambda _: Garat(),
     }
@@ -256,11 +308,10 @@ class _Bench:
             stage_keys,
             target_parameters,
         )
-        from envs import open_env
-        from train._robots import load_udr, training_config
+        from train._robots import load_udr
 
-        env = open_env(cell.robot, None, cell.options)
-        training = training_config(env, cell.env_steps)
+        env = cell.env()
+        training = cell.training(env, folder)
         training = training if cell.curves else quiet(training)
         changes = (cell.target,) if cell.target else ()
         target = jnp.asarray(target_parameters(env.space, changes), jnp.float32)
@@ -488,8 +539,10 @@ def udr_run(cell: Cell, folder: Path) -> Path:
             return out
         udr.run(
             udr.Config(
-                robot=cell.robot,
-                option=cell.options,
+                robot=cell.machine.robot,
+                option=cell.machine.options,
+                algorithm=cell.machine.algorithm,
+                demonstrations=cell.shown(folder),
                 out=out,
                 seeds=(cell.seed,),
                 env_steps=cell.env_steps,

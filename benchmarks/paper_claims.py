@@ -6,6 +6,7 @@ were not run is shown as not run. ``python -m benchmarks.summary`` writes the pa
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from itertools import product
 from pathlib import Path
 from statistics import mean, median, stdev
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 from benchmarks._common import markdown_table
 from benchmarks._page import load
 from benchmarks.paper_cells import WARM, is_stale
-from benchmarks.paper_experiments import CHANGED, SEARCHES, STARTS
+from benchmarks.paper_experiments import CHANGED, SEARCHES, STARTS, robots
 from benchmarks.paper_tables import (
     GOAL,
     OURS,
@@ -250,14 +251,15 @@ def _few(rows: Rows) -> Answer:
 
 def _twin(
     rows: Rows,
-    robot: str,
+    experiment: str,
     measures: dict[str, Callable[[Row], Any]],
     beside: dict[str, Callable[[Row], Any]] | None = None,
 ) -> Answer:
     """Whether each of ``measures`` is below UDR's; what is ``beside`` is shown only."""
-    found = in_twin(robot, rows.paper)
     figures, holds = [], []
-    for what, value in {**measures, **(beside or {})}.items():
+    every = product(robots(experiment), {**measures, **(beside or {})}.items())
+    for robot, (what, value) in every:
+        found = in_twin(robot, rows.paper)
         by = {}
         for m, mine in found.items():
             known = [v for v in map(value, mine) if v is not None]
@@ -266,7 +268,7 @@ def _twin(
         if "UDR" not in by:
             continue
         told = ", ".join(f"{_short(m)} {v:.2f}" for m, v in by.items())
-        figures.append(f"{what}: {told}")
+        figures.append(f"{robot}, {what}: {told}")
         if what in measures:
             holds += [v < by["UDR"] for m, v in by.items() if m != "UDR"]
     return Answer(figures, holds)
@@ -274,7 +276,7 @@ def _twin(
 
 def _cart(rows: Rows) -> Answer:
     return _twin(
-        *(rows, "cartpole"),
+        *(rows, "table2"),
         {
             "pole angle [0.01 rad]": lambda r: r["angle_error"],
             "cart speed [0.1 m/s]": lambda r: r["speed"],
@@ -284,14 +286,14 @@ def _cart(rows: Rows) -> Answer:
 
 def _spectrum(rows: Rows) -> Answer:
     return _twin(
-        *(rows, "go2"),
+        *(rows, "fig7"),
         {"joint motion from the twin's [dB]": lambda r: r["spectrum"]["distance_db"]},
     )
 
 
 def _tracking(rows: Rows) -> Answer:
     return _twin(
-        *(rows, "go2"),
+        *(rows, "fig7"),
         {"speed from command [m/s]": lambda r: r["tracking_error"]},
         {"falls in 28 episodes": lambda r: float(sum(r["fallen"]))},
     )

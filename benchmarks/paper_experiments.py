@@ -9,7 +9,7 @@ import tyro
 from benchmarks import paper_twin
 from benchmarks._cells import Share
 from benchmarks._common import at_least_one
-from benchmarks.paper_cells import METHODS, Cell
+from benchmarks.paper_cells import IMITATING, METHODS, Cell
 from benchmarks.paper_runtime import WAYS
 from benchmarks.rival_cells import AFTER_GAP
 
@@ -21,11 +21,17 @@ CHANGED = {
     "ant": "torso_mass",
     "ballbalance": "ball_mass",
     "go2": "thigh_kp",
+    IMITATING: "thigh_kp",
 }
 MUST = METHODS[:7]
 WHOLE = ("status", "all")
-# Of one robot, whatever --robot says.
-OF_ONE = {"table2": "cartpole", "fig7": "go2", "appendix_a": "go2"}
+# Robots of experiments that are not of all; the first is taken for any other.
+OF_SOME = {
+    "table2": ("cartpole",),
+    "fig7": ("go2", IMITATING),
+    "appendix_a": ("go2",),
+    "runtime": tuple(x for x in CHANGED if x != IMITATING),
+}
 ON_HARDWARE = ("UDR", "EASI paper", "EASI default", AFTER_GAP)
 SEARCHES = ("EASI paper", "EASI default, not refined")
 # Where searches start: as UDR trains, for a target with one value halved; then, for one
@@ -41,11 +47,13 @@ class Config(Share):
     experiment: Annotated[str, tyro.conf.Positional]
     """fig4, fig5, fig6, fig7, table1, table2, table3, table4, table5, appendix_a (go2),
     runtime; table2 is of cartpole's and fig7 of go2's twin, simulations in place of
-    hardware, whatever --robot says. Or status: what stands of all of them; all: run
+    hardware. Or status: what stands of all of them; all: run
     what is missing or stale, the experiment that takes least first."""
     robot: str = ""
-    """Built-in robot; where not given, cartpole, and every robot for status and all.
-    """
+    """cartpole, ant, ballbalance, go2, or go2-imitating: Go2 with the paper's
+    controller, Ess-InfoGAIL, whose demonstrations are made first (--folder). Where not
+    given, or where the experiment is of others, the first that it is of; for status and
+    all every one."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds, paired over methods."""
     methods: tuple[str, ...] = ()
@@ -79,10 +87,12 @@ def cells(config: Config) -> list[Cell]:
         known = ", ".join((*EXPERIMENTS, *WHOLE))
         hint = nearest(config.experiment, (*EXPERIMENTS, *WHOLE))
         raise UserError(f'experiment "{config.experiment}": {known}{hint}')
-    config = dataclasses.replace(config, robot=config.robot or "cartpole")
-    if config.robot not in CHANGED:
+    if config.robot not in ("", *CHANGED):
         hint = nearest(config.robot, CHANGED)
         raise UserError(f"--robot {config.robot}: {', '.join(CHANGED)}{hint}")
+    known = robots(config.experiment)
+    robot = config.robot if config.robot in known else known[0]
+    config = dataclasses.replace(config, robot=robot)
     for m in config.methods:
         if m not in METHODS:
             raise UserError(f'--methods "{m}": unknown{nearest(m, METHODS)}')
@@ -93,6 +103,11 @@ def cells(config: Config) -> list[Cell]:
                 raise UserError(f"{AFTER_GAP}: of table2 and fig7, where logs are all")
             found.append(dataclasses.replace(c, env_steps=config.env_steps))
     return found
+
+
+def robots(experiment: str) -> tuple[str, ...]:
+    """Robots that an experiment is of."""
+    return OF_SOME.get(experiment, tuple(CHANGED))
 
 
 def _returns(config: Config, seed: int, factors: tuple[float, ...]) -> list[Cell]:
@@ -117,7 +132,7 @@ def _fig6(config: Config, seed: int) -> list[Cell]:
 def _table2(config: Config, seed: int) -> list[Cell]:
     """In the paper on a real Cartpole; here in a twin (`benchmarks.twin`)."""
     return [
-        Cell(m, "cartpole", "twin", seed, trajectories=50)
+        Cell(m, config.robot, "twin", seed, trajectories=50)
         for m in config.methods or ON_HARDWARE
     ]
 
@@ -125,7 +140,7 @@ def _table2(config: Config, seed: int) -> list[Cell]:
 def _fig7(config: Config, seed: int) -> list[Cell]:
     """In the paper on a real Go2; here in a twin (`benchmarks.twin`)."""
     methods = config.methods or ON_HARDWARE
-    return [Cell(m, "go2", "twin", seed, trajectories=1) for m in methods]
+    return [Cell(m, config.robot, "twin", seed, trajectories=1) for m in methods]
 
 
 def _table3(config: Config, seed: int) -> list[Cell]:
@@ -142,7 +157,6 @@ def _fig4(config: Config, seed: int) -> list[Cell]:
 
 
 def _appendix_a(config: Config, seed: int) -> list[Cell]:
-    config = dataclasses.replace(config, robot="go2")
     return _traced(config, seed, "FR_thigh_kp*0.5", ("parameters=full",))
 
 

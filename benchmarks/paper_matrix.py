@@ -6,13 +6,12 @@ from typing import Any
 from benchmarks._common import commits_of, markdown_table
 from benchmarks.paper_cells import METHODS, changes, is_stale
 from benchmarks.paper_experiments import (
-    CHANGED,
     EXPERIMENTS,
     MUST,
-    OF_ONE,
     SEARCHES,
     Config,
     cells,
+    robots,
 )
 from benchmarks.rival_cells import AFTER_GAP
 
@@ -26,7 +25,7 @@ def paragraphs(rows: Iterable[Row]) -> list[str]:
     have = {r["key"]: r for r in rows}
     lines, none = [], []
     for name in EXPERIMENTS:
-        for robot in (OF_ONE[name],) if name in OF_ONE else CHANGED:
+        for robot in robots(name):
             every = cells(Config(name, robot=robot))
             mine = [have[c.key] for c in every if c.key in have]
             if not mine:

@@ -19,7 +19,7 @@ from typing import Any
 
 from benchmarks._cells import check_out, read_rows
 from benchmarks.paper_cells import METHODS, Cell, changes, is_stale
-from benchmarks.paper_experiments import CHANGED, EXPERIMENTS, OF_ONE, Config, cells
+from benchmarks.paper_experiments import EXPERIMENTS, Config, cells, robots
 from benchmarks.paper_runtime import WAYS
 from train._command import say, show_table
 
@@ -55,7 +55,7 @@ def parts(config: Config, rows: Iterable[Row]) -> list[Part]:
     have = {r["key"]: r for r in rows}
     found = []
     for name in EXPERIMENTS:
-        for robot in (OF_ONE[name],) if name in OF_ONE else CHANGED:
+        for robot in robots(name):
             if config.robot not in ("", robot):
                 continue
             one = dataclasses.replace(config, experiment=name, robot=robot, methods=())

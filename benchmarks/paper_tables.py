@@ -16,8 +16,15 @@ from benchmarks import paper_matrix
 from benchmarks._cells import read_rows
 from benchmarks._common import markdown_table
 from benchmarks._page import Named, Section, each_of, met, named, table, those
-from benchmarks.paper_cells import METHODS, WARM
-from benchmarks.paper_experiments import CHANGED, MUST, ON_HARDWARE, SEARCHES, STARTS
+from benchmarks.paper_cells import IMITATING, METHODS, WARM
+from benchmarks.paper_experiments import (
+    CHANGED,
+    MUST,
+    ON_HARDWARE,
+    SEARCHES,
+    STARTS,
+    robots,
+)
 from benchmarks.paper_runtime import WAYS
 from benchmarks.paper_twin import TWIN
 from benchmarks.twin_measures import COMMANDS, EPISODES, TRACKED
@@ -59,7 +66,7 @@ SHOWN = {
     "cartpole": ("cart_kp", "pole_armature"),
     "ant": ("torso_mass", "foot_mass"),
     "ballbalance": ("knee_kp", "ball_mass"),
-    "go2": ("thigh_kp", "base_mass"),
+    **dict.fromkeys(("go2", IMITATING), ("thigh_kp", "base_mass")),
 }
 _NOT_RUN = "not run"
 _EXACT = 1e-3  # log ratios below it train the same policy, but for chance
@@ -102,11 +109,10 @@ def _drawn(rows: Sequence[Row]) -> Named:
     ):
         texts = {x: draw([r for r in plain if r["robot"] == x]) for x in CHANGED}
         out[figure] = {f"paper_{figure}_{x}.svg": t for x, t in texts.items() if t}
-    for figure, name, text in (
-        ("fig7", "paper_fig7_go2.svg", _drawn_fig7(rows)),
-        ("appendix_a", "paper_appendix_a.svg", _drawn_appendix_a(rows)),
-    ):
-        out[figure] = {name: text} if text else {}
+    texts = {x: _drawn_fig7(x, rows) for x in robots("fig7")}
+    out["fig7"] = {f"paper_fig7_{x}.svg": t for x, t in texts.items() if t}
+    text = _drawn_appendix_a(rows)
+    out["appendix_a"] = {"paper_appendix_a.svg": text} if text else {}
     return out
 
 
@@ -315,7 +321,7 @@ def in_twin(robot: str, rows: Sequence[Row]) -> dict[str, list[Row]]:
     return {m: f for m, f in found.items() if f}
 
 
-def _fig7(found: dict[str, list[Row]]) -> list[str]:
+def _fig7(robot: str, found: dict[str, list[Row]]) -> list[str]:
     def speed(rows: Sequence[Row]) -> str:
         speeds = [v for r in rows for v in r["speed"]]
         left = sum(v is not None for v in speeds)
@@ -335,18 +341,24 @@ def _fig7(found: dict[str, list[Row]]) -> list[str]:
         ),
     }
     return [
-        f"{_NO_HARDWARE} Go2; one log of 40 s at 1.4 m/s. The UDR policy's joint "
-        "motion in the simulation as given (UDR) or as identified (EASI), against that "
-        "in the twin, RMS over 0.25 to 10 Hz; speeds are of each method's own policy, "
-        "at commands at which it does not fall.",
+        f"{_NO_HARDWARE} Go2 ({_CONTROLLERS[robot]}); one log of 40 s at 1.4 m/s. The "
+        "UDR policy's joint motion in the simulation as given (UDR) or as identified "
+        "(EASI), against that in the twin, RMS over 0.25 to 10 Hz; speeds are of each "
+        "method's own policy, at commands at which it does not fall.",
         table(found.items(), columns),
     ]
 
 
-def _drawn_fig7(rows: Sequence[Row]) -> str:
+_CONTROLLERS = {
+    "go2": "its controller is PPO with hand-made rewards",
+    IMITATING: "its controller is the paper's, Ess-InfoGAIL",
+}
+
+
+def _drawn_fig7(robot: str, rows: Sequence[Row]) -> str:
     from benchmarks.paper_figures import motion_and_speed
 
-    mine = in_twin("go2", rows)
+    mine = in_twin(robot, rows)
     first = {m: found[0] for m, found in mine.items()}
     if "UDR" not in first or first["UDR"]["spectrum"]["twin"] is None:
         return ""
@@ -671,7 +683,13 @@ SECTIONS = (
     _part("### Table 4: parameter error by μ/λ", "table4", _table4, _RATIO),
     _part(_TITLE5, "table5", _swept, _UPDATES),
     _part(_TITLE4, "fig4", _fig4, those(_traced)),
-    _part("### Fig. 7: walking in a twin", "fig7", _fig7, partial(in_twin, "go2")),
+    *(
+        _part(
+            *("" if i else "### Fig. 7: walking in a twin", f"fig7 --robot {x}"),
+            *(partial(_fig7, x), partial(in_twin, x)),
+        )
+        for i, x in enumerate(robots("fig7"))
+    ),
     _part(_TITLE_A, "appendix_a", _appendix_a, those(lambda r: r["options"])),
     _part(_TITLE_TIME, "runtime", _runtime, those(lambda r: r["method"] in WAYS)),
     _part("", "{name}", _shown, _drawn),

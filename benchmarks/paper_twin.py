@@ -50,14 +50,13 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
     from benchmarks.twin import GAPS, Twin
     from benchmarks.twin_measures import balancing, spectra, tracking
     from easi_jax.errors import UserError
-    from envs import make
     from train._robots import load_udr
 
     if cell.method not in ("UDR", *_PRESETS):
         raise UserError(f"no {cell.method} in a twin: UDR, {', '.join(_PRESETS)}")
     begun = time.monotonic()
-    env = make(cell.robot)
-    twin = Twin(env, GAPS[cell.robot])
+    env = cell.env()
+    twin = Twin(env, GAPS[cell.machine.robot])
     udr = load_udr(udr_run(cell, folder))
     first = jax.tree.map(lambda x: x[0], udr["policies"])
     logs = record(twin, first, cell)
@@ -72,7 +71,7 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
         place = folder / re.sub(r"\W+", "_", f"{cell.key}, recipe {made}")
         place.mkdir(parents=True, exist_ok=True)
         found = identified(cell, place, env, first, twin, logs)
-        policy = trained(cell, place, with_effects(env, place), found)
+        policy = trained(cell, folder, place, with_effects(env, place), found)
         row |= {k: v for k, v in found.items() if k not in ("unit_mean", "unit_cov")}
     seed = 2 * cell.seed + 1  # other starts than those that were logged
     if cell.robot == "cartpole":
@@ -184,12 +183,12 @@ def _by_command(
         "resume": True,
     }
     if cell.method == AFTER_GAP:
-        _named(cell.robot, place)
+        _named(cell.machine.robot, place)
         known = read_json(place / "gap" / "gap.json")
         told = {k: known[k] for k in ("effects", "refitted", "gap", "verdict")}
     easi.run(
         easi.Config(
-            robot=cell.robot,
+            robot=cell.machine.robot,
             effects=place / _FOUND if told else None,
             set=cell.settings,
             seeds=(cell.seed,),
@@ -268,7 +267,7 @@ def by_controller(
     key = stage_keys(seed_keys([cell.seed]))["search"][0]
     # A log holds positions and speeds, and not what the controller saw.
     unseen = {"observation_inputs": False, "mask_resets": True}
-    config = search_config("paper", cell.settings, cell.robot, **unseen)
+    config = search_config("paper", cell.settings, cell.machine.robot, **unseen)
     found = Easi(config).fit(task, demos, Budget(), key)
     dist = found.distribution
     return {
@@ -286,10 +285,9 @@ def _flat(x: Any) -> Any:
 
 
 def trained(
-    cell: Cell, place: Path, env: Any, found: dict[str, Any], training: Any = None
+    cell: Cell, folder: Path, place: Path, env: Any, found: dict[str, Any]
 ) -> Any:
-    """The policy of a whole training under what was found, in chunks; ``training`` are
-    its settings, the robot's own where not given."""
+    """The policy of a whole training under what was found, in chunks."""
     import jax
     import jax.numpy as jnp
 
@@ -297,11 +295,11 @@ def trained(
     from easi_jax.io.runs.folder import RunFolder
     from easi_jax.model import distribution
     from easi_jax.pipeline.stages import Pipeline, PipelineConfig, seed_keys, stage_keys
-    from train._robots import search_config, training_chunk, training_config
+    from train._robots import search_config, training_chunk
     from train._stages import jit_chunks, run_stage
 
-    training = quiet(training or training_config(env, cell.env_steps))
-    search = search_config(_PRESETS[cell.method], cell.settings, cell.robot)
+    training = quiet(cell.training(env, folder))
+    search = search_config(_PRESETS[cell.method], cell.settings, cell.machine.robot)
     pipe = Pipeline(env, PipelineConfig(search=search, training=training))
     mean, cov = whole(pipe.space, found)
     dist = pipe.spread(distribution.gaussian(pipe.space, mean, cov), 1)

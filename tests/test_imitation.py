@@ -64,7 +64,7 @@ def test_circles_on_the_page() -> None:
     assert "44%, 44%, 10%, 2%" in text
 
 
-def test_walks_skills_and_twins_on_the_page() -> None:
+def test_walks_and_skills_on_the_page() -> None:
     speeds = [
         {
             "speed": v,
@@ -91,13 +91,6 @@ def test_walks_skills_and_twins_on_the_page() -> None:
     }
     text = "\n".join(imitation._skills([skills]))
     assert "one step in 200" in text and "| 0 | 0.95 | 0.10 | 0.06 |" in text
-    twin = shared | {
-        **{"method": imitation.UDR, "commands": [0.4, 1.6], "speed": [0.3, None]},
-        **{"fallen": [0, 4], "tracking_error": 0.1},
-        "spectrum": {"distance_db": 3.21},
-    }
-    text = "\n".join(imitation._twins([twin]))
-    assert "| UDR in the twin | 0 | 3.2 | 0.30, - | 0.100 | 4 of 8 |" in text
 
 
 def test_windows_of_episodes_that_ended() -> None:

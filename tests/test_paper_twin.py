@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -12,15 +13,24 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks import paper, paper_experiments, paper_twin, twin_measures
+from benchmarks import (
+    demonstrated,
+    paper,
+    paper_experiments,
+    paper_twin,
+    twin_measures,
+)
 from benchmarks.paper_cells import Cell
 from benchmarks.rival_cells import AFTER_GAP
 from benchmarks.twin import CARTPOLE, GAPS, GO2, Gap, Motor, Twin
 from benchmarks.twin_runs import commanded, play
+from easi_jax.data.recording import Run
 from easi_jax.errors import UserError
 from easi_jax.io.logs.reader import read_logs, write_log
 from easi_jax.io.models.effects_file import write_effects
 from easi_jax.model.found_effects import EffectEntry
+from easi_jax.model.joint_space import Configuration
+from easi_jax.rl.config import EssInfoGailConfig
 from easi_jax.rl.evaluate import evaluate
 from easi_jax.rl.networks import PolicyParams, act
 from envs import make
@@ -322,8 +332,13 @@ def test_what_the_gap_workflow_named_is_in_search_and_training(tmp_path: Path) -
 
 
 def test_cells_are_of_the_twins_and_named_so() -> None:
-    for experiment, robot in (("table2", "cartpole"), ("fig7", "go2")):
-        cells = paper.cells(paper.Config(experiment, seeds=(0, 1)))
+    for experiment, robot, given in (
+        ("table2", "cartpole", "ant"),
+        ("fig7", "go2", ""),
+        ("fig7", "go2-imitating", "go2-imitating"),
+    ):
+        config = paper.Config(experiment, robot=given, seeds=(0, 1))
+        cells = paper.cells(config)
         assert [c.method for c in cells[:4]] == list(paper_experiments.ON_HARDWARE)
         assert all("twin" in c.key and c.robot == robot for c in cells)
     with pytest.raises(UserError, match="of table2 and fig7"):
@@ -332,9 +347,43 @@ def test_cells_are_of_the_twins_and_named_so() -> None:
         paper_twin.solve(Cell("GARAT", "cartpole", "twin", 0), Path("none"))
 
 
+def test_the_papers_go2_imitates_and_is_paid_for_its_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every training of a cell imitates one log, which is made once."""
+    env, made = ENVS["go2"], []
+
+    def command(words: list[str], **more: Any) -> Any:
+        assert words[1:3] == ["-m", "train.demonstrate"]
+        made.append(words)
+        physics, rows = first("go2"), np.arange(300)
+        log = Path(words[words.index("--out") + 1]) / "demonstrations.npz"
+        log.parent.mkdir()
+        qpos = np.tile(np.asarray(physics.qpos), (300, 1))
+        qpos[:, 0] += 0.02 * rows
+        qpos[:, 7:] += 0.1 * np.sin(0.7 * rows[:, None] + np.arange(12))
+        run = Run(
+            *("trot", "made", env.dt, env.dt * rows, qpos),
+            *(np.zeros((300, 18)), True, qpos[:, 7:]),
+            configuration=Configuration.of(env.mj_model),
+        )
+        write_log(log, env.mj_model, [run])
+        return SimpleNamespace(returncode=0)
+
+    monkeypatch.setattr(demonstrated.subprocess, "run", command)
+    cell = Cell("EASI default", "go2-imitating", "twin", 0)
+    assert cell.env().rewarded == "command"
+    for _ in range(2):
+        training = cell.training(cell.env(), tmp_path)
+        assert isinstance(training, EssInfoGailConfig)
+        assert training.demonstrations is not None
+    assert len(made) == 1 and made[0].count("trot") == 1
+    assert Cell("UDR", "go2", "twin", 0).shown(tmp_path) is None
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
-@pytest.mark.parametrize("robot", ["cartpole", "go2"])
+@pytest.mark.parametrize("robot", ["cartpole", "go2", "go2-imitating"])
 def test_cells_at_their_smallest(
     robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

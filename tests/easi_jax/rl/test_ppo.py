@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.training.agents.ppo.losses import PPONetworkParams
 from jax.sharding import Mesh
 
 from easi_jax.devices.mesh import make_mesh
@@ -182,16 +181,26 @@ def test_a_policy_clipped_apart_does_not_hear_of_the_value(ppo: Ppo, apart: bool
     """A value that errs by much, once, takes the policy's next step away with it."""
     config = replace(ppo.config, clip_apart=apart)
     other = Ppo(ppo.env, config, bind=lambda theta: theta, draw=lambda dist, key: dist)
-    params = PPONetworkParams(policy=jnp.zeros(2), value=jnp.zeros(3))  # type: ignore
+    shapes = jax.eval_shape(
+        lambda key: other.init(key, probe_models()["constant"]).params,
+        jax.random.key(0),
+    )
+
+    def filled(policy: float, value: float) -> Any:
+        return shapes.replace(
+            policy=jax.tree.map(lambda x: jnp.full(x.shape, policy), shapes.policy),
+            value=jax.tree.map(lambda x: jnp.full(x.shape, value), shapes.value),
+        )
 
     def steps(*errors: float) -> Any:
+        params = filled(0.0, 0.0)
         state, moved = other._optimizer.init(params), []
         for error in errors:
-            given = params.replace(policy=jnp.full(2, 1e-3), value=jnp.full(3, error))
+            given = filled(1e-4, error)
             change, state = other._optimizer.update(
                 given, state, params, kl=jnp.zeros(())
             )
-            moved.append(change.policy)
+            moved.append(jax.tree.leaves(change.policy)[0])
         return moved
 
     small, large = steps(0.0, 0.0), steps(1e3, 0.0)
