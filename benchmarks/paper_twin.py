@@ -32,6 +32,26 @@ _FOUND = "gap/effects.yaml"  # in a cell's folder
 _PRESETS = {"EASI paper": "paper", "EASI default": "default", AFTER_GAP: "default"}
 
 
+@dataclasses.dataclass(frozen=True)
+class Transferred:
+    """What a cell comes to before it is tested.
+
+    Attributes:
+        twin: the machine.
+        first: UDR's policy, which was logged; ``logs`` of it.
+        policy: the method's own.
+        found: see `identified`; None for UDR.
+        place: folder of what was found.
+    """
+
+    twin: Any
+    first: Any
+    logs: list[Any]
+    policy: Any
+    found: dict[str, Any] | None
+    place: Path
+
+
 def solve(cell: Cell, folder: Path) -> dict[str, Any]:
     """Runs a cell; trainings go on where they were stopped.
 
@@ -45,43 +65,56 @@ def solve(cell: Cell, folder: Path) -> dict[str, Any]:
     Raises:
         UserError: a method without a cell here.
     """
+    from benchmarks.twin_measures import balancing, spectra, tracking
+
+    begun = time.monotonic()
+    got = transferred(cell, folder)
+    row: dict[str, Any] = {
+        "stands_for": "hardware, which it is not: a simulation in MuJoCo C",
+        "logged": int(sum(log.steps.sum() for log in got.logs)),
+    }
+    found = got.found or {}
+    row |= {k: v for k, v in found.items() if k not in ("unit_mean", "unit_cov")}
+    seed = 2 * cell.seed + 1  # other starts than those that were logged
+    if cell.robot == "cartpole":
+        row |= balancing(got.twin, got.policy, seed)
+    else:
+        row |= tracking(got.twin, got.policy, seed)
+        walking = with_effects(walker(), got.place) if found else walker()
+        row["spectrum"] = spectra(
+            *(walking, got.first, seed, LOGGED, got.logs, found.get("mean"))
+        )
+    return row | {"seconds": time.monotonic() - begun}
+
+
+def transferred(cell: Cell, folder: Path) -> Transferred:
+    """The policy of a cell's method, trained where it is not there yet.
+
+    Raises:
+        UserError: a method without a cell here.
+    """
     import jax
 
     from benchmarks.twin import GAPS, Twin
-    from benchmarks.twin_measures import balancing, spectra, tracking
     from easi_jax.errors import UserError
     from train._robots import load_udr
 
     if cell.method not in ("UDR", *_PRESETS):
         raise UserError(f"no {cell.method} in a twin: UDR, {', '.join(_PRESETS)}")
-    begun = time.monotonic()
     env = cell.env()
     twin = Twin(env, GAPS[cell.machine.robot])
     udr = load_udr(udr_run(cell, folder))
     first = jax.tree.map(lambda x: x[0], udr["policies"])
     logs = record(twin, first, cell)
-    row: dict[str, Any] = {
-        "stands_for": "hardware, which it is not: a simulation in MuJoCo C",
-        "logged": int(sum(log.steps.sum() for log in logs)),
-    }
+    # What an earlier recipe of the method has left there is not gone on with.
+    made = recipe(cell.method, cell.robot)
+    place = folder / re.sub(r"\W+", "_", f"{cell.key}, recipe {made}")
     policy, found = first, None
     if cell.method != "UDR":
-        # What an earlier recipe of the method has left there is not gone on with.
-        made = recipe(cell.method, cell.robot)
-        place = folder / re.sub(r"\W+", "_", f"{cell.key}, recipe {made}")
         place.mkdir(parents=True, exist_ok=True)
         found = identified(cell, place, env, first, twin, logs)
         policy = trained(cell, folder, place, with_effects(env, place), found)
-        row |= {k: v for k, v in found.items() if k not in ("unit_mean", "unit_cov")}
-    seed = 2 * cell.seed + 1  # other starts than those that were logged
-    if cell.robot == "cartpole":
-        row |= balancing(twin, policy, seed)
-    else:
-        row |= tracking(twin, policy, seed)
-        theta = None if found is None else found["mean"]
-        walking = walker() if found is None else with_effects(walker(), place)
-        row["spectrum"] = spectra(walking, first, seed, LOGGED, logs, theta)
-    return row | {"seconds": time.monotonic() - begun}
+    return Transferred(twin, first, logs, policy, found, place)
 
 
 # -- logs --------------------------------------------------------------------

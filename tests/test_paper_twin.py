@@ -19,6 +19,7 @@ from benchmarks import (
     paper_experiments,
     paper_twin,
     twin_measures,
+    twin_video,
 )
 from benchmarks.paper_cells import Cell
 from benchmarks.rival_cells import AFTER_GAP
@@ -34,6 +35,8 @@ from easi_jax.rl.config import EssInfoGailConfig
 from easi_jax.rl.evaluate import evaluate
 from easi_jax.rl.networks import PolicyParams, act
 from envs import make
+from tests.commands import refused
+from train._command import main
 
 ENVS = {"cartpole": make("cartpole"), "go2": make("go2")}
 HALF_SECOND = 25  # control steps
@@ -345,6 +348,40 @@ def test_cells_are_of_the_twins_and_named_so() -> None:
         paper.cells(paper.Config("table1", methods=(AFTER_GAP,)))
     with pytest.raises(UserError, match="no GARAT in a twin"):
         paper_twin.solve(Cell("GARAT", "cartpole", "twin", 0), Path("none"))
+
+
+def test_walks_in_a_twin_are_drawn_side_by_side(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    env, cells = ENVS["go2"], []
+
+    def transferred(cell: Cell, folder: Path) -> Any:
+        cells.append(cell)
+        return SimpleNamespace(twin=Twin(env, GO2), policy=POLICIES["go2"])
+
+    monkeypatch.setattr(paper_twin, "transferred", transferred)
+    out = tmp_path / "both.svg"
+    words = ["--seconds", "0.1", "--out", str(out)]
+    main(twin_video.Config, twin_video.run, name="benchmarks.twin_video", args=words)
+    assert [c.method for c in cells] == ["UDR", "EASI default"]
+    assert {(c.robot, c.target, c.trajectories) for c in cells} == {("go2", "twin", 1)}
+    said = capsys.readouterr().out
+    assert "no hardware: UDR" in said and str(out) in said
+    wide, high = map(int, re.findall(r'viewBox="0 0 (\d+) (\d+)"', out.read_text())[0])
+    assert wide / high == pytest.approx(3 * 2 * 480 / (2 * 320))
+
+
+@pytest.mark.fault("wrong options and files")
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--robot", "ant"], "go2, go2-imitating"),
+        (["--out", "walk.avi"], ".gif or .mp4"),
+        (["--seconds", "0"], "above 0"),
+    ],
+)
+def test_videos_that_cannot_be_made(words: list[str], said: str, capsys: Any) -> None:
+    assert said in refused(capsys, twin_video, *words)
 
 
 def test_the_papers_go2_imitates_and_is_paid_for_its_command(

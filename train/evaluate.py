@@ -9,8 +9,6 @@ from typing import Any
 from train._command import compiled, main, say, show_table
 from train._options import EngineOptions, OwnEffectsOptions
 
-_FPS = 25  # frames per second of a video, about
-
 
 @dataclasses.dataclass(frozen=True)
 class Config(EngineOptions, OwnEffectsOptions):
@@ -142,23 +140,13 @@ def _result(played: _Played) -> dict[str, Any]:
 
 def _render(path: Path, every: Sequence[_Played]) -> None:
     """Draws what was played, side by side, each with the name of its policy."""
-    import numpy as np
-
-    from easi_jax.io.report.video import FRAMES, captioned, render, write_video
+    from easi_jax.io.report.video import side_by_side
 
     env = every[0].saved["env"]
-    skip = max(1, round(1 / (_FPS * env.dt)))
-    rows = np.arange(0, min(len(p.motion) for p in every), skip)
-    if path.suffix == ".svg":  # what a strip shows, for drawing takes time
-        rows = rows[np.linspace(0, len(rows) - 1, FRAMES).round().astype(int)]
-    parts = []
-    for played in every:
-        shown = played.motion[rows]
-        frames = render(env.mj_model, shown, tell=lambda text: say(f"note: {text}"))
-        if len(every) > 1:
-            frames = captioned(frames, played.saved["method"])
-        parts.append(frames)
-    write_video(path, np.concatenate(parts, 2), 1 / (skip * env.dt))
+    motions = [(played.saved["method"], played.motion) for played in every]
+    side_by_side(
+        *(path, env.mj_model, env.dt, motions), lambda text: say(f"note: {text}")
+    )
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import mujoco
@@ -20,6 +20,7 @@ from easi_jax.io.files import os_reason
 from easi_jax.io.report.drawing import drawn
 
 FRAMES = 6  # of a strip
+_FPS = 25  # frames per second of a video, about
 _ROW = 3
 _INK = 40, 40, 40
 _LIMIT = 300  # s
@@ -145,6 +146,33 @@ def _encode(path: Path, part: Path, frames: np.ndarray, fps: float) -> None:
         if done.returncode:
             said = done.stderr.decode(errors="replace").strip().splitlines()
             raise UserError(f"{path}: ffmpeg failed: {said[-1] if said else ''}")
+
+
+def side_by_side(
+    path: Path,
+    m: mujoco.MjModel,
+    dt: float,
+    motions: Sequence[tuple[str, np.ndarray]],
+    tell: Callable[[str], None] = lambda _: None,
+) -> None:
+    """Writes motions of one model beside each other, for as long as the shortest.
+
+    Args:
+        dt: time from row to row [s].
+        motions: name and positions ``(T, nq)`` of each; a single one needs no name.
+
+    Raises:
+        UserError: see `write_video`.
+    """
+    skip = max(1, round(1 / (_FPS * dt)))
+    rows = np.arange(0, min(len(motion) for _, motion in motions), skip)
+    if path.suffix == ".svg":  # what a strip shows, for drawing takes time
+        rows = rows[np.linspace(0, len(rows) - 1, FRAMES).round().astype(int)]
+    parts = []
+    for name, motion in motions:
+        frames = render(m, motion[rows], tell=tell)
+        parts.append(captioned(frames, name) if len(motions) > 1 else frames)
+    write_video(path, np.concatenate(parts, 2), 1 / (skip * dt))
 
 
 def captioned(frames: np.ndarray, text: str) -> np.ndarray:
