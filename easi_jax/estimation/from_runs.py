@@ -24,8 +24,13 @@ from easi_jax.devices.mesh import placed
 from easi_jax.devices.runtime import quick_compile
 from easi_jax.estimation import limits, step_error
 from easi_jax.estimation.blocks import too_few
+from easi_jax.estimation.contradictions import (
+    Recording,
+    compared,
+    contradictions,
+    held_apart,
+)
 from easi_jax.estimation.doubts import Doubts, all_doubts, doubts_of, shown, told
-from easi_jax.estimation.identifiability import identifiability
 from easi_jax.estimation.least_squares import raised_to_range
 from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.pieces import effective_noise, few, segments_from_runs
@@ -46,7 +51,6 @@ from easi_jax.estimation.prediction_error import (
 from easi_jax.estimation.problem import Problem
 from easi_jax.estimation.step_error import error_of_steps, is_visible, widened_by
 from easi_jax.estimation.weights import readings, step_weights
-from easi_jax.model.parameters import ParameterSpace
 from easi_jax.search.config import SearchConfig
 from easi_jax.search.easi import Search, SearchData
 from easi_jax.simulation.slopes import shift_readings
@@ -69,8 +73,6 @@ _FINISH = 0.5  # s, of pieces in the least-squares finish
 # Quarters of a second that it begins with for larger robots, which are slow: enough to
 # find the valley, for the last steps take all.
 _FEW = 24
-_COMPARED = 8  # runs at most that are fitted alone as well
-_FAR, _DIFFERENT = 5.0, 0.1  # standard deviations, and log ratio, that contradict
 _READABLE = 8  # steps at least of pieces whose errors tell the noise
 _OUTLIER = 2.5  # times the median error: windows beyond it weigh less
 
@@ -210,7 +212,8 @@ class _Finish:
 
     Attributes:
         whole: all pieces, M of them; `pieces` those that many trials are made with.
-        owner: recording of each of ``whole``, ``(M,)``.
+        owner: recording of each of ``whole``, ``(M,)``; ``apart`` are recordings of
+            which all is held out.
         simulator: reads ``sensors``, N numbers, that are fitted as well.
         told: noise as the rows tell it: where motion is rough, too much; ``least``
             what the resolution makes.
@@ -249,6 +252,10 @@ class _Finish:
         given = cutting, problem.fit, self.steps, every
         whole = to_device(segments_from_runs(*given, sensors=self.sensors))
         self.whole = replace(whole, weight=0.5 * whole.weight)
+        runs = problem.fit, problem.held
+        self.apart = held_apart(
+            *(self.whole, cutting, runs, self.steps, every, self.sensors)
+        )
         starts = [len(range(0, len(r) - self.steps, every)) for r in problem.fit]
         self.owner = np.repeat([r.recording for r in problem.fit], starts)
         self.pieces = few(simulator, self.whole, _FEW) if refined else self.whole
@@ -544,30 +551,26 @@ class _Finish:
 
     def contradictions(self, found: Estimate, weight: jax.Array) -> list[str]:
         """Notes on recordings that lead elsewhere than all of them together do; of many
-        those that fit worst are looked at."""
-        names = _worst(self.owner, np.asarray(weight))
-        if not self.refined or len(names) < 2:
+        those that fit worst are looked at, and held-out ones."""
+        if not self.refined:
             return []
-        doubts = self.doubts_in(found)
         # A larger robot's program for fewer pieces is compiled in less time than the
         # others take; one of a smaller robot is there.
-        wide, notes = self.simulator.wide, []
-        most = int(max((self.owner == name).sum() for name in names))
-        end = self.ending(doubts, most if wide else None)
-        for name in names:
-            mine = np.asarray(self.whole.weight * weight) * (self.owner == name)
-            if not np.any(mine > 0):
-                continue
-            pieces = replace(self.whole, weight=jnp.asarray(mine))
-            pieces = _alone(pieces, self.owner == name, most) if wide else pieces
+        few = self.simulator.wide
+        given = self.whole, self.owner, np.asarray(weight), self.apart, few
+        doubts = self.doubts_in(found)
+
+        def by_itself(recording: Recording) -> Estimate:
+            pieces = recording.pieces
+            end = self.ending(doubts, pieces.count if few else None)
             given = (
                 *(found.fit, found.search_cov, pieces, found.misfit),
                 (found.noise, found.start),
             )
-            self.tell(f"{name} by itself, beside the others")
-            alone = distributed.local(end(*placed(given)))
-            notes += _contradiction(self.search.space, name, alone, found)
-        return notes
+            self.tell(f"{recording.name} by itself, beside the others")
+            return distributed.local(end(*placed(given)))
+
+        return contradictions(self.search.space, compared(*given), found, by_itself)
 
 
 def _most_steps(rows: Sequence[int], least: int) -> int:
@@ -586,44 +589,3 @@ def _resolution_noise(problem: Problem, sensors: Sensors) -> np.ndarray:
     sensed = sensors.finest(runs)
     step = [position, np.where(measured, velocity, 0.0), sensed]
     return np.concatenate(step) / math.sqrt(12.0)
-
-
-def _worst(owner: np.ndarray, weight: np.ndarray) -> list[str]:
-    """Recordings, in order: of many those whose pieces fit worst.
-
-    Args:
-        owner: recording of each piece, ``(M,)``.
-        weight: of each piece by how well it fits, ``(M,)``.
-    """
-    names = list(dict.fromkeys(owner.tolist()))
-    worst = sorted(names, key=lambda n: weight[owner == n].mean())[:_COMPARED]
-    return [n for n in names if n in worst]
-
-
-def _alone(pieces: Segments, own: np.ndarray, count: int) -> Segments:
-    """``count`` pieces: those that are ``own (M,)``, then others of no weight."""
-    first = np.flatnonzero(own)
-    some = pieces.take(np.append(first, np.full(count - len(first), first[0])))
-    return replace(some, weight=some.weight * (np.arange(count) < len(first)))
-
-
-def _contradiction(
-    space: ParameterSpace, name: str, alone: Estimate, found: Estimate
-) -> list[str]:
-    """A note where a run ``alone`` leads far from what all runs say."""
-    if diverged(alone, space.names):
-        return []
-    known = identifiability(space, np.asarray(alone.hessian))
-    fits = [np.asarray(raised_to_range(space, e.fit), float) for e in (alone, found)]
-    off = (fits[0] - fits[1]) * known.scale
-    std = known.std * float(widened(alone.excess))
-    far = known.determined & (np.abs(off) > np.maximum(_FAR * std, _DIFFERENT))
-    if not far.any():
-        return []
-    i = int(np.argmax(np.where(far, np.abs(off) / np.maximum(std, 1e-12), 0.0)))
-    one, all_ = (float(space.to_si(e.fit)[i]) for e in (alone, found))
-    return [
-        f"{name} contradicts the other runs: alone it says {space.names[i]} "
-        f"{one:.3g} {space.units[i]}, all together {all_:.3g} (something was changed "
-        "between them, or it moves the robot in a way that shows what the model lacks)"
-    ]

@@ -365,6 +365,28 @@ def test_a_result_that_is_no_number_is_an_error(files, capsys, monkeypatch):
     assert not (files["out"] / "distribution.json").exists()
 
 
+@pytest.mark.parametrize(
+    ("dampings", "odd"), [((0.05, 0.25), "log1"), ((0.1, 0.1), None)]
+)
+def test_logs_that_contradict_each_other_are_named(files, capsys, dampings, odd):
+    """Of two logs one is held out, and a fit to the other says nothing of it."""
+    logs = [files["log"].with_name(f"log{k}.csv") for k in range(2)]
+    for k, (log, damping) in enumerate(zip(logs, dampings, strict=True)):
+        swing(log, damping, rows=600, noise=1e-4, seed=k)
+    files["log"] = logs[0]
+    call(*arguments(files, "--held-out", logs[1]))
+    said = capsys.readouterr().out
+    page = (files["out"] / "report.html").read_text()
+    for text in (said, page):
+        text = " ".join(text.split())
+        assert ("contradicts the other runs" in text) == (odd is not None)
+        if odd:
+            assert (
+                f"{odd} contradicts the other runs: alone it says damping 0.25" in text
+            )
+            assert "those that were fitted 0.05" in text
+
+
 def test_degrees_are_noticed_and_earlier_results_kept(files, capsys):
     """A whole small run; then a bad one into the same folder."""
     write_log(files["log"], gain=57.3 * 2)

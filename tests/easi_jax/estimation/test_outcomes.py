@@ -8,13 +8,14 @@ import pytest
 
 from easi_jax.data.segments import Segments
 from easi_jax.errors import UserError
-from easi_jax.estimation.from_runs import (
-    _alone,
-    _contradiction,
-    _Finish,
-    _most_steps,
-    _worst,
+from easi_jax.estimation.contradictions import (
+    Recording,
+    alone,
+    compared,
+    contradiction,
+    worst,
 )
+from easi_jax.estimation.from_runs import _Finish, _most_steps
 from easi_jax.estimation.identifiability import seed_result
 from easi_jax.estimation.posterior import diverged
 from easi_jax.model.parameters import Parameter, ParameterSpace
@@ -28,6 +29,8 @@ SPACE = ParameterSpace(
     )
 )
 SURE = np.diag([1e4, 1e4])
+NONE: Any = None
+RECORDING = Recording("a.csv", NONE)
 
 
 def found(mean: Any = (0.5, 0.5), **changes: Any) -> Any:
@@ -99,23 +102,26 @@ def test_a_seed_that_diverged_has_a_reason_and_no_number() -> None:
 
 def test_a_run_that_leads_elsewhere_is_named() -> None:
     everything = found()
-    assert not _contradiction(SPACE, "a.csv", found((0.505, 0.5)), everything)
-    (line,) = _contradiction(SPACE, "a.csv", found((0.7, 0.5)), everything)
+    assert not contradiction(SPACE, RECORDING, found((0.505, 0.5)), everything)
+    (line,) = contradiction(SPACE, RECORDING, found((0.7, 0.5)), everything)
     assert line.startswith("a.csv contradicts the other runs: alone it says kp 1.32")
+    held = Recording("a.csv", NONE, held=True)
+    (line,) = contradiction(SPACE, held, found((0.7, 0.5)), everything)
+    assert "those that were fitted 1" in line
     # Not where the run determines nothing, or its fit is none.
-    assert not _contradiction(
-        SPACE, "a.csv", found((0.7, 0.5), hessian=0 * SURE), everything
+    assert not contradiction(
+        SPACE, RECORDING, found((0.7, 0.5), hessian=0 * SURE), everything
     )
-    assert not _contradiction(SPACE, "a.csv", found((np.nan, 0.5)), everything)
+    assert not contradiction(SPACE, RECORDING, found((np.nan, 0.5)), everything)
 
 
 def test_of_many_runs_those_that_fit_worst_are_looked_at() -> None:
     names = [f"run{k}.csv" for k in range(12)]
     owner, weight = np.repeat(names, 5), np.ones(60)
     weight[50:55] = 0.2
-    looked = _worst(owner, weight)
+    looked = worst(owner, weight)
     assert len(looked) == 8 and looked[-1] == "run10.csv"
-    assert _worst(owner[:10], weight[:10]) == names[:2]
+    assert worst(owner[:10], weight[:10]) == names[:2]
 
 
 def test_a_run_by_itself_has_its_pieces_and_no_others() -> None:
@@ -124,9 +130,30 @@ def test_a_run_by_itself_has_its_pieces_and_no_others() -> None:
     pieces = Segments(
         *(rows[:, None], rows[:, None], steps, steps, steps, 0.5 * np.ones(6))
     )
-    some = _alone(pieces, np.array([0, 0, 1, 1, 0, 0], bool), 3)
+    some = alone(pieces, np.array([0, 0, 1, 1, 0, 0], bool), 3)
     assert some.count == 3 and some.weight.tolist() == [0.5, 0.5, 0.0]
     assert some.qpos[:2, 0].tolist() == [2.0, 3.0]
+
+
+def test_what_is_held_out_is_compared_as_well() -> None:
+    """Also with a single recording that is fitted, which is then what all say."""
+    rows = np.arange(6.0)
+    steps = np.broadcast_to(rows[:, None, None], (6, 4, 1))
+    whole = Segments(
+        *(rows[:, None], rows[:, None], steps, steps, steps, 0.5 * np.ones(6))
+    )
+    apart = [Recording("b", whole.take(slice(4)), held=True)]
+    one, two = np.repeat("a", 6), np.repeat(["a", "c"], 3)
+    (only,) = compared(whole, one, np.ones(6), apart, few=False)
+    assert only.name == "b" and only.pieces.count == 6, "a program is of one size"
+    assert only.pieces.weight.tolist() == [0.5] * 4 + [0.0] * 2
+    assert compared(whole, one, np.ones(6), [], few=False) == []
+    found = compared(whole, two, np.ones(6), apart, few=True)
+    assert [r.name for r in found] == ["a", "c", "b"]
+    assert [r.pieces.count for r in found] == [4, 4, 4]
+    long = Recording("long", whole.take(np.arange(24) % 6), held=True)
+    (some,) = compared(whole, one, np.ones(6), [long], few=True)
+    assert some.pieces.count == 6 and some.pieces.qpos[-1, 0] == 5.0
 
 
 def test_a_pass_more_is_made_where_readings_count_otherwise() -> None:
