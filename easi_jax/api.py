@@ -21,7 +21,7 @@ from easi_jax.devices.runtime import fast_loops, quick_compile
 from easi_jax.errors import UserError
 from easi_jax.estimation.from_runs import ready_finish, replayed, search_data
 from easi_jax.estimation.held_out import held_out_errors, ready_errors
-from easi_jax.estimation.posterior import diverged
+from easi_jax.estimation.posterior import sound
 from easi_jax.estimation.problem import HORIZON, Problem, checked_horizon, problem_of
 from easi_jax.estimation.relative import result_of
 from easi_jax.export.mjcf import written_machine
@@ -44,7 +44,7 @@ from easi_jax.model.own_effects import OwnEffect, registered
 from easi_jax.model.own_effects_check import check_own_effects
 from easi_jax.model.parameter_proposal import own_space
 from easi_jax.model.parameters import ParameterSpace
-from easi_jax.model.results import Flag, GapResult, HeldOutErrors
+from easi_jax.model.results import Flag, GapResult, HeldOutErrors, Outcome
 from easi_jax.pipeline.stages import seed_keys
 from easi_jax.rl.config import EssInfoGailConfig
 from easi_jax.rl.networks import PolicyParams, act
@@ -158,6 +158,7 @@ class Estimated:
             than where the search started.
         flags: ``determined``, ``not determined`` or ``at bound``, ``n``.
         undetermined: combinations that the logs leave open, a sentence each.
+        outcome: how the fit ended; ``reason`` names what it is about.
         no_region: why ``std`` means nothing, as the model lacks something unknown;
             empty where it holds.
         held_out: errors of predictions on data that no fit saw.
@@ -173,6 +174,8 @@ class Estimated:
     std: np.ndarray
     flags: tuple[Flag, ...]
     undetermined: tuple[str, ...]
+    outcome: Outcome
+    reason: str
     no_region: str
     held_out: HeldOutErrors
     notes: tuple[str, ...]
@@ -200,6 +203,8 @@ class Estimated:
                 *(e.channels, e.units, e.before, e.after[0], e.floor[0]), strict=True
             )
         ]
+        if self.outcome != "converged":
+            lines.append(f"the fit: {self.outcome} ({self.reason})")
         return "\n".join(lines)
 
 
@@ -292,7 +297,7 @@ def estimate_parameters(
             search, start = _searched(problem, *searching)
         else:
             search = _search(problem, 1, population, settings)
-        found = _estimated(problem, search, start, effects, restarts, tell)
+        found = _estimated(problem, search, start, effects, restarts, seed, tell)
     return replace(found, notes=(*said, *found.notes))
 
 
@@ -302,6 +307,7 @@ def _estimated(
     start: Searched,
     effects: FoundEffects | None,
     restarts: int,
+    seed: int,
     tell: Tell,
 ) -> Estimated:
     if start.space.names != search.space.names:
@@ -312,11 +318,10 @@ def _estimated(
     estimates, notes = ready_finish(problem, search, True, restarts, tell)(
         jnp.asarray(start.mean)[None], jnp.asarray(start.cov)[None]
     )
-    (found,) = estimates
-    space, unit = search.space, found.distribution.mean
-    if why := diverged(found, space.names):
-        raise UserError(f"the fit diverged ({why}): try another seed")
-    result = result_of(space, found)
+    space = search.space
+    (found,) = sound((seed,), estimates, space.names)[0].values()
+    unit, result = found.distribution.mean, result_of(space, found)
+    errors = held_out_errors(problem, space, [unit], ready_errors(problem, space))
     return Estimated(
         names=space.names,
         units=space.units,
@@ -324,9 +329,11 @@ def _estimated(
         std=np.array(result.std),
         flags=tuple(result.flags),
         undetermined=tuple(u.meaning for u in result.undetermined),
+        outcome=result.outcome,
+        reason=result.reason,
         no_region=result.no_region,
-        held_out=held_out_errors(problem, space, [unit], ready_errors(problem, space)),
-        notes=(*problem.notes, *notes(0)),
+        held_out=errors,
+        notes=(*problem.notes, *notes(0), *errors.notes((seed,))),
         space=space,
         distribution=found.distribution,
         simulator=problem.simulator,

@@ -32,7 +32,8 @@ def run(config: Any) -> None:
         from easi_jax.devices.distributed import started
         from easi_jax.estimation.from_runs import ready_finish, search_data
         from easi_jax.estimation.held_out import ready_errors
-        from train._log_results import sound, write
+        from easi_jax.estimation.posterior import sound
+        from train._log_results import write
 
         refines = config.refine and search.config.finish
         finish = started(
@@ -50,7 +51,7 @@ def run(config: Any) -> None:
             *(list(good.values()), list(good), errors(), lost),
             lambda best: notes_of(places[best]),
         )
-    show(problem.name, report, problem.notes, config.out)
+    show(problem.name, report, config.out)
 
 
 def _settings(config: Any, problem: "Problem") -> Any:
@@ -108,14 +109,18 @@ def searched(
     )
 
 
-def show(name: str, report: Any, notes: Sequence[str], out: Any) -> None:
-    """Says what was found, and where the report is."""
+def show(name: str, report: Any, out: Any) -> None:
+    """Says what was found, what is to be doubted, and where the report is."""
     from easi_jax.io.report.parameters import parameter_table
 
     show_table(f"Parameters of {name}", *parameter_table(report.parameters))
     errors = report.tables[0]
     show_table(errors.title, errors.columns, errors.rows)
-    for note in (*report.undetermined, *notes):
+    for found in report.diagnostics:
+        if not found.ok:
+            more = f" ({found.note})" if found.note else ""
+            say(f"note: {found.label}: {found.value}{more}")
+    for note in (*report.undetermined, *report.notes):
         say(f"note: {note}")
     say(f"a policy for it: python -m train.udr --env FILE.py --found {out} ...")
     say(f"report: {out / 'report.html'}")

@@ -47,7 +47,7 @@ def run(config: Any) -> None:
         states = searched(folder, config, search, data, problem.notes, seeds)
         given = problem, simulated, stand
         report = _finished(folder, config, *given, states, seeds, keys)
-    show(problem.name, report, problem.notes, config.out)
+    show(problem.name, report, config.out)
 
 
 def _check_options(config: Any) -> None:

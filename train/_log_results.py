@@ -21,29 +21,6 @@ if TYPE_CHECKING:
     from easi_jax.model.results import HeldOutErrors, SeedResult
 
 
-def sound(
-    seeds: Sequence[int], estimates: Sequence["Estimate"], names: Sequence[str]
-) -> tuple[dict[int, "Estimate"], dict[int, str]]:
-    """Estimates by seed, and why other seeds have none.
-
-    Raises:
-        UserError: every fit diverged.
-    """
-    from easi_jax.errors import UserError
-    from easi_jax.estimation.posterior import diverged
-
-    every = dict(zip(seeds, estimates, strict=True))
-    why = {seed: diverged(found, names) for seed, found in every.items()}
-    lost = {seed: reason for seed, reason in why.items() if reason}
-    if len(lost) == len(every):
-        seed, reason = next(iter(lost.items()))
-        raise UserError(
-            f"the fit diverged (seed {seed}: {reason}): narrow the initial ranges, "
-            "lower the model's timestep, or try another seed"
-        )
-    return {s: e for s, e in every.items() if s not in lost}, lost
-
-
 def write(
     folder: "RunFolder",
     problem: "Problem",
@@ -77,17 +54,6 @@ def write(
     given = folder, problem.name, space, generations
     more = problem.notes, noise, "--data ..."
     return write_found(*given, results, seeds, errors, diverged, *more)
-
-
-def not_finite(errors: "HeldOutErrors", seeds: Sequence[int]) -> list[str]:
-    """A note for each model that some held-out windows explode with."""
-    models = ("the model as given", *(f"the result of seed {s}" for s in seeds))
-    return [
-        f"{lost} of {errors.windows} held-out windows are not finite with {model}: "
-        "each counts as an error of the largest motion"
-        for model, lost in zip(models, errors.not_finite, strict=False)
-        if lost
-    ]
 
 
 def write_found(
@@ -152,7 +118,7 @@ def write_found(
         command=f"python -m train.easi {options}",
         notes=[
             *(f"seed {s} has no result: {why}" for s, why in diverged.items()),
-            *not_finite(errors, seeds),
+            *errors.notes(seeds),
             *notes,
         ],
         config=folder.config,

@@ -11,6 +11,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from easi_jax.data.segments import Segments
+from easi_jax.errors import UserError
 from easi_jax.estimation import limits
 from easi_jax.estimation.blocks import scattered
 from easi_jax.estimation.doubts import Doubts, followed, without
@@ -446,6 +447,26 @@ def diverged(found: Estimate, names: Sequence[str]) -> str:
     if not np.isfinite(found.hessian).all():
         return "what the data say of the parameters is not finite"
     return ""
+
+
+def sound(
+    seeds: Sequence[int], estimates: Sequence[Estimate], names: Sequence[str]
+) -> tuple[dict[int, Estimate], dict[int, str]]:
+    """Estimates of parameters ``names`` by seed, and why other seeds have none.
+
+    Raises:
+        UserError: every fit diverged.
+    """
+    every = dict(zip(seeds, estimates, strict=True))
+    why = {seed: diverged(found, names) for seed, found in every.items()}
+    lost = {seed: reason for seed, reason in why.items() if reason}
+    if len(lost) == len(every):
+        seed, reason = next(iter(lost.items()))
+        raise UserError(
+            f"the fit diverged (seed {seed}: {reason}): narrow the initial ranges, "
+            "lower the model's timestep, or try another seed"
+        )
+    return {s: e for s, e in every.items() if s not in lost}, lost
 
 
 def _posterior(hessian: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -26,6 +26,7 @@ from easi_jax.gap.verdict import Openness
 from easi_jax.gap.window_set import WindowSet
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.results import Outcome as Ended
+from easi_jax.model.results import Refitted
 
 # Sizes of differences, that a number without bounds may be off which no data determine.
 _ANYTHING = 1e3
@@ -123,7 +124,7 @@ class Outcome:
 
     verdict: str
     found: list[Found]
-    refitted: list[dict]
+    refitted: tuple[Refitted, ...]
     before: Figures
     refit: Figures
     after: Figures
@@ -200,18 +201,16 @@ class Numbers:
                 got[c.parameter] = (value, c.of * std.get(k, 0.0), c.unit)
         return dict(place.row.told(got))
 
-    def refitted(self, space: ParameterSpace) -> list[dict]:
+    def refitted(self, space: ParameterSpace) -> tuple[Refitted, ...]:
         """The model's own parameters that the fit moved."""
-        return [
-            {
-                "address": address,
-                "from": float(space.parameters[i].nominal),
-                "to": float(self.model.fit.x[i]),
-                "std": self._std[i],
-            }
+        return tuple(
+            Refitted(
+                *(address, float(space.parameters[i].nominal)),
+                *(float(self.model.fit.x[i]), self._std[i], OUTCOMES[self._codes[i]]),
+            )
             for i in self.model.own
             for address in space.parameters[i].addresses
-        ]
+        )
 
 
 def _within_bounds(selector: Selector, model: Model) -> np.ndarray:

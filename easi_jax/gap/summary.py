@@ -51,9 +51,7 @@ def gap_result(
         verdict="explained" if explained else o.verdict,
         effects=_effects(o),
         readings=tuple(_reading(r, last_figures(o).gap) for r in readings),
-        refitted=tuple(
-            Refitted(r["address"], r["from"], r["to"], r["std"]) for r in o.refitted
-        ),
+        refitted=o.refitted,
         before=_figures(o.before),
         refit=_figures(o.refit, _intervals(o, o.open_refit)),
         after=_figures(o.after, _intervals(o, o.open_after)),
@@ -73,7 +71,10 @@ def gap_result(
         bounded=_named(c.names, np.append(o.floor_is_bound, False)),
         open=_named(c.names, o.open_after.is_open),
         undecided=_named(c.names, o.open_after.undecided),
-        notes=(*notes, *o.notes, *_not_finite(lost, len(o.held))),
+        notes=(
+            *(*notes, *o.notes, *_not_finite(lost, len(o.held))),
+            *_not_determined(o.refitted),
+        ),
     )
 
 
@@ -83,6 +84,16 @@ def _not_finite(lost: int, of: int) -> list[str]:
     return [
         f"{lost} of {of} held-out predictions are not finite (the model blows up from "
         "there); each counts as an error of the largest motion seen"
+    ]
+
+
+def _not_determined(refitted: Sequence[Refitted]) -> list[str]:
+    loose = [r.address for r in refitted if r.outcome == "not determined"]
+    if not loose:
+        return []
+    return [
+        f"the data do not determine {', '.join(loose)}: what the refit made of it "
+        "means nothing"
     ]
 
 

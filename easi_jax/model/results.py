@@ -96,12 +96,14 @@ class NamedEffect:
 
 @dataclass(frozen=True)
 class Refitted:
-    """A model's own parameter that a refit moved, SI units."""
+    """A model's own parameter that a refit moved, SI units; ``outcome`` says how its
+    fit ended."""
 
     address: str
     nominal: float
     value: float
     std: float
+    outcome: Outcome = "converged"
 
 
 @dataclass(frozen=True)
@@ -436,6 +438,17 @@ class HeldOutErrors:
     def best(self) -> int:
         """Place of the seed that fits its own data best."""
         return int(np.argmin(self.fit)) if self.fit else 0
+
+    def notes(self, seeds: Sequence[int]) -> list[str]:
+        """One on each model that some held-out windows explode with; results are those
+        of ``seeds``."""
+        models = ("the model as given", *(f"the result of seed {s}" for s in seeds))
+        return [
+            f"{lost} of {self.windows} held-out windows are not finite with {model}: "
+            "each counts as an error of the largest motion"
+            for model, lost in zip(models, self.not_finite, strict=False)
+            if lost
+        ]
 
 
 # -- what to record ----------------------------------------------------------------

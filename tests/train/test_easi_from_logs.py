@@ -1,5 +1,6 @@
 """``train.easi --data``: what a user with a model, parameters and logs gets."""
 
+import html
 import json
 import re
 import shutil
@@ -7,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax
@@ -16,6 +17,8 @@ import numpy as np
 import pytest
 
 from easi_jax.estimation import posterior
+from easi_jax.estimation.from_runs import _Finish
+from easi_jax.estimation.held_out import WindowErrors
 from tests.commands import refused
 from train import _command, easi, evaluate
 
@@ -363,6 +366,66 @@ def test_a_result_that_is_no_number_is_an_error(files, capsys, monkeypatch):
     assert said.startswith("error: the fit diverged (seed 0:")
     assert "not finite for damping" in said
     assert not (files["out"] / "distribution.json").exists()
+
+
+@pytest.mark.fault("simulations that explode, parameters at absurd corners")
+def test_a_seed_without_a_result_has_a_reason_and_no_number(files, capsys, monkeypatch):
+    monkeypatch.setattr(_Finish, "passes", diverging(_Finish.passes))
+    swing(files["log"], damping=0.1, rows=600, noise=1e-4)
+    call(*arguments(files, "--seeds", 0, 1))
+    found = json.loads((files["out"] / "distribution.json").read_text())
+    assert list(found["seeds"]) == ["1"] and found["best_seed"] == 1
+    assert "not finite for damping" in found["diverged"]["0"]
+    assert "seed 0 has no result: its mean or its spread" in words(capsys, files)
+
+
+def diverging(passes):
+    """The first fit's mean is no number."""
+    count = iter(range(100))
+
+    def spoiled(self, mean, cov):
+        found, weight = passes(self, mean, cov)
+        if next(count) == 0:
+            none = replace(found.distribution, mean=np.nan * found.distribution.mean)
+            found = replace(found, distribution=none)
+        return found, weight
+
+    return spoiled
+
+
+def words(capsys, files) -> str:
+    """What the terminal and the report say, which is the same."""
+    said = " ".join(capsys.readouterr().out.split())
+    page = " ".join((files["out"] / "report.html").read_text().split())
+    for note in re.findall(r"note: (.*?)(?= note: | a policy for it: )", said):
+        for part in re.split(r": | \(|\)$", note):
+            assert part in html.unescape(page), note
+    return said
+
+
+@pytest.mark.fault("simulations that explode, parameters at absurd corners")
+def test_predictions_that_are_not_finite_are_counted_and_spoil_nothing(
+    files, capsys, monkeypatch
+):
+    solved = WindowErrors._solved
+
+    def blown(self, x):
+        moved, found = solved(self, x)
+        found = np.array(found)
+        found[:2, -1] = np.nan
+        return moved, found
+
+    monkeypatch.setattr(WindowErrors, "_solved", blown)
+    swing(files["log"], damping=0.1, rows=600, noise=1e-4)
+    call(*arguments(files))
+    held = json.loads((files["out"] / "distribution.json").read_text())["held_out"]
+    assert held["not_finite"] == [2, 2] and held["windows"] > 8
+    figures = [*held["before"], *held["after"]["0"], *held["noise_floor"]]
+    assert np.isfinite(figures).all()
+    said = words(capsys, files)
+    for model in ("the model as given", "the result of seed 0"):
+        lost = f"2 of {held['windows']} held-out windows are not finite with {model}"
+        assert lost in said
 
 
 @pytest.mark.parametrize(

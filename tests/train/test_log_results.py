@@ -1,7 +1,6 @@
 """What an identification from logs says of its own predictions."""
 
 from easi_jax.model.results import HeldOutErrors
-from train._log_results import not_finite
 
 
 def test_predictions_that_are_not_finite_are_counted() -> None:
@@ -10,6 +9,6 @@ def test_predictions_that_are_not_finite_are_counted() -> None:
         windows=40,
         not_finite=[3, 0, 1],
     )
-    given, second = not_finite(errors, (4, 7))
+    given, second = errors.notes((4, 7))
     assert given.startswith("3 of 40 held-out windows are not finite with the model")
     assert "result of seed 7" in second

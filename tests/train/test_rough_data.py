@@ -2,12 +2,14 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
-from train import _command, easi
+import easi_jax
+from train import _command, easi, info
 
 MODEL = """<mujoco model="two">
   <option timestep="0.01" integrator="implicitfast"/>
@@ -50,20 +52,27 @@ def record(path: Path, wild: tuple[int, ...]) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
+def identified(
+    folder: Path, parameters: str, population: str, generations: str
+) -> dict[str, Any]:
+    """What ``train.easi --data`` finds in ``log.csv``."""
+    (folder / "model.xml").write_text(MODEL)
+    (folder / "parameters.yaml").write_text(parameters)
+    args = ["--model", "model.xml", "--parameters", "parameters.yaml"]
+    args += ["--data", "log.csv", "--out", "out", "--population", population]
+    args += ["--generations", generations, "--set", "segments=32"]
+    given = [str(folder / a) if "." in a or a == "out" else a for a in args]
+    _command.main(easi.Config, easi.run, name="train.easi", args=given)
+    return json.loads((folder / "out" / "distribution.json").read_text())
+
+
 @pytest.mark.parametrize("wild", [(), (123, 300, 301)], ids=len)
 @pytest.mark.fault("wild readings, joints that stand still")
 def test_the_same_is_found(
     wild: tuple[int, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "model.xml").write_text(MODEL)
-    (tmp_path / "parameters.yaml").write_text(PARAMETERS)
     record(tmp_path / "log.csv", wild)
-    args = ["--model", "model.xml", "--parameters", "parameters.yaml"]
-    args += ["--data", "log.csv", "--out", "out", "--population", "64"]
-    args += ["--generations", "6", "--set", "segments=32"]
-    given = [str(tmp_path / a) if "." in a or a == "out" else a for a in args]
-    _command.main(easi.Config, easi.run, name="train.easi", args=given)
-    found = json.loads((tmp_path / "out" / "distribution.json").read_text())
+    found = identified(tmp_path, PARAMETERS, "64", "6")
     result = found["seeds"]["0"]
     flags = dict(
         zip([p["name"] for p in found["parameters"]], result["flags"], strict=True)
@@ -75,3 +84,27 @@ def test_the_same_is_found(
             wanted = TRUTH[parameter["name"]]
             assert mean == pytest.approx(wanted, rel=0.05), parameter["name"]
     assert ("readings leap" in capsys.readouterr().out) == bool(wild)
+
+
+@pytest.mark.fault("data that say nothing of what is asked")
+def test_data_that_determine_nothing_say_of_what(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In result, terminal, report, ``train.info`` and Python."""
+    record(tmp_path / "log.csv", ())
+    lines = PARAMETERS.splitlines()
+    found = identified(tmp_path, "\n".join([lines[0], lines[-1]]) + "\n", "8", "2")
+    result, why = found["seeds"]["0"], "the data determine none of still_damping"
+    assert result["outcome"] == "not determined" and result["reason"] == why
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"the fit: not determined ({why})" in said
+    assert why in (tmp_path / "out" / "report.html").read_text()
+    info.run(info.Config(run=tmp_path / "out"))
+    assert why in " ".join(capsys.readouterr().out.split())
+    model = easi_jax.read_model(tmp_path / "model.xml")
+    space = easi_jax.read_parameters(tmp_path / "parameters.yaml", model)
+    log = easi_jax.read_log(tmp_path / "log.csv", model)
+    small = {"population": 8, "generations": 2}
+    answer = easi_jax.estimate_parameters(model, space, log, **small)
+    assert (answer.outcome, answer.reason) == ("not determined", why)
+    assert why in str(answer)

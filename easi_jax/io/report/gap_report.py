@@ -43,7 +43,10 @@ def gap_json(result: GapResult) -> dict[str, Any]:
             told for e in (*r.effects, *r.readings) for told in _effect_json(r, e)
         ],
         "refitted": [
-            {"address": p.address, "from": p.nominal, "to": p.value, "std": p.std}
+            {
+                **{"address": p.address, "from": p.nominal, "to": p.value},
+                **{"std": p.std, "outcome": p.outcome},
+            }
             for p in r.refitted
         ],
         "gap": {
@@ -260,13 +263,18 @@ def effect_rows(r: GapResult, between: str, none: str) -> list[tuple[str, ...]]:
         (
             f"{e.name}: {e.law}" if e.law else e.name,
             e.pattern or ", ".join(e.at) or "whole model",
-            parameters_text(e.values, between),
+            _marked(parameters_text(e.values, between), e.outcome),
             f"{e.confidence:.2f}",
             _change(e, none),
             ", ".join(e.indistinguishable) or none,
         )
         for e in (*r.effects, *r.readings)
     ]
+
+
+def _marked(told: str, outcome: str) -> str:
+    """Numbers, and how their fit ended where that is to be doubted."""
+    return told if outcome == "converged" else f"{told} ({outcome})"
 
 
 def _change(e: NamedEffect, none: str) -> str:
@@ -348,7 +356,10 @@ def _tables(r: GapResult) -> list[Table]:
         Table(
             "The model's own parameters",
             ["address", "from", "to", "std"],
-            [(p.address, p.nominal, p.value, p.std) for p in r.refitted],
+            [
+                (p.address, p.nominal, p.value, _marked(number(p.std, 2), p.outcome))
+                for p in r.refitted
+            ],
         ),
         Table(
             "Return in the repaired model",

@@ -17,9 +17,8 @@ from easi_jax.estimation.contradictions import (
 )
 from easi_jax.estimation.from_runs import _Finish, _most_steps
 from easi_jax.estimation.identifiability import seed_result
-from easi_jax.estimation.posterior import diverged
+from easi_jax.estimation.posterior import diverged, sound
 from easi_jax.model.parameters import Parameter, ParameterSpace
-from train._log_results import sound
 
 NAMES = ("kp", "kv")
 SPACE = ParameterSpace(

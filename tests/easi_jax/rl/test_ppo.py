@@ -181,7 +181,7 @@ def test_a_policy_clipped_apart_does_not_hear_of_the_value(ppo: Ppo, apart: bool
     """A value that errs by much, once, takes the policy's next step away with it."""
     config = replace(ppo.config, clip_apart=apart)
     other = Ppo(ppo.env, config, bind=lambda theta: theta, draw=lambda dist, key: dist)
-    shapes = jax.eval_shape(
+    shapes: Any = jax.eval_shape(
         lambda key: other.init(key, probe_models()["constant"]).params,
         jax.random.key(0),
     )
@@ -192,14 +192,14 @@ def test_a_policy_clipped_apart_does_not_hear_of_the_value(ppo: Ppo, apart: bool
             value=jax.tree.map(lambda x: jnp.full(x.shape, value), shapes.value),
         )
 
+    update: Any = other._optimizer.update
+
     def steps(*errors: float) -> Any:
         params = filled(0.0, 0.0)
         state, moved = other._optimizer.init(params), []
         for error in errors:
             given = filled(1e-4, error)
-            change, state = other._optimizer.update(
-                given, state, params, kl=jnp.zeros(())
-            )
+            change, state = update(given, state, params, kl=jnp.zeros(()))
             moved.append(jax.tree.leaves(change.policy)[0])
         return moved
 
