@@ -6,6 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+import yaml
 
 from easi_jax.data.recording import Configuration, Run
 from easi_jax.data.windows import fitted_velocity
@@ -16,8 +17,8 @@ from easi_jax.gap.result import Numbers
 from easi_jax.gap.screening import expanded
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import engine
-from tests.commands import command
-from train import gap
+from tests.commands import command, read
+from train import easi, export, gap
 
 MODEL = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
 <body><joint name="j" axis="0 1 0" armature="0.02"/>
@@ -101,3 +102,42 @@ def test_what_the_drive_lacks_is_named(effect: str, tmp_path: Path) -> None:
     kp, kv = TRUTHS[effect]
     np.testing.assert_allclose(m.actuator_gainprm[0, 0], kp, rtol=0.02)
     np.testing.assert_allclose(m.actuator_biasprm[0, 1:3], (-kp, -kv), rtol=0.02)
+
+
+EFFECTS = """effects:
+- {effect: drive_stiffness, at: servo, kind: actuator, columns: {kp: 1.0}}
+- {effect: drive_damping, at: servo, kind: actuator, columns: {kv: 1.0}}
+- {effect: actuator_strength, at: servo, kind: actuator, columns: {strength: 1.0}}
+"""
+
+
+def test_a_drive_that_is_identified_is_exported(tmp_path: Path) -> None:
+    """Stiffness and damping may be both of them less, or the drive weaker: which of the
+    two no data say, but what the drive does is known, and written down."""
+    kp, kv = 0.7 * KP, 0.85 * KV
+    (tmp_path / "arm.xml").write_text(MODEL.format(kp=KP, kv=KV))
+    (tmp_path / "effects.yaml").write_text(EFFECTS)
+    (tmp_path / "parameters.yaml").write_text(
+        "parameters:\n- {name: armature, address: joint.j.armature, "
+        "initial: [0.01, 0.04]}\n"
+    )
+    head, rows = "time,qpos.j,ctrl.servo", recorded(kp, kv)
+    np.savetxt(tmp_path / "log.csv", rows, "%.9g", ",", header=head, comments="")
+    out = tmp_path / "out"
+    command(
+        *(easi, "--model", tmp_path / "arm.xml", "--data", tmp_path / "log.csv"),
+        *("--parameters", tmp_path / "parameters.yaml"),
+        *("--effects", tmp_path / "effects.yaml", "--engine", "mujoco"),
+        *("--population", 16, "--generations", 3, "--set", "segments=16"),
+        *("--out", out),
+    )
+    command(export, out, "--to", "mjcf", "randomization")
+    m = mujoco.MjModel.from_xml_path(str(out / "export" / "model.xml"))
+    np.testing.assert_allclose(m.actuator_gainprm[0, 0], kp, rtol=0.02)
+    np.testing.assert_allclose(m.actuator_biasprm[0, 1:3], (-kp, -kv), rtol=0.02)
+    told = yaml.safe_load((out / "export" / "randomization.yaml").read_text())
+    names = {p["name"] for p in told["parameters"]}
+    factors = ("drive_stiffness", "drive_damping", "actuator_strength")
+    assert {f"{name}@servo.factor" for name in factors} < names
+    flags = read(out / "distribution.json")["seeds"]["0"]["flags"]
+    assert "not determined" in flags, "one of three is free"
