@@ -2,8 +2,9 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from statistics import mean, median
 from typing import Any
 
 from benchmarks._cells import read_rows
@@ -107,6 +108,21 @@ def table(rows: Iterable[Any], columns: Mapping[str, Column]) -> str:
         for row in rows
     ]
     return markdown_table(list(columns), lines)
+
+
+def computing(rows: Sequence[Mapping[str, Any]]) -> str:
+    """How long all rows took, by those that say it."""
+    told = [r["seconds"] for r in rows if "seconds" in r]
+    if not told:
+        return "Computing time: not recorded."
+    each = f"{median(told):.0f} s each in the median"
+    if len(told) == len(rows):
+        return f"Computing time: {sum(told) / 3600:.1f} hours of a core, {each}."
+    whole = mean(told) * len(rows) / 3600
+    return (
+        f"Computing time: about {whole:.1f} hours of a core, {each}, by the "
+        f"{len(told)} of {len(rows)} that say it."
+    )
 
 
 def met(ok: object) -> str:

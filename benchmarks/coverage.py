@@ -20,6 +20,7 @@ are those of ``train.easi --data``; lines are in ``coverage_logs.jsonl``.
 
 import copy
 import dataclasses
+import time
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +82,9 @@ def run(config: Config) -> None:
     given |= {"versions": versions(), "late": config.late}
     with progress("coverage", len(mine), len(mine) - len(seeds)) as shown:
         for seed in seeds:
+            begun = time.monotonic()
             row = {"seed": seed, **solve(seed), **given}
+            row["seconds"] = time.monotonic() - begun  # the first one's compile, too
             add_row(out, row)
             shown.advance(1, refined=row["refined"]["distance"] / max(row["rank"], 1))
     say(f"written: {out}")

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks._common import commits_of, markdown_table
-from benchmarks._page import Section, met
+from benchmarks._page import Section, computing, met
 from benchmarks.coverage import WAYS
 from benchmarks.gap_score import wilson
 
@@ -15,6 +15,7 @@ GOALS = {0.5: (0.45, 0.55), 0.9: (0.87, 0.93)}
 MEANT = WAYS[1:]  # spreads that commands state
 BOUND = 1.07  # times the Cramer-Rao bound
 LATE = 0.8  # of truths, at least, inside regions of 90 % where commands come late
+SILENT = 0.1  # of targets with a right model, at most, of which no region is stated
 OFF = 0.2  # standard deviations, that the mean error of a parameter is at most
 TARGETS = 100
 _REGIONS = (
@@ -34,6 +35,7 @@ def _late(rows: list[dict[str, Any]]) -> list[str]:
         "knows nothing; the finish is that of measured logs, with late commands "
         f"in doubt; commits {commits_of(rows)}. {_REGIONS}",
         _as_stated(rows, {0.9: (LATE, 1.0)}),
+        computing(rows),
     ]
 
 
@@ -45,6 +47,8 @@ def _logs(rows: list[dict[str, Any]]) -> list[str]:
         f"(every step twice in pieces, late commands in doubt); commits "
         f"{commits_of(rows)}. {_REGIONS}",
         _as_stated(rows, GOALS),
+        *_centered(rows),
+        computing(rows),
     ]
 
 
@@ -64,11 +68,14 @@ def _as_stated(
             told = f", {judged(hit, goals[q])}" if q in goals else ""
             inside.append(share(hit) + told)
         error = f"{np.median(beside_bound(mine, WAYS[-1])):.3g}"
-        none = sum(
-            bool(r.get("no_region")) or r.get("times_noise", 0.0) > UNSTATED
-            for r in mine
-        )
-        lines.append((f"{1000 * late:g} ms", len(mine), *inside, error, none))
+        silent = [
+            r.get("no_region") or r.get("times_noise", 0) > UNSTATED for r in mine
+        ]
+        none = np.array(silent, bool)
+        told = f"{none.sum()}"
+        if late == 0:  # a model that is right says where its parameters are
+            told += f", {judged(none, (0.0, SILENT))}"
+        lines.append((f"{1000 * late:g} ms", len(mine), *inside, error, told))
     head = (
         *("late by", "targets", "50 %, information", "90 %, information"),
         *("50 %, as stated", "90 %, as stated", "error / bound", "no region"),
@@ -119,6 +126,7 @@ def _right(rows: list[dict[str, Any]]) -> list[str]:
         markdown_table(head, lines),
         *_centered(rows),
         *_unseen(rows),
+        computing(rows),
     ]
 
 

@@ -28,7 +28,7 @@ import numpy as np
 
 from benchmarks._cells import Share, run_cells
 from benchmarks._common import RESULTS, commits_of
-from benchmarks._page import Section, met, table
+from benchmarks._page import Section, computing, met, table
 from benchmarks.coverage_summary import NOT_TOLD, judged
 from benchmarks.gap_score import keys_of, wilson
 from train._command import main
@@ -409,6 +409,7 @@ def paragraphs(rows: list[dict[str, Any]]) -> list[str]:
                     ),
                 },
             ),
+            computing(clean),
         ]
     if hidden:
         by_effect = {e: [r for r in hidden if r["hidden"] == e] for e in EFFECTS}
@@ -439,6 +440,7 @@ def paragraphs(rows: list[dict[str, Any]]) -> list[str]:
                     "gap over floor after": lambda line: _spread(line[1]),
                 },
             ),
+            computing(hidden),
         ]
     return said
 

@@ -139,7 +139,7 @@ def test_lines_are_counted_by_package() -> None:
     assert "| **easi_jax, train, benchmarks** | 7 | 7 | +0 |" in told
     assert told.endswith("| **in all** | 1,007 | 2,007 | +1,000 |")
     with pytest.raises(UserError, match="no such commit"):
-        lines.counts("no such commit")
+        lines.files("no such commit")
 
 
 @pytest.mark.slow
