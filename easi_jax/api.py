@@ -4,7 +4,7 @@ The commands of ``train`` do the same with folders, checkpoints and reports.
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -46,6 +46,7 @@ from easi_jax.model.parameter_proposal import own_space
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.results import Flag, GapResult, HeldOutErrors, Outcome
 from easi_jax.pipeline.stages import seed_keys
+from easi_jax.progress import Tell
 from easi_jax.rl.config import EssInfoGailConfig
 from easi_jax.rl.networks import PolicyParams, act
 from easi_jax.rl.presets import imitating, training_preset
@@ -58,7 +59,6 @@ from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.with_effects import env_identified
 
 PathLike = str | os.PathLike[str]
-Tell = Callable[[str], None]
 
 
 def _silent(_: str) -> None:

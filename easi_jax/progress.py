@@ -4,6 +4,8 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Protocol
 
+Tell = Callable[[str], None]  # takes a line on how far it is
+
 
 class Steps(Protocol):
     """What is told of each step of a stage."""

@@ -29,7 +29,7 @@ class Easi:
     """More starts of it, as in `easi_jax.pipeline.stages.PipelineConfig`."""
     refine_horizon: int | None = None
     """Control steps of a piece there, as in
-    `easi_jax.estimation.posterior.finish_pieces`."""
+    `easi_jax.estimation.pieces.finish_pieces`."""
     refine_pieces: int | None = None
     """Pieces at most, as there."""
 

@@ -43,9 +43,7 @@ def activation_guess(m: mujoco.MjModel, run: Run) -> np.ndarray:
     return out
 
 
-def activation_spread(
-    m: mujoco.MjModel, runs: Sequence[Run], guesses: Sequence[np.ndarray]
-) -> np.ndarray:
+def activation_spread(m: mujoco.MjModel, runs: Sequence[Run]) -> np.ndarray:
     """How far activations may be from their guess, standard deviations ``(na,)``.
 
     As much as the commands (of a filter) or the guess itself change in the runs: wide,
@@ -53,9 +51,10 @@ def activation_spread(
     """
     out = np.ones(m.na)
     for i, at in _places(m).items():
-        paths = [g[:, at] for g in guesses]
         if m.actuator_dyntype[i] in _FOLLOWING:
             paths = [run.ctrl[:, i] for run in runs]
+        else:
+            paths = [activation_guess(m, run)[:, at] for run in runs]
         spread = float(np.std(np.concatenate(paths)))
         out[at] = spread if spread > 0 else 1.0
     return out

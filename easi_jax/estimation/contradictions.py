@@ -103,7 +103,7 @@ def held_apart(
 def spread(names: Sequence[str]) -> list[str]:
     """`_COMPARED` of them at most, at even distances."""
     at = np.linspace(0, len(names) - 1, min(len(names), _COMPARED))
-    return [names[i] for i in at.round().astype(int)]
+    return [names[int(i)] for i in at.round()]
 
 
 def worst(owner: np.ndarray, weight: np.ndarray) -> list[str]:

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from easi_jax.progress import Tell
 from easi_jax.search.unpaired import (
     Pieces,
     Simulations,
@@ -83,18 +84,8 @@ class Matched:
     mean: np.ndarray
     cov: np.ndarray
     excess: float
-    lost: int
     disagree: bool = False
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """What one emulator says of pieces; as `Matched`."""
-
-    mean: np.ndarray
-    cov: np.ndarray
-    excess: float
-    disagree: bool
+    lost: int = 0
 
 
 @dataclass(frozen=True)
@@ -129,7 +120,7 @@ class _Emulator:
         given = shown(read.before), left(read.before, read.change), weight
         return _Emulator(middle, shown, left, _slopes(unit - middle, *given), known)
 
-    def fit(self, pieces: Pieces) -> _Fit:
+    def fit(self, pieces: Pieces) -> Matched:
         """The parameters of ``pieces (K, ...)`` by least squares."""
         x, r = self.shown(pieces.before), self.left(pieces.before, pieces.change)
         counts = pieces.weight
@@ -164,7 +155,7 @@ class _Emulator:
         scores = score / excess, of_channels @ share.T / excess
         scatter, disagree = _scattered(*scores, information / excess)
         cov = inverse @ (scatter + prior) @ inverse
-        return _Fit(self.middle + step, cov, excess, disagree)
+        return Matched(self.middle + step, cov, excess, disagree)
 
 
 def _scattered(
@@ -195,7 +186,7 @@ def matched(
     pieces: Pieces,
     mean: np.ndarray,
     key: jax.Array,
-    tell: Callable[[str], None] = lambda _: None,
+    tell: Tell = lambda _: None,
     known: Known = NOTHING,
 ) -> Matched:
     """The fit, from where a search has ended.
@@ -217,7 +208,7 @@ def matched(
     low, high = np.maximum(low, -BEYOND), np.minimum(high, 1 + BEYOND)
     center = np.clip(np.asarray(mean, float), low, high)
     n, spread = len(center), np.full(len(center), PRIOR**-0.5)
-    found, lost = list[tuple[_Emulator, _Fit]](), 0
+    found, lost = list[tuple[_Emulator, Matched]](), 0
     known = known.beside(n - len(known.mean))
     for k in range(ROUNDS):
         k_draw, k_roll = jax.random.split(jax.random.fold_in(key, k))
@@ -237,7 +228,7 @@ def matched(
         spread = np.clip(wide, _NARROWEST, np.maximum(_NARROWER * spread, _NARROWEST))
     if not found:
         nan = np.full((n, n), np.nan)
-        return Matched(nan[0], nan, np.nan, lost)
+        return Matched(nan[0], nan, np.nan, lost=lost)
     last = found[-_AVERAGED:]
     unit = np.clip(np.mean([fit.mean for _, fit in last], axis=0), low, high)
     size = len(real.weight)
@@ -259,8 +250,7 @@ def _told_again(
     read, sound = simulated(np.tile(unit, (simulated.size, 1)), k_own)
     if not sound.any():
         return np.tile(unit, (len(emulators), 1)), 0.0
-    good = (x[sound] for x in (read.before, read.change, read.weight))
-    log = Pieces(*(x.reshape(-1, *x.shape[2:]) for x in good))
+    log = jax.tree.map(lambda x: x[sound].reshape(-1, *x.shape[2:]), read)
     said = [
         replace(e, known=Known(unit, e.known.information)).fit(log).mean
         for e in emulators
@@ -269,7 +259,7 @@ def _told_again(
 
 
 def _corrected(
-    fits: Sequence[_Fit],
+    fits: Sequence[Matched],
     again: np.ndarray,
     more: float,
     unit: np.ndarray,
@@ -284,7 +274,7 @@ def _corrected(
         cov = cov + np.diag(means.var(0, ddof=1)) / len(fits)
     excess = float(np.mean([f.excess for f in fits]))
     disagree = sum(f.disagree for f in fits) > len(fits) / 2
-    return Matched(np.clip(means.mean(0), *bounds), cov, excess, lost, disagree)
+    return Matched(np.clip(means.mean(0), *bounds), cov, excess, disagree, lost)
 
 
 def _regressed(

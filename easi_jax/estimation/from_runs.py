@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from easi_jax.data import unmeasured
-from easi_jax.data.activations import activation_guess, activation_spread
+from easi_jax.data.activations import activation_spread
 from easi_jax.data.noise import finest, resolution_of, resolutions
 from easi_jax.data.recording import Run
 from easi_jax.data.scales import scales_of
@@ -51,14 +51,13 @@ from easi_jax.estimation.prediction_error import (
 from easi_jax.estimation.problem import Problem
 from easi_jax.estimation.step_error import error_of_steps, is_visible, widened_by
 from easi_jax.estimation.weights import readings, step_weights
+from easi_jax.progress import Tell
 from easi_jax.search.config import SearchConfig
 from easi_jax.search.easi import Search, SearchData
 from easi_jax.simulation.slopes import shift_readings
 
-Tell = Callable[[str], None]
 Notes = Callable[[int], list[str]]
 
-_HELD_WINDOWS, _FIT_WINDOWS = 200, 96  # that errors are measured on, at most
 # Pieces of a generation at least, and physics steps that are worth their time; a piece
 # of a larger robot tells more, and each of its steps takes longer.
 _SEARCH, _WIDE_SEARCH = (16, 500_000), (4, 100_000)
@@ -92,19 +91,14 @@ def search_data(problem: Problem) -> SearchData:
         problem.simulator, problem.fit, problem.piece, max(1, problem.piece // 2)
     )
     hidden = np.isinf(problem.noise)
-    noise = _with_start_spread(problem)
+    # Where a start is hidden, how far it may be off.
+    spread = unmeasured.start_spread(problem.simulator.mj_model, problem.fit)
+    noise = np.where(hidden, spread, problem.noise)
     return SearchData(
         segments=to_device(pieces),
-        noise=noise,
+        noise=jnp.asarray(noise, jnp.result_type(float)),
         hidden=jnp.asarray(hidden) if hidden.any() else (),
     )
-
-
-def _with_start_spread(problem: Problem) -> jax.Array:
-    """Noise ``(2 nv,)``, and where a start is hidden how far it may be off."""
-    spread = unmeasured.start_spread(problem.simulator.mj_model, problem.fit)
-    noise = np.where(np.isfinite(problem.noise), problem.noise, spread)
-    return jnp.asarray(noise, jnp.result_type(float))
 
 
 def start_spread(problem: Problem, noise: jax.Array) -> jax.Array:
@@ -141,12 +135,11 @@ def spread_of_starts(
     wide = unmeasured.start_spread(m, runs, hidden[: m.nv])
     position, velocity = np.split(np.where(hidden, wide, np.asarray(noise)), 2)
     derived = ~measured & ~hidden[m.nv :]
-    guesses = [activation_guess(m, run) for run in runs]
     return jnp.concatenate(
         [
             position,
             np.where(derived, np.hypot(velocity, moving), velocity),
-            activation_spread(m, runs, guesses),
+            activation_spread(m, runs),
         ],
         dtype=jnp.result_type(float),
     )
@@ -381,7 +374,7 @@ class _Finish:
             if self.alike(before, counts):
                 break
         if not self.refined or self.lost(found):
-            return replace(found, search_mean=mean, search_cov=cov), weight
+            return replace(found, search_cov=cov), weight
         if fewer:
             weighed = self.whole
         undoubted = _Last(found, weight, weighed, misfit, noise, found.fit)
@@ -396,7 +389,7 @@ class _Finish:
         found = last.found
         if not self.lost(found) and not self.beyond(found):
             found = self.of_steps(found, cov)
-        return replace(found, search_mean=mean, search_cov=cov), last.weight
+        return replace(found, search_cov=cov), last.weight
 
     def ended(
         self,

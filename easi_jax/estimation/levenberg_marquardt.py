@@ -18,6 +18,7 @@ logged together; it says nothing about unpaired data or about distributions.
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import flax.struct
@@ -39,6 +40,9 @@ from easi_jax.model.parameters import ParameterSpace
 
 _TRIED = 10.0 ** np.arange(-2, 4)  # dampings together, relative to the last one
 _DAMPING = Damping(falls=1.0, rises=100.0, least=1e-6, most=1e6)
+# Information of a weak pull towards the start, whose deviation is three initial ranges:
+# directions without any other stay where they are.
+_PULL = 1.0 / 3.0**2
 _SHARES = 0.0, 0.3, 1.0  # of the step of its start, of which each piece takes the best
 _STEPS = 1 + len(_TRIED)  # places that a step is tried at: without one as well
 _TINY = 1e-24  # below what a parameter that is nearly zero has of information
@@ -97,7 +101,6 @@ def refine(
     paired: PairedFit,
     unit: jax.Array,
     iterations: int = 40,
-    prior_std: float = 3.0,
     robust: int | jax.Array = 6,
     near: bool | jax.Array = False,
     others: jax.Array | None = None,
@@ -106,8 +109,6 @@ def refine(
 
     Args:
         iterations: rounds of a stage at most; fewer where the cost has settled.
-        prior_std: weak pull towards the start, in initial ranges, so that
-            directions without any information stay where they are.
         robust: in so many first rounds, pieces that fit far worse than most count
             less.
         near: whether ``unit`` is already about the best, so that there is only the last
@@ -117,7 +118,7 @@ def refine(
         others: ``(K, n)`` more places to start from; what fits best is the result. One
             that comes to within a standard deviation of it is followed no further.
     """
-    fit = _Fit(paired, paired.weight, unit, 1.0 / prior_std**2, iterations)
+    fit = _Fit(paired, paired.weight, unit, iterations)
     starts = unit[None] if others is None else jnp.concatenate([unit[None], others])
     stages = _Stage.all(starts, near, robust, others is not None)
     place, costs = fit.place(unit, paired.unmoved), jnp.zeros(iterations + 2)
@@ -234,14 +235,12 @@ class _Fit:
         whole: the pieces.
         weight: of each measured number, ``(M, H, 2 nv)``.
         anchor: where the prior draws to, ``(n,)``.
-        pull: information of the prior.
         iterations: rounds of a stage at most.
     """
 
     whole: PairedFit
     weight: jax.Array
     anchor: jax.Array
-    pull: float
     iterations: int
 
     @property
@@ -358,7 +357,7 @@ class _Fit:
         )
         return _Found(
             last=last,
-            best=_where(better, at, best),
+            best=jax.tree.map(partial(jnp.where, better), at, best),
             costs=jnp.where(better, costs, found.costs),
             unmet=jnp.where(item.dropping, unmet, found.unmet),
         )
@@ -369,7 +368,9 @@ class _Fit:
         begins = jnp.arange(self.whole.segments.horizon) < self.short
         weight = jnp.where(now.item.short, self.weight * begins[:, None], self.weight)
         trust = self.trust(at.pieces, weight, now)
-        reach = _where(now.anew, limits.Reach.fresh(space), at.reach)
+        reach = jax.tree.map(
+            partial(jnp.where, now.anew), limits.Reach.fresh(space), at.reach
+        )
         hops = reach.ends(space, at.unit)
         eq, (units, shifts), each = self.look(at, hops, weight, trust, now)
         here = _data(each[:1], trust)
@@ -390,7 +391,7 @@ class _Fit:
             unit=units[best],
             shift=shifts[best],
             damping=jnp.where(moving, damping, at.damping),
-            reach=_where(moving, told, reach),
+            reach=jax.tree.map(partial(jnp.where, moving), told, reach),
             pieces=each[best],
             hessian=eq.hessian,
             residuals=eq.residuals,
@@ -430,7 +431,7 @@ class _Fit:
 
     def prior(self, unit: jax.Array) -> jax.Array:
         """Its cost, ``(...)``."""
-        return 0.5 * jnp.sum(self.pull * self.away(unit) ** 2, axis=-1)
+        return 0.5 * jnp.sum(_PULL * self.away(unit) ** 2, axis=-1)
 
     def trials(
         self, at: _Place, hops: jax.Array, now: _Now, eq: Normal
@@ -439,8 +440,8 @@ class _Fit:
         where the fit began; parameters and starts."""
         u, shift, unmoved = at.unit, at.shift, self.whole.unmoved
         away, slope = jax.jvp(self.away, (u,), (jnp.ones(u.size),))
-        grad = eq.gradient + self.pull * slope * away
-        hess = eq.hessian + jnp.diag(self.pull * slope**2 + _TINY)
+        grad = eq.gradient + _PULL * slope * away
+        hess = eq.hessian + jnp.diag(_PULL * slope**2 + _TINY)
         free = ~held_back(u, grad, *self.space.unit_bounds) & now.loose
         du = bounded_step(hess, grad, free, at.damping * _TRIED)
         newton = self.space.clip(moved(self.space, u, du))
@@ -529,7 +530,3 @@ def _data(each: jax.Array, trust: jax.Array) -> jax.Array:
     """Cost of the data, of pieces ``each (T, M)``; without trust they may be infinitely
     bad."""
     return jnp.where(trust > 0, each * trust, 0.0).sum(1)
-
-
-def _where(condition: jax.Array, new: Any, old: Any) -> Any:
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)

@@ -130,7 +130,8 @@ class PairedFit:
 
         native = self.simulator.engine == "mujoco"
         points = self.points if native else 1
-        return self._summed(self._each(one, points, delta, weight))
+        hessian, *rest = self._each(one, points, delta, weight)
+        return Normal(hessian.sum(0), *rest)
 
     def information(self, unit: jax.Array) -> jax.Array:
         """Of the data at ``unit (n,)``, starts as they were measured, ``(n, n)``."""
@@ -142,7 +143,9 @@ class PairedFit:
         ``(K, M, S)``."""
         n, m, size = self.space.size, self._directions, delta.shape[1]
         low, high = self.space.unit_bounds
-        ways = jnp.eye(m, n + size) * self._steps()
+        along = jnp.full(n, _STEP)
+        steps = jnp.concatenate([along, jnp.clip(self.spread, *_MOVE)])
+        ways = jnp.eye(m, n + size) * steps
         ways = jnp.concatenate([jnp.zeros((1, n + size)), ways, -ways])
         # Between bounds a parameter may have less than its step to go.
         units = jnp.clip(unit + ways[:, :n], low, high)
@@ -178,11 +181,7 @@ class PairedFit:
 
         shifts = jnp.swapaxes(deltas, 0, 1)
         equations, cost = self._each(one, units.shape[0], shifts, weight)
-        return self._summed(equations), cost.T
-
-    def _steps(self) -> jax.Array:
-        along = jnp.full(self.space.size, _STEP)
-        return jnp.concatenate([along, jnp.clip(self.spread, *_MOVE)])
+        return Normal(equations[0].sum(0), *equations[1:]), cost.T
 
     def _equations(
         self, r: jax.Array, jac: jax.Array, d: jax.Array, w: Any, share: jax.Array
@@ -215,9 +214,6 @@ class PairedFit:
         both = left.T @ left
         step = -size[:, None] * follow
         return both[:n, :n], both[:n, n], cost, step[:, n], step[:, :n], r
-
-    def _summed(self, parts: Any) -> Normal:
-        return Normal(parts[0].sum(0), *parts[1:])
 
     def _cost(
         self, r: jax.Array, d: jax.Array, w: jax.Array, share: jax.Array

@@ -13,6 +13,7 @@ there says beforehand that nothing can make up for it.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import flax.struct
@@ -214,7 +215,7 @@ class _Steps:
         allowed = limits.edge(unit[way], told.hessian[way, way])
         allowed = jnp.where(flat, allowed, 0.0)
         taken = first | going & (end.least < found.least + allowed)
-        best = jax.tree.map(lambda x, y: jnp.where(taken, x, y), end, found)
+        best = jax.tree.map(partial(jnp.where, taken), end, found)
         best = replace(best, cost=jnp.where(first, end.cost, found.cost))
         return best, end.k * self.paired.points + tried
 
@@ -271,7 +272,7 @@ class _Steps:
         cost += 0.5 * jnp.sum(self.known * c.unit**2)
         better = stepping & ((c.k == 0) | (cost < c.least))
         best = jax.tree.map(
-            lambda new, old: jnp.where(better, new, old),
+            partial(jnp.where, better),
             (c.unit, c.starts, eq),
             c.best,
         )

@@ -1,7 +1,8 @@
 """From the end of a search to an honest distribution over parameters."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import flax.struct
@@ -47,8 +48,8 @@ class Estimate:
 
     Attributes:
         distribution: the Gaussian that training samples from.
-        search_mean: mean found by the adversarial search, unit coordinates, ``(n,)``.
-        search_cov: its covariance, ``(n, n)``.
+        search_cov: covariance found by the adversarial search, unit coordinates,
+            ``(n, n)``.
         hessian: Fisher information of the data at the fit, logarithms that are below
             the low end of their initial range raised to it, ``(n, n)``: there it says
             how far they are known to be below, as a share of that end.
@@ -78,7 +79,6 @@ class Estimate:
     """
 
     distribution: Distribution
-    search_mean: jax.Array
     search_cov: jax.Array
     hessian: jax.Array
     noise: jax.Array
@@ -114,7 +114,7 @@ def estimate(
     open, ``(F + prior)^-1`` with F the Fisher information of the pieces and the initial
     range as prior. The mean is that of both, too: a direction that the data do not show
     keeps the initial spread about the middle of the initial range, wherever the search
-    has drifted to; but not where that leads out of a bent valley (`_Whole.likelier`).
+    has drifted to; but not where that leads out of a bent valley (`_likelier`).
     Where the fit leaves more than the noise explains, the model lacks something, and
     the information counts for less (`trusted`). Without ``informed`` it is the
     search's own covariance alone. What may be as good as zero is stated as `_near_zero`
@@ -139,7 +139,7 @@ def estimate(
     starts = fit.delta if rest is None else None
     ends = {"adjusted": adjusted, "doubts": doubts, "starts": starts}
     more = polished(whole, fit.fit, cov, informed, **ends)
-    return replace(more, search_mean=mean, simulated=fit.simulated + more.simulated)
+    return replace(more, simulated=fit.simulated + more.simulated)
 
 
 def begun(
@@ -165,7 +165,7 @@ def begun(
         return _of_search(paired, mean, cov, informed)
     others = _draws(mean, cov, restarts) if restarts else None
     fit = refine(paired, mean, robust=robust, near=near, others=others)
-    return _of_fit(paired, fit, mean, cov, informed)
+    return _of_fit(paired, fit, cov, informed)
 
 
 def polished(
@@ -196,12 +196,12 @@ def polished(
         # Their deviations, too, are those of a model that errs, at most as before.
         std = jnp.minimum(told[:, 1] * widened(all_.excess), 1.0)
         told = told.at[:, 1].set(std)
-        found = _of_fit(paired, fit, center, cov, informed, _Whole(wider, all_))
+        found = _of_fit(paired, fit, cov, informed, (wider, all_))
         return replace(found, doubts=told, doubted=doubts.parameters)
     fit = polish(paired, center, starts=starts)
     if adjusted:
         fit = _adjusted(paired, fit)
-    return _of_fit(paired, fit, center, cov, informed, _Whole(paired, fit))
+    return _of_fit(paired, fit, cov, informed, (paired, fit))
 
 
 def _floored(paired: PairedFit) -> PairedFit:
@@ -236,21 +236,21 @@ def _of_search(
         gain=eq.start_gain,
     )
     stated = (center, spread) if informed else (mean, cov)
-    return _stated(paired, ended, mean, cov, *stated)
+    return _stated(paired, ended, cov, *stated)
 
 
 def _of_fit(
     paired: PairedFit,
     fit: RefineResult,
-    mean: jax.Array,
     cov: jax.Array,
     informed: bool,
-    whole: "_Whole | None" = None,
+    whole: tuple[PairedFit, RefineResult] | None = None,
 ) -> Estimate:
-    """What is stated of a fit, after a search that ended at ``mean``, ``cov``.
+    """What is stated of a fit, after a search that ended with ``cov``.
 
     Args:
-        whole: the fit with all that was fitted, where it has come to its end.
+        whole: all that was fitted, effects in doubt behind the parameters, and where it
+            ended, where the fit has come to its end.
     """
 
     def said(information: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -260,60 +260,45 @@ def _of_fit(
     # What predicts best, whatever it stands in for.
     center = paired.space.clip(said(fit.raised_hessian)[0])
     if whole is not None:
-        center = whole.likelier(center, fit)
-        fit = replace(fit, simulated=fit.simulated + whole.simulated)
+        center = _likelier(*whole, center, fit)
+        pieces = whole[0].segments
+        looked = 1.0 * len(_WAY) * pieces.count * pieces.horizon
+        fit = replace(fit, simulated=fit.simulated + looked)
     left = scattered(fit.raised_hessian, fit.hessian, fit.gradients)
     spread = said(left * trusted(fit.excess))[1]
-    return _stated(paired, fit, mean, cov, center, spread if informed else cov)
+    return _stated(paired, fit, cov, center, spread if informed else cov)
 
 
-@dataclass(frozen=True)
-class _Whole:
-    """A fit with all that was fitted: parameters, then effects in doubt.
+def _likelier(
+    paired: PairedFit, fit: RefineResult, center: jax.Array, own: RefineResult
+) -> jax.Array:
+    """The mean of ``fit`` and initial range ``center (n,)``, or as far on the way there
+    from the fit, of which ``own`` is the parameters' part, as is not surely less likely
+    by data and prior.
 
-    Attributes:
-        paired: the pieces, and what simulates them.
-        fit: where it ended.
+    Data that know products of parameters know a bent valley, in which a straight line
+    towards the middle of the range soon predicts far worse. Starts and effects in doubt
+    follow as the fit's slopes say. What the data say nothing of by itself costs
+    nothing, and goes all of the way.
     """
-
-    paired: PairedFit
-    fit: RefineResult
-
-    @property
-    def simulated(self) -> float:
-        """Control steps that `likelier` simulates."""
-        pieces = self.paired.segments
-        return 1.0 * len(_WAY) * pieces.count * pieces.horizon
-
-    def likelier(self, center: jax.Array, own: RefineResult) -> jax.Array:
-        """The mean of fit and initial range ``center (n,)``, or as far on the way there
-        from the fit, of which ``own`` is the parameters' part, as is not surely less
-        likely by data and prior.
-
-        Data that know products of parameters know a bent valley, in which a straight
-        line towards the middle of the range soon predicts far worse. Starts and effects
-        in doubt follow as the fit's slopes say. What the data say nothing of by itself
-        costs nothing, and goes all of the way.
-        """
-        paired, fit, n = self.paired, self.fit, center.size
-        fitted = jnp.where(limits.unmet(fit.hessian)[:n], center, own.raised)
-        units = fitted + jnp.asarray(_WAY)[:, None] * (center - fitted)
-        gone = units - own.unit
-        step = jnp.concatenate([gone, gone @ followed(fit.hessian, n).T], 1)
-        starts = own.delta + jnp.einsum("msn,kn->kms", own.gain, gone)
-        each = paired.costs(fit.unit + step, starts, paired.weight)
-        cost = jnp.where(jnp.isfinite(each[0]), each, 0.0).sum(1)
-        cost += 0.5 * jnp.sum((units - _MIDDLE) ** 2, 1) / _INITIAL_VARIANCE
-        likely = cost < cost[0] + _SURELY
-        # As far as all before are likely, too; all of the way as it was given.
-        last = jnp.argmin(jnp.append(likely[1:], False))
-        return jnp.where(last == len(_WAY) - 1, center, units[last])
+    n = center.size
+    fitted = jnp.where(limits.unmet(fit.hessian)[:n], center, own.raised)
+    units = fitted + jnp.asarray(_WAY)[:, None] * (center - fitted)
+    gone = units - own.unit
+    step = jnp.concatenate([gone, gone @ followed(fit.hessian, n).T], 1)
+    starts = own.delta + jnp.einsum("msn,kn->kms", own.gain, gone)
+    each = paired.costs(fit.unit + step, starts, paired.weight)
+    cost = jnp.where(jnp.isfinite(each[0]), each, 0.0).sum(1)
+    cost += 0.5 * jnp.sum((units - _MIDDLE) ** 2, 1) / _INITIAL_VARIANCE
+    likely = cost < cost[0] + _SURELY
+    # As far as all before are likely, too; all of the way as it was given.
+    last = jnp.argmin(jnp.append(likely[1:], False))
+    return jnp.where(last == len(_WAY) - 1, center, units[last])
 
 
 def _stated(
     paired: PairedFit,
     fit: RefineResult,
-    mean: jax.Array,
     cov: jax.Array,
     center: jax.Array,
     spread: jax.Array,
@@ -323,7 +308,6 @@ def _stated(
     return Estimate(
         # Where next to nothing is known, what others do may lead anywhere.
         distribution=gaussian(paired.space, paired.space.clip(center), spread),
-        search_mean=mean,
         search_cov=cov,
         hessian=fit.raised_hessian,
         noise=noise,
@@ -385,20 +369,10 @@ def _adjusted(paired: PairedFit, fit: RefineResult) -> RefineResult:
     long = paired.segments.horizon >= _BRIEF
     if long or not paired.free_starts or paired.simulator.mj_model.nv > FORWARD_MODE:
         return fit
-    new = adjust(paired, fit.unit)
-    found = replace(
-        fit,
-        unit=new.unit,
-        hessian=new.hessian,
-        # Scatter is in the score's worth already.
-        gradients=jnp.zeros_like(fit.gradients),
-        delta=new.delta,
-        raised=new.raised,
-        raised_hessian=new.raised_hessian,
-    )
-    fine = jnp.isfinite(new.left[1])
-    found = jax.tree.map(lambda x, y: jnp.where(fine, x, y), found, fit)
-    return replace(found, simulated=fit.simulated + new.simulated)
+    found, left = adjust(paired, fit)
+    fine = jnp.isfinite(left[1])
+    kept = jax.tree.map(partial(jnp.where, fine), found, fit)
+    return replace(kept, simulated=found.simulated)
 
 
 def trusted(excess: jax.Array) -> jax.Array:

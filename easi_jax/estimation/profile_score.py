@@ -14,7 +14,8 @@ direction where it is not, or where scores with fitted starts scatter more than 
 information says, the result is as much less sure (Godambe, 1960).
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import flax.struct
@@ -28,6 +29,7 @@ from easi_jax.estimation.least_squares import (
     moved,
     raised_to_range,
 )
+from easi_jax.estimation.levenberg_marquardt import RefineResult
 from easi_jax.estimation.limits import EDGE, beyond_edge
 from easi_jax.estimation.normal_equations import RESOLVED, PairedFit
 from easi_jax.model.parameters import ParameterSpace
@@ -80,31 +82,6 @@ class Score:
 
 
 @flax.struct.dataclass
-class Adjusted:
-    """Result of `adjust`.
-
-    Attributes:
-        unit: parameters, unit coordinates, ``(n,)``.
-        hessian: information at them, less what their score scatters beyond it,
-            ``(n, n)``.
-        delta: shifts of the starts, ``(M, 2 nv)``.
-        raised: ``unit``, logarithmic parameters raised to the low end of their range.
-        raised_hessian: information there.
-        left: half the squared score that is left, in its standard deviations, ``()``,
-            at the start and at the result, ``(2,)``.
-        simulated: control steps simulated, ``()``; a derivative counts as one more.
-    """
-
-    unit: jax.Array
-    hessian: jax.Array
-    delta: jax.Array
-    raised: jax.Array
-    raised_hessian: jax.Array
-    left: jax.Array
-    simulated: jax.Array
-
-
-@flax.struct.dataclass
 class _Carry:
     """Of the rounds of `adjust`."""
 
@@ -117,83 +94,6 @@ class _Carry:
     length: jax.Array
     left: jax.Array
     seen: Any  # the score at the place looked at last
-
-
-class ProfileFit(PairedFit):
-    """`PairedFit` with each start at its best, and what that does to the score."""
-
-    def score(
-        self,
-        unit: jax.Array,
-        weight: jax.Array,
-        draws: jax.Array,
-        spread: jax.Array,
-    ) -> Score:
-        """The score at ``unit (n,)``.
-
-        Args:
-            weight: of each measured number, ``(M, H, 2 nv)``.
-            draws: standard normal, ``(M, K, H + 1, 2 nv)``: of each start, then of
-                what is measured after each step.
-            spread: standard deviations of the noise of starts, then of what comes
-                after, of each step or of all, ``(1 + H or 2, 2 nv)``.
-        """
-
-        def one(item: Any) -> Any:
-            s, w, e = item
-
-            def fitted(s: Segments) -> Any:
-                def turn(d: jax.Array, _: Any) -> Any:
-                    r, jac = self._pushed(unit, d, s)
-                    parts = self._equations(r, jac, d, w, s.weight)
-                    ahead = jnp.clip(d + parts[3], -most, most)
-                    return ahead, (d, r, jac, parts)
-
-                _, turns = jax.lax.scan(
-                    turn, jnp.zeros(most.shape), None, length=_TURNS
-                )
-                return jax.tree.map(lambda x: x[-1], turns)
-
-            def draw(real: Any, item: Any) -> Any:
-                """The measured piece, then those that ``e`` would have made of it."""
-                k, e = item
-                d, r, jac = real
-                first, later = e[0] * spread[0], e[1:] * spread[1:]
-                new = shift_start(self.simulator, s, d + first)
-                new = shift_readings(self.simulator, new, r + later)
-                new = jax.tree.map(lambda x, y: jnp.where(k, x, y), new, s)
-                *found, parts = fitted(new)
-                # The truth of what is made is known: its score is zero on average.
-                known = self._equations(-later, jac, -first, w, s.weight)[1]
-                fine = jnp.isfinite(parts[2]) & (parts[2] > 0)
-                over = jnp.where(fine, parts[1] - known, 0.0)
-                real = jax.tree.map(lambda x, y: jnp.where(k, x, y), real, tuple(found))
-                return real, (*parts[:3], over, known)
-
-            none = most, w, jnp.broadcast_to(w[..., None], (*w.shape, ways))
-            none = jax.tree.map(jnp.zeros_like, none)
-            drawn = jnp.arange(1 + len(e)) > 0
-            e = jnp.concatenate([0.0 * e[:1], e])
-            real, (hess, *rest) = jax.lax.scan(draw, none, (drawn, e))
-            grad, cost, over, known = rest
-            over, known = over[1:], known[1:]
-            bias, expected = over.mean(0), cost[1:].mean()
-            scatter = _scatter(over + known) + _scatter(over) / len(over)
-            return hess[0], grad[0], bias, scatter, cost[0], expected, real[0]
-
-        most, ways = _FARTHEST * self.noise, self._directions
-        hess, grad, bias, scatter, cost, expected, delta = self._each(
-            one, 1 + self._directions, weight, draws
-        )
-        return Score(
-            hessian=hess.sum(0),
-            gradient=grad.sum(0),
-            bias=bias.sum(0),
-            scatter=scatter.sum(0),
-            cost=cost.sum(),
-            expected=expected.sum(),
-            delta=delta,
-        )
 
 
 def less_scatter(hessian: jax.Array, scatter: jax.Array, count: int) -> jax.Array:
@@ -223,32 +123,39 @@ def _scatter(x: jax.Array) -> jax.Array:
     return off.T @ off / (len(x) - 1)
 
 
-def adjust(paired: PairedFit, unit: jax.Array) -> Adjusted:
-    """From a best fit ``unit (n,)`` to where its score less the average is zero; pure.
+def adjust(paired: PairedFit, fit: RefineResult) -> tuple[RefineResult, jax.Array]:
+    """From a best fit to where its score less the average is zero; pure.
 
     Noise that was assumed too high is taken as high as the fit's cost shows.
+
+    Returns:
+        The fit there, its information less what its score scatters beyond it; and half
+        the squared score that is left, in its standard deviations, at the start and at
+        the result, ``(2,)``.
     """
-    fit = ProfileFit(**{f.name: getattr(paired, f.name) for f in fields(paired)})
-    space, segments, noise = fit.space, fit.segments, fit.noise
+    space, segments, noise = paired.space, paired.segments, paired.noise
     shape = (segments.count, _DRAWS, segments.horizon + 1, len(noise))
     draws = jax.random.normal(jax.random.key(0), shape)
-    off = jnp.zeros_like(noise) if fit.misfit is None else fit.misfit
+    off = jnp.zeros_like(noise) if paired.misfit is None else paired.misfit
     later = jnp.where(jnp.isfinite(off), jnp.hypot(noise, off), 0.0)
-    root = _Root(fit, fit.weight, draws)
+    root = _Root(paired, paired.weight, draws)
     spread = jnp.concatenate([noise[None], jnp.atleast_2d(later)])
-    begin = root.begin(raised_to_range(space, unit), spread)
+    begin = root.begin(raised_to_range(space, fit.unit), spread)
     end, rounds = jax.lax.scan(root.search, begin, jnp.array([False, True]))
     u, found = end.here
-    points = (1 + _DRAWS) * _TURNS * fit.points * rounds.sum()
-    return Adjusted(
+    points = (1 + _DRAWS) * _TURNS * paired.points * rounds.sum()
+    adjusted = replace(
+        fit,
         unit=u,
         hessian=root.worth(found),
+        # Scatter is in the score's worth already.
+        gradients=jnp.zeros_like(fit.gradients),
         delta=found.delta,
         raised=raised_to_range(space, u),
         raised_hessian=root.worth(end.seen),
-        left=end.left,
-        simulated=1.0 * segments.count * segments.horizon * points,
+        simulated=fit.simulated + 1.0 * segments.count * segments.horizon * points,
     )
+    return adjusted, end.left
 
 
 @dataclass(frozen=True)
@@ -257,10 +164,12 @@ class _Root:
 
     Attributes:
         fit: the pieces.
-        weight, draws: as `ProfileFit.score` takes them.
+        weight: of each measured number, ``(M, H, 2 nv)``.
+        draws: standard normal, ``(M, K, H + 1, 2 nv)``: of each start, then of what is
+            measured after each step.
     """
 
-    fit: ProfileFit
+    fit: PairedFit
     weight: jax.Array
     draws: jax.Array
 
@@ -269,7 +178,69 @@ class _Root:
         return self.fit.space
 
     def score(self, unit: jax.Array, spread: jax.Array) -> Score:
-        return self.fit.score(unit, self.weight, self.draws, spread)
+        """The score at ``unit (n,)``, each start at its best.
+
+        Args:
+            spread: standard deviations of the noise of starts, then of what comes
+                after, of each step or of all, ``(1 + H or 2, 2 nv)``.
+        """
+        fit = self.fit
+
+        def one(item: Any) -> Any:
+            s, w, e = item
+
+            def fitted(s: Segments) -> Any:
+                def turn(d: jax.Array, _: Any) -> Any:
+                    r, jac = fit._pushed(unit, d, s)
+                    parts = fit._equations(r, jac, d, w, s.weight)
+                    ahead = jnp.clip(d + parts[3], -most, most)
+                    return ahead, (d, r, jac, parts)
+
+                _, turns = jax.lax.scan(
+                    turn, jnp.zeros(most.shape), None, length=_TURNS
+                )
+                return jax.tree.map(lambda x: x[-1], turns)
+
+            def draw(real: Any, item: Any) -> Any:
+                """The measured piece, then those that ``e`` would have made of it."""
+                k, e = item
+                d, r, jac = real
+                first, later = e[0] * spread[0], e[1:] * spread[1:]
+                new = shift_start(fit.simulator, s, d + first)
+                new = shift_readings(fit.simulator, new, r + later)
+                new = jax.tree.map(partial(jnp.where, k), new, s)
+                *found, parts = fitted(new)
+                # The truth of what is made is known: its score is zero on average.
+                known = fit._equations(-later, jac, -first, w, s.weight)[1]
+                fine = jnp.isfinite(parts[2]) & (parts[2] > 0)
+                over = jnp.where(fine, parts[1] - known, 0.0)
+                real = jax.tree.map(partial(jnp.where, k), real, tuple(found))
+                return real, (*parts[:3], over, known)
+
+            none = most, w, jnp.broadcast_to(w[..., None], (*w.shape, ways))
+            none = jax.tree.map(jnp.zeros_like, none)
+            drawn = jnp.arange(1 + len(e)) > 0
+            e = jnp.concatenate([0.0 * e[:1], e])
+            real, (hess, *rest) = jax.lax.scan(draw, none, (drawn, e))
+            grad, cost, over, known = rest
+            over, known = over[1:], known[1:]
+            bias, expected = over.mean(0), cost[1:].mean()
+            scatter = _scatter(over + known) + _scatter(over) / len(over)
+            return hess[0], grad[0], bias, scatter, cost[0], expected, real[0]
+
+        most, ways = _FARTHEST * fit.noise, fit._directions
+        hess, grad, bias, scatter, cost, expected, delta = fit._each(
+            one, 1 + fit._directions, self.weight, self.draws
+        )
+        return Score(
+            hessian=hess.sum(0),
+            gradient=grad.sum(0),
+            bias=bias.sum(0),
+            scatter=scatter.sum(0),
+            cost=cost.sum(),
+            expected=expected.sum(),
+            delta=delta,
+        )
 
     def begin(self, unit: jax.Array, spread: jax.Array) -> _Carry:
         """At ``unit (n,)``, before anything was looked at."""
@@ -325,7 +296,7 @@ class _Root:
         freed = ~again | edges.any() & freed
         first = jnp.where(again, found.left[0], end.left[0])
         end = replace(end, left=end.left.at[0].set(first))
-        return jax.tree.map(lambda x, y: jnp.where(freed, x, y), end, found), end.k
+        return jax.tree.map(partial(jnp.where, freed), end, found), end.k
 
     def round(self, c: _Carry) -> _Carry:
         """The score at a place, and where to look next."""
@@ -339,7 +310,7 @@ class _Root:
         before = self.newton(u, found, held)[1]
         left = self.newton(c.at, s, held)[1]
         better = ((c.phase == _FIRST) | moving & (left < before)) & ~lost.any()
-        here = jax.tree.map(lambda x, y: jnp.where(better, x, y), (c.at, s), c.here)
+        here = jax.tree.map(partial(jnp.where, better), (c.at, s), c.here)
         u, found = here
         step, rest = self.newton(u, found, held)
         # A step that gains little may have been too short.

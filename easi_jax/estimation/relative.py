@@ -28,6 +28,7 @@ from easi_jax.estimation.identifiability import (
 )
 from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.posterior import Estimate, no_region, polished
+from easi_jax.model.distribution import covariance
 from easi_jax.model.parameters import Parameter, ParameterSpace
 from easi_jax.model.results import Relative, SeedResult
 from easi_jax.simulation.simulator import Simulator
@@ -117,7 +118,6 @@ def seed_results(
 
 def result_of(space: ParameterSpace, found: Estimate) -> SeedResult:
     """What one fit says, without what an owner knows."""
-    root = np.asarray(found.distribution.factor, np.float64)
-    stated = found.distribution.mean, root @ root.T
+    stated = found.distribution.mean, covariance(found.distribution)
     result = seed_result(space, *stated, found.hessian, found.fit)
     return replace(result, no_region=no_region(found))

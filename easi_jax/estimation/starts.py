@@ -214,9 +214,8 @@ class Starts:
         weighed = near * self._weight
         normal = np.einsum("swtc,uwtc->wsu", near, weighed, optimize=True)
         prior = np.diag(1.0 / self.spread**2)
-        inverse = np.linalg.inv(_scaled(normal + prior, self.spread)) * np.outer(
-            self.spread, self.spread
-        )
+        size = np.outer(self.spread, self.spread)
+        inverse = np.linalg.inv((normal + prior) * size) * size
         return (
             np.einsum("wsu,uwtc->wstc", inverse, weighed, optimize=True),
             inverse @ prior,
@@ -479,8 +478,3 @@ def floor(
     # Of a model that predicts nothing the noise of the readings alone is known.
     each = np.broadcast_to(count[:, None, None], total.shape)
     return np.where(each > 0, total / np.maximum(each, 1.0), starts.noises**2)
-
-
-def _scaled(normal: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Matrices ``(W, s, s)`` in units of ``size (s,)``."""
-    return normal * np.outer(size, size)

@@ -1,6 +1,6 @@
 """What a search on unpaired logs, and the fit after it, say."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -21,6 +21,7 @@ from easi_jax.estimation.identifiability import seed_result
 from easi_jax.estimation.unpaired_runs import UnpairedProblem
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.results import HeldOutErrors, SeedResult
+from easi_jax.progress import Tell
 from easi_jax.search.unpaired import Pieces, Simulations, UnpairedSearch
 
 _LACKING = 1.5  # times the squared error of simulations, that is worth a note
@@ -126,7 +127,7 @@ def found_of(
     cov: jax.Array,
     key: jax.Array,
     refined: bool,
-    tell: Callable[[str], None],
+    tell: Tell,
     known: Known = NOTHING,
 ) -> Found:
     """What a search at ``mean (n,)``, ``cov (n, n)`` found, with the fit after it where

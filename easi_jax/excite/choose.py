@@ -1,6 +1,6 @@
 """Chooses the test that tells most effects apart."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -25,13 +25,12 @@ from easi_jax.gap.table import Place, covered, does
 from easi_jax.model.effect_catalog import CATALOG, Scales
 from easi_jax.model.joint_space import scalar_dofs
 from easi_jax.model.parameters import ParameterSpace
+from easi_jax.progress import Tell
 from easi_jax.simulation.step import WRITTEN_OUT
 
 _WORK = 4e6  # physics steps of all simulations together
 _WORK_WIDE = 1e6
 _RIPPLE = 6.0  # cycles over the range of a joint
-
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """What several runs would say of every effect: simulated once, in one program."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -19,11 +19,10 @@ from easi_jax.gap.window_set import WindowSet, join, window_set
 from easi_jax.gap.window_starts import window_starts
 from easi_jax.model.effect_catalog import Scales
 from easi_jax.model.parameters import ParameterSpace
+from easi_jax.progress import Tell
 
 _TOGETHER = 16  # vectors in one call, between two lines of progress
 _FLOOR = 0.05  # of the error that the start velocity's own fit makes
-
-Tell = Callable[[str], None]
 
 
 def windows_of(

@@ -1,7 +1,7 @@
 """What to record next, so that two effects can be told apart."""
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -18,6 +18,7 @@ from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.table import Place
 from easi_jax.gap.window_set import WindowSet, join
 from easi_jax.model.joint_space import scalar_dofs
+from easi_jax.progress import Tell
 
 _WINDOWS = 32  # of each run
 _MARGIN = 0.05
@@ -93,7 +94,7 @@ def propose(
     noise: np.ndarray,
     horizon: float,
     plan: tuple[Sequence[candidates.Test], str],
-    tell: Callable[[str], None] = lambda _: None,
+    tell: Tell = lambda _: None,
 ) -> list[Proposal]:
     """For each rival of an effect, the best of a few tests.
 

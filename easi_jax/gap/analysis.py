@@ -9,7 +9,7 @@ reported at in nothing else.
 import copy
 import itertools
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -43,7 +43,7 @@ from easi_jax.gap.window_starts import window_starts
 from easi_jax.io.runs.step_cache import Journal, key_of
 from easi_jax.model.found_laws import add_law
 from easi_jax.model.parameters import ParameterSpace
-from easi_jax.progress import Progress, Wait, at_once, silent
+from easi_jax.progress import Progress, Tell, Wait, at_once, silent
 from easi_jax.simulation.engine import Engine
 from easi_jax.simulation.logged import Logged
 
@@ -57,8 +57,6 @@ _NO_LAWS = (
     "no law beyond the table was looked for: feet stick and slip, where errors are not "
     "linear in a force"
 )
-
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)

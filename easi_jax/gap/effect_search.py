@@ -7,7 +7,7 @@ length says is never added to what another does: they share rows.
 """
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -32,6 +32,7 @@ from easi_jax.model.effect_catalog import Scales
 from easi_jax.model.found_laws import law_of
 from easi_jax.model.joint_space import is_hinge, scalar_dofs
 from easi_jax.model.parameters import ParameterSpace
+from easi_jax.progress import Tell
 
 RIVALS = 8  # names in the place of another that are followed up
 _STAGES = 8  # of adding one and taking out what has become needless
@@ -41,8 +42,6 @@ _BEAM = 3  # sets of effects that are followed
 # but the first, and as rivals (benchmarks.gap_times).
 _LIKELY = 60
 _LOST = 0.25  # of the motion: errors of a model that does not follow it
-
-Tell = Callable[[str], None]
 
 
 class Places:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from easi_jax.data.activations import activation_guess, activation_spread
+from easi_jax.data.activations import activation_spread
 from easi_jax.data.recording import Run
 from easi_jax.data.unmeasured import start_spread
 from easi_jax.estimation.starts import Starts, starts_about
@@ -36,9 +36,6 @@ def window_starts(
         count: of them that are no fillers; all where None.
         rows: of a window that are compared; all where None.
     """
-    act = np.zeros(m.na)
-    if m.na:
-        act = activation_spread(m, runs, [activation_guess(m, run) for run in runs])
     own, read = len(predictor.neutral), predictor.read
     every = np.arange(len(predictor.windows))
     at = (every if blocks is None else windows_in(blocks))[:count]
@@ -55,7 +52,7 @@ def window_starts(
         scales.position,
         scales.speed,
         start_spread(m, runs),
-        act,
+        activation_spread(m, runs),
         runs[0].dt,
         start_parts(m),
         None if read.all() else read[at, :length],

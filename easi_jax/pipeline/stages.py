@@ -55,7 +55,7 @@ class PipelineConfig:
     quarter of a second for larger robots, whose motion is stiffer."""
     refine_pieces: int | None = None
     """Pieces that it takes at most; not given: as
-    `easi_jax.estimation.posterior.finish_pieces` and `finish_rest` have it."""
+    `easi_jax.estimation.pieces.finish_pieces` and `finish_rest` have it."""
     warm_start: bool = True
     """Final training and Oracle go on from the networks of the policy that recorded the
     demonstrations, in place of new ones, where the search's recipe allows that."""

@@ -43,7 +43,7 @@ def recorded(actuator: str) -> tuple[mujoco.MjModel, Run, np.ndarray]:
 def test_guess_is_within_its_spread_of_the_truth(name: str) -> None:
     m, run, act = recorded(ACTUATORS[name])
     guess = activation_guess(m, run)
-    spread = activation_spread(m, [run], [guess])
+    spread = activation_spread(m, [run])
     assert guess.shape == act.shape
     assert 0 < spread[0] < 10
     assert np.abs(guess - act).max() < 2 * spread[0]

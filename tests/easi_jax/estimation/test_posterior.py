@@ -190,7 +190,7 @@ def test_what_is_hardly_known_stays_within_reach() -> None:
     paired = PairedFit(cast(Any, None), space, cast(Any, None), jnp.ones(2))
     fit = RefineResult(*([jnp.zeros(6)] * len(RefineResult.__dataclass_fields__)))
     for center, spread in zip(mean[:20], cov[:20], strict=True):
-        found = _stated(paired, fit, fit.unit, jnp.eye(6), center, spread)
+        found = _stated(paired, fit, jnp.eye(6), center, spread)
         assert (found.distribution.mean >= low).all()
         assert (found.distribution.mean <= high).all()
     assert (mean > high).any() or (mean < low).any()
@@ -214,7 +214,7 @@ def test_what_is_surely_far_below_its_range_is_determined(
     raised = {"raised": 0.0 * unit, "raised_hessian": low_end}
     fit = RefineResult(**{**none, "unit": unit, "hessian": here, **raised})
     paired = PairedFit(cast(Any, None), space, cast(Any, None), jnp.ones(2))
-    found = _stated(paired, fit, unit, jnp.eye(1), unit, 1e-4 * jnp.eye(1))
+    found = _stated(paired, fit, jnp.eye(1), unit, 1e-4 * jnp.eye(1))
     told = seed_result(space, unit, 1e-4 * np.eye(1), found.hessian)
     assert told.flags == [flag]
     assert not identifiability(space, np.asarray(here)).determined.any()

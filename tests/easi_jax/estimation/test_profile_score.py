@@ -13,7 +13,7 @@ from easi_jax.devices.runtime import quick_compile
 from easi_jax.estimation.levenberg_marquardt import RefineResult, refine
 from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.polish import polish
-from easi_jax.estimation.profile_score import Adjusted, adjust, less_scatter
+from easi_jax.estimation.profile_score import adjust, less_scatter
 from easi_jax.model.parameters import ParameterSpace, declare
 from easi_jax.simulation.simulator import Simulator
 
@@ -72,13 +72,13 @@ def fits() -> Any:
     simulator = Simulator(m, space, 0.02)
     truth = space.to_unit(jnp.asarray(space.nominal))
 
-    def run(assumed: float, spread: float) -> tuple[RefineResult, Adjusted]:
-        def one(key: jax.Array) -> tuple[RefineResult, Adjusted]:
+    def run(assumed: float, spread: float) -> Any:
+        def one(key: jax.Array) -> Any:
             pieces = recorded(simulator, key, jnp.asarray(spread))
             noise = assumed * _NOISE
             paired = PairedFit(simulator, space, pieces, noise)
             fit = refine(paired, truth, iterations=8)
-            return fit, adjust(paired, fit.unit)
+            return fit, *adjust(paired, fit)
 
         return jax.lax.map(one, jax.random.split(jax.random.key(3), _SEEDS))
 
@@ -86,9 +86,9 @@ def fits() -> Any:
     compiled = jax.jit(run, compiler_options=quick_compile())
 
     def fits(assumed: float = 1.0, spread: float = _SPEED) -> Any:
-        fit, adjusted = jax.device_get(compiled(assumed, spread))
+        fit, adjusted, left = jax.device_get(compiled(assumed, spread))
         std = np.sqrt([np.diag(np.linalg.inv(x)) for x in adjusted.hessian]) / assumed
-        return *((x.unit - truth) / std for x in (fit, adjusted)), adjusted.left
+        return *((x.unit - truth) / std for x in (fit, adjusted)), left
 
     return fits
 
@@ -161,10 +161,10 @@ def test_a_limit_that_was_not_met_is_not_known(limit: float) -> None:
     # Of 8,000 pushes a handful is stronger than what is met from here.
     start = truth.at[2].set(0.0) if limit > 5.0 else truth
 
-    def run(key: jax.Array) -> Adjusted:
+    def run(key: jax.Array) -> RefineResult:
         pieces = recorded(simulator, key, jnp.asarray(_SPEED))
         paired = PairedFit(simulator, space, pieces, _NOISE)
-        return adjust(paired, polish(paired, start).unit)
+        return adjust(paired, polish(paired, start))[0]
 
     compiled = jax.jit(run, compiler_options=quick_compile())
     for seed in range(3):

@@ -74,7 +74,6 @@ class Bench:
         cov = jnp.linalg.inv(info + 12 * jnp.eye(self.space.size))
         return Estimate(
             distribution=gaussian(self.space, unit, cov),
-            search_mean=unit,
             search_cov=cov,
             hessian=info,
             noise=noise,
