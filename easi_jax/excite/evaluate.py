@@ -80,7 +80,7 @@ def products_of(
         noise: of measured positions, ``(nv,)``.
         scales: how large motion is.
     """
-    p, nv = design.predictor, m.nv
+    p = design.predictor
     windows, lead = join(list(parts)), lead_rows(runs[0].dt)
     starts = window_starts(m, p, runs, scales, known_noise(noise, scales.position))
     still = np.zeros((len(windows), p.size))
@@ -92,12 +92,11 @@ def products_of(
         groups.append(p.errors(x, None, at))
         tell(f"simulated {first + len(x)} of {len(design.vectors)} changes")
     errors = np.concatenate(groups)
-    names = [n.removeprefix("qpos.") for n in p.simulator.state_names[:nv]]
     out, at = [], 0
     for part, run in zip(parts, runs, strict=True):
         here = slice(at, at + len(part))
         at += len(part)
-        scale = measure.channels(m, names, [run], noise, p.steps - lead).scale
+        scale = measure.channels(m, [run], noise, p.steps - lead).scale
         found = np.zeros((len(design.pairs),) * 2)
         if np.isfinite(scale).any():
             found = _products(design, starts.part(here), lead, errors[:, here], scale)

@@ -161,8 +161,8 @@ class Analysis:
         self.held_out = self._held_out(kept, len(seen) // BLOCK)
 
     def _fitting(self, predictor: Predictor, windows: WindowSet, steps: int) -> Fitting:
-        own, given = range(self.space.size), (self.data, predictor, windows, steps)
-        return Fitting(*given, self._ignored, own, self._progress)
+        given = self.data, predictor, windows, steps
+        return Fitting(*given, self._ignored, self._progress)
 
     def _cut(self, cut: "WindowsOf", fit: Sequence[Run]) -> dict[int, WindowSet]:
         """Windows that fits see, by their length; of the lengths that no run has
@@ -277,10 +277,7 @@ class Analysis:
         of = np.array([names.index(run.recording) for run in runs])
         run = of[np.concatenate([at.windows.run, self.held_out.windows.run])]
         scale = self.held_out.channels.scale
-        if len(np.unique(run)) == 2:
-            odd = measure.odd_of_two(square, scale, run, outcome.floor)
-        else:
-            odd = measure.odd_runs(square, scale, run)
+        odd = measure.odd_runs(square, scale, run, outcome.floor)
         return {names[r]: ratio for r, ratio in odd.items()}
 
     # -- the whole -------------------------------------------------------------
@@ -402,9 +399,8 @@ class Analysis:
         given = {k: getattr(data, k)[some] for k in ("motion", "noise", "resolution")}
         bound = data.noise_is_bound[:nv]
         data = replace(data, **given, noise_is_bound=bound, sensors=NO_SENSORS)
-        windows, own = unsensed(at.windows), range(self.space.size)
-        predictor, steps = self.native_predictor(at), at.steps
-        out = Fitting(data, predictor, windows, steps, {}, own, self._progress)
+        given = data, self.native_predictor(at), unsensed(at.windows), at.steps
+        out = Fitting(*given, {}, self._progress)
         out.selector.weight = at.selector.weight
         return out, out.again(model)
 

@@ -1,7 +1,6 @@
 """Where and when a prediction error sits: which joint, and what was going on."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import mujoco
@@ -14,23 +13,7 @@ from easi_jax.gap.gap_metric import Channels
 from easi_jax.gap.window_set import Rows, WindowSet
 from easi_jax.model.joint_space import scalar_dofs
 from easi_jax.model.quantities import actuator_name, body_name
-
-
-@dataclass(frozen=True)
-class Where:
-    """Share of the squared gap at one joint, and when it is largest.
-
-    Attributes:
-        at: joint.
-        share: of the squared gap.
-        when: a condition in words.
-        ratio: squared error there over that elsewhere.
-    """
-
-    at: str
-    share: float
-    when: str
-    ratio: float
+from easi_jax.model.results import ErrorPlace
 
 
 class Conditions:
@@ -176,8 +159,8 @@ def _largest(values: np.ndarray) -> np.ndarray:
 
 def where(
     errors: np.ndarray, found: Conditions, m: mujoco.MjModel, channels: Channels
-) -> list[Where]:
-    """Joints by their share of the squared gap, largest first.
+) -> list[ErrorPlace]:
+    """Joints with a share of the squared gap, largest first.
 
     Of the conditions under which a joint's error is much larger, the one is told that
     is least likely chance (Welch's t).
@@ -196,7 +179,7 @@ def where(
     for joint in dict.fromkeys(channels.joints):
         dofs = [d for d, name in enumerate(channels.joints) if name == joint]
         mine = square[:, dofs].sum(1)
-        when, ratio, surest = "throughout", 1.0, 0.0
+        when, surest = "throughout", 0.0
         masks = {**found.general, **found.named}
         if dofs[0] in scalar:
             masks = {**found.of_joint(scalar[dofs[0]]), **masks}
@@ -207,9 +190,9 @@ def where(
             times = there.mean() / max(elsewhere.mean(), 1e-300)
             sure = _welch(there, elsewhere)
             if times > DECIDE.when_ratio and sure > surest:
-                when, ratio, surest = text, float(times), sure
-        out.append(Where(joint, float(mine.sum() / total), when, ratio))
-    return sorted(out, key=lambda w: -w.share)
+                when, surest = text, sure
+        out.append(ErrorPlace(joint, float(mine.sum() / total), when))
+    return sorted((w for w in out if w.share > 0), key=lambda w: -w.share)
 
 
 def _welch(a: np.ndarray, b: np.ndarray) -> float:

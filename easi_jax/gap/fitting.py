@@ -15,7 +15,7 @@ from easi_jax.gap.discretization_error import error_of_steps
 from easi_jax.gap.effect_set import Model
 from easi_jax.gap.forward_selection import Selector
 from easi_jax.gap.gap_metric import Channels
-from easi_jax.gap.predictor import BLOCK, Predictor
+from easi_jax.gap.predictor import Predictor
 from easi_jax.gap.recorded import Recorded
 from easi_jax.gap.table import Place
 from easi_jax.gap.verdict import Openness, openness
@@ -42,7 +42,6 @@ class Fitting:
         steps: control steps of a window that are compared, those before its start
             counted; the predictor's may be more.
         ignored: channels that nothing can be compared of, with the reason.
-        own: indices of the model's own parameters that may be refitted.
         progress: told how far long stages are.
 
     Attributes:
@@ -66,18 +65,15 @@ class Fitting:
         windows: WindowSet,
         steps: int,
         ignored: Mapping[str, str],
-        own: Sequence[int],
         progress: Progress = silent,
     ) -> None:
         self.data, self.predictor, self.windows = data, predictor, windows
         self.steps, count = steps, len(windows)
-        blocks = np.arange(-(-count // BLOCK))
         group = np.arange(count) * min(BLOCKS, count) // count
-        self.selector = Selector(
-            predictor, blocks, count, data.bounds, group, own, progress, steps + 1
-        )
+        chosen = Selector(predictor, data.bounds, group, progress, steps + 1)
+        self.selector = chosen
         given = data.m, predictor, data.fit, data.scales, data.noise
-        self.starts = window_starts(*given, blocks, count, steps + 1)
+        self.starts = window_starts(*given, chosen.blocks, count, steps + 1)
         self.channels = self._channels(ignored)
         self.sticks = self._begun = False
         self.gap = self.floor = self.own_steps = 0.0
@@ -85,10 +81,8 @@ class Fitting:
 
     def _channels(self, ignored: Mapping[str, str]) -> Channels:
         data, after = self.data, self.steps - self.data.lead
-        names = self.predictor.simulator.state_names[: data.m.nv]
         found = measure.channels(
             data.m,
-            [n.removeprefix("qpos.") for n in names],
             data.fit,
             data.noise[: self.starts.compared],
             after,
@@ -155,7 +149,7 @@ class Fitting:
             starts, data.lead, _LET_PASS * rms, self.channels.scale
         )
         r = chosen.residuals
-        self.gap = r.gap(r.whitened(r.grouped(errors[None]))[0])
+        self.gap = r.gap(r.of(errors[None])[0])
         self.floor = chosen.floor = float(np.sqrt(r.floor.mean()))
 
     @property
@@ -291,7 +285,7 @@ class Fitting:
             for sign in (1.0, -1.0):
                 errors = chosen.errors(vectors, None, chosen.moved + sign * off)
                 left = errors - true - sign * noise
-                r = chosen.residuals.whitened(chosen.residuals.grouped(left))
+                r = chosen.residuals.of(left)
                 slope = (r[1:] - r[0]) / step[:, None, None]
                 each = np.einsum("w,awm,wm->a", weight, slope, r[0], optimize=True)
                 pull += 0.5 * np.nan_to_num(each) * bounds.size[f.active]

@@ -22,7 +22,7 @@ from easi_jax.gap.decisions import DECIDE
 from easi_jax.gap.effect_set import Candidate, Model
 from easi_jax.gap.gap_metric import finite
 from easi_jax.gap.model_comparison import better, contains
-from easi_jax.gap.predictor import Predictor, windows_in
+from easi_jax.gap.predictor import BLOCK, Predictor, windows_in
 from easi_jax.gap.table import Place
 from easi_jax.gap.whitening import Residuals
 from easi_jax.io.runs.step_cache import Arrays, Journal
@@ -43,12 +43,9 @@ class Selector:
     ``moved (count, s)`` are offsets of the windows' starts.
 
     Args:
-        predictor: predictions.
-        blocks: blocks of windows that are fitted.
-        count: windows in them that count.
+        predictor: predictions, of the fitted windows in its first blocks.
         bounds: of the whole vector.
-        group: block of cross-validation that each window is in, ``(count,)``.
-        own: indices of the model's own parameters that may be refitted.
+        group: block of cross-validation that each fitted window is in, ``(count,)``.
         progress: told how far long stages are.
         rows: of a window that are compared; all where None.
     """
@@ -56,11 +53,8 @@ class Selector:
     def __init__(
         self,
         predictor: Predictor,
-        blocks: np.ndarray,
-        count: int,
         bounds: Bounds,
         group: np.ndarray,
-        own: Sequence[int],
         progress: Progress = silent,
         rows: int | None = None,
     ) -> None:
@@ -68,11 +62,12 @@ class Selector:
         self.residuals: Residuals
         self.floor = 0.0
         self.journal = Journal()
-        self.blocks, self.count, self.bounds = blocks, count, bounds
-        self.group, self.own = group, tuple(own)
-        self.weight = np.ones(count)
+        self.bounds, self.group, self.count = bounds, group, len(group)
+        self.blocks = np.arange(-(-self.count // BLOCK))
+        self.own = tuple(range(predictor.own))
+        self.weight = np.ones(self.count)
         self.steps: np.ndarray | None = None
-        self.moved = np.zeros((count, predictor.size))
+        self.moved = np.zeros((self.count, predictor.size))
 
     @property
     def neutral(self) -> np.ndarray:
@@ -91,16 +86,16 @@ class Selector:
         moved: np.ndarray | None = None,
     ) -> np.ndarray:
         """Errors of the fitted windows under vectors ``(B, n)``, ``(B, W, T, c)``;
-        ``some``: of those in some of the blocks, by their place among them; ``moved
-        (count, s)``: other offsets of starts.
+        ``some``: of those in some of the blocks; ``moved (count, s)``: other offsets of
+        starts.
 
         Single windows whose prediction is not finite count as the largest motion; of a
         vector that loses most windows they stay as they are, and no fit takes it."""
-        every = np.arange(len(self.blocks)) if some is None else some
+        every = self.blocks if some is None else some
         at = self.windows_of(every)
         begun = self.moved if moved is None else moved
         moved = np.broadcast_to(begun[at], (len(x), len(at), begun.shape[1]))
-        given = self.plain(x), self.blocks[every], moved, self.rows
+        given = self.plain(x), every, moved, self.rows
         found = self.predictor.errors(*given)[:, : len(at)]
         bounded, lost = finite(found, self.predictor.largest)
         few = lost.mean(1) <= _LOST
@@ -130,9 +125,7 @@ class Selector:
         `errors`."""
         at = None if some is None else self.windows_of(some)
         with warnings_to():  # what a trial does to MuJoCo is nobody's fault
-            errors = self.errors(x, some)
-        grouped = self.residuals.grouped(errors)
-        return self.residuals.whitened(grouped, at)
+            return self.residuals.of(self.errors(x, some), at)
 
     def columns(self, place: Place, fitted: bool = True) -> np.ndarray:
         """Entries of the whole vector that belong to a place."""

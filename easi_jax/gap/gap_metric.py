@@ -14,6 +14,7 @@ from easi_jax.model.joint_space import (
     dofs,
     is_hinge,
     joint_name,
+    tangent_names,
     tangent_units,
     widths,
 )
@@ -47,7 +48,6 @@ class Channels:
 
 def channels(
     m: mujoco.MjModel,
-    names: Sequence[str],
     runs: Sequence[Run],
     noise: np.ndarray,
     steps: int,
@@ -55,10 +55,9 @@ def channels(
 ) -> Channels:
     """What the gap of these runs is made of.
 
-    ``names`` are those of degrees of freedom, ``noise (c,)`` is of all channels.
-    A channel's scale is its standard deviation over all rows, or for one without bounds
-    (a free base's x and y, a hinge that turns on) the RMS of its change over ``steps``
-    control steps.
+    ``noise (c,)`` is of all channels. A channel's scale is its standard deviation over
+    all rows, or for one without bounds (a free base's x and y, a hinge that turns on)
+    the RMS of its change over ``steps`` control steps.
     """
     parts, changes = [], []
     for run in runs:
@@ -71,7 +70,7 @@ def channels(
     everything = np.concatenate(parts)
     change = np.sqrt(np.mean(np.concatenate(changes) ** 2, 0))
     spread = np.nanstd(everything, 0)
-    names = [*names, *(n.channel for n in sensors)]
+    names = [*tangent_names(m), *(n.channel for n in sensors)]
     joints = [joint_name(m, j) for j in m.dof_jntid]
     joints += [f"sensor.{n.sensor}" for n in sensors]
     units = [*tangent_units(m), *(n.unit for n in sensors)]
@@ -156,48 +155,35 @@ def finite(errors: np.ndarray, largest: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def odd_runs(
-    square: np.ndarray, scale: np.ndarray, run: np.ndarray
+    square: np.ndarray, scale: np.ndarray, run: np.ndarray, floor: float
 ) -> dict[int, float]:
     """Runs whose windows are predicted far worse than those of the other runs.
+
+    Of two runs it is the one that the other's model does not predict: whichever is odd,
+    the model follows the other one down to its noise, and misses this one by far.
 
     Args:
         square: mean squares of each window, ``(W, c)``.
         run: which run each window is of, ``(W,)``.
+        floor: gap of a perfect model.
 
     Returns:
-        For each such run its median error over that of the others; empty where there
-        are fewer than three runs.
+        For each such run its median error over that of the others.
     """
     error = gap(square, scale)
     typical = {int(r): float(np.median(error[run == r])) for r in np.unique(run)}
-    if len(typical) < 3:
-        return {}
     out = {}
     for r, mine in typical.items():
-        others = float(np.median([x for k, x in typical.items() if k != r]))
-        if mine > DECIDE.odd_run * others:
+        rest = [x for k, x in typical.items() if k != r]
+        others = float(np.median(rest)) if rest else np.inf
+        least = others
+        if len(rest) == 1:
+            if others >= DECIDE.followed * floor:
+                continue
+            least = DECIDE.followed * max(others, floor)
+        if mine > DECIDE.odd_run * least:
             out[r] = mine / max(others, 1e-30)
     return out
-
-
-def odd_of_two(
-    square: np.ndarray, scale: np.ndarray, run: np.ndarray, floor: float
-) -> dict[int, float]:
-    """Of two runs the one that the other's model does not predict.
-
-    Whichever is odd, the model follows the other one down to its noise, ``floor``, and
-    misses this one by far. Arguments and result: `odd_runs`.
-    """
-    error = gap(square, scale)
-    first, second = (int(r) for r in np.unique(run))
-    a, b = (float(np.median(error[run == r])) for r in (first, second))
-    odd, mine, other = (first, a, b) if a > b else (second, b, a)
-    if (
-        other < DECIDE.followed * floor
-        and mine > DECIDE.odd_run * DECIDE.followed * max(other, floor)
-    ):
-        return {odd: mine / max(other, 1e-30)}
-    return {}
 
 
 def resampled(count: int, seed: int) -> np.ndarray:

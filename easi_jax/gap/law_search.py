@@ -81,7 +81,7 @@ class LawSearch:
         pushes = self.linear.impulses()  # (N, nv, W, H + 1, nv)
         count, nv = pushes.shape[:2]
         flat = pushes.reshape(count * nv, *pushes.shape[2:])[:, :, : s.rows]
-        unit = s.residuals.whitened(s.residuals.grouped(flat))
+        unit = s.residuals.of(flat)
         unit = unit.reshape(count, nv, *unit.shape[1:])  # (N, nv, W, m)
         evaluated = _Motion(self.at, self.linear)
         out, kept = [], []

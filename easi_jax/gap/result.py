@@ -257,6 +257,6 @@ def score_of(selector: Selector, model: Model, error: np.ndarray) -> np.ndarray:
     """What an error of all predictions ``(W, T, c)`` adds to the score of a fit, by
     size of a difference of each active entry, ``(a,)``."""
     weight, residuals = selector.weight * selector.rows_once(), selector.residuals
-    off = residuals.whitened(residuals.grouped(error[None]))[0]
+    off = residuals.of(error[None])[0]
     score = np.einsum("w,wma,wm->a", weight, model.fit.slope, off, optimize=True)
     return score * selector.bounds.size[model.fit.active]

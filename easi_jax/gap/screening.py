@@ -55,7 +55,7 @@ class Screening:
 
     def __init__(self, selector: Selector, base: Model) -> None:
         self.selector, self.base = selector, base
-        self.some = np.arange(len(selector.blocks))
+        self.some = selector.blocks
         p = selector.predictor
         # A short list of names needs no more, where it takes minutes as it is.
         if p.simulator.wide or p.steps * p.simulator.dt > _LONG:
@@ -74,7 +74,7 @@ class Screening:
         if s.predictor.simulator.engine != "mujoco" or s.predictor.sensors:
             return None
         x, moved = s.plain(self.base.fit.x), s.moved[self.seen]
-        found = LinearResponse(s.predictor, x, s.blocks[self.some], moved)
+        found = LinearResponse(s.predictor, x, self.some, moved)
         return found if found.holds.mean() >= _HOLDS else None
 
     def promises(self, candidates: Sequence[Candidate]) -> Arrays:
@@ -178,7 +178,7 @@ class Screening:
         s, at = self.selector, self.seen
         # Of short windows fits see the first rows.
         changes = self.linear.changes(s.plain(x))[:, :, : s.rows]
-        return self.first + s.residuals.whitened(s.residuals.grouped(changes), at)
+        return self.first + s.residuals.of(changes, at)
 
 
 def as_sine(start: np.ndarray, end: np.ndarray) -> np.ndarray:

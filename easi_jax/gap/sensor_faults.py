@@ -57,13 +57,6 @@ class ReadingFault:
     parameters: Mapping[str, tuple[float, float, str]]
     confidence: float
 
-    @property
-    def place(self) -> str:
-        """In words."""
-        if self.at.startswith("qvel."):
-            return f'measured velocity of "{self.at.removeprefix("qvel.")}"'
-        return f'sensor "{self.at}"'
-
 
 def reading_faults(m: mujoco.MjModel, runs: Sequence[Run]) -> list[ReadingFault]:
     """What is wrong with the velocities and the named sensors of ``runs``."""

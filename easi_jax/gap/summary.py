@@ -165,8 +165,7 @@ def _reading(r: ReadingFault, gap: float) -> NamedEffect:
 def error_places(o: Outcome, m: mujoco.MjModel) -> tuple[ErrorPlace, ...]:
     """Where the error that remains sits, the largest share first."""
     last = last_figures(o)
-    found = where(last.errors, last.conditions, m, o.channels)
-    return tuple(ErrorPlace(w.at, w.share, w.when) for w in found if w.share > 0)
+    return tuple(where(last.errors, last.conditions, m, o.channels))
 
 
 def error_map(o: Outcome, m: mujoco.MjModel) -> ErrorMap | None:

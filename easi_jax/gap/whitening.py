@@ -24,7 +24,6 @@ class Residuals:
 
     Attributes:
         groups: averages over rows, ``(K, T)``.
-        scale: of each channel in the gap; infinite for one left out, ``(c,)``.
         root: inverse root of each window's error covariance, ``(W, m, n)`` with
             ``n = K c`` and m of them that hold a reading in some window.
         plain: errors in units of the gap, starts fitted anew, from whitened ones,
@@ -34,11 +33,14 @@ class Residuals:
     """
 
     groups: np.ndarray
-    scale: np.ndarray
     root: np.ndarray
     plain: np.ndarray
     floor: np.ndarray
     live: np.ndarray
+
+    def of(self, errors: np.ndarray, at: np.ndarray | None = None) -> np.ndarray:
+        """What fits compare of errors, ``(B, W, m)``; ``at`` as in `whitened`."""
+        return self.whitened(self.grouped(errors), at)
 
     def grouped(self, errors: np.ndarray) -> np.ndarray:
         """Averages over groups of rows, ``(B, W, K, c)``."""
@@ -80,7 +82,8 @@ def make_residuals(
         lead: rows before the start that the gap is measured from.
         misfit: errors of the model that are let pass, ``(c,)``; keeps a fit from
             hanging on what no model would get right.
-        scale: see `Residuals`; of channels that speak of more than starts.
+        scale: of channels that speak of more than starts, in the gap; infinite for one
+            that is left out, ``(c,)``.
     """
     size, count, rows, nv = starts.slope.shape
     share = np.ones(nv)
@@ -119,7 +122,7 @@ def make_residuals(
         left = (refit**2) @ white[w].reshape(-1) + ((refit @ free[w]) ** 2).sum(1)
         floor[w] = left[keep].sum() / n
     live = white.reshape(count, n)[:, kept] > 0
-    return Residuals(groups, scale, root, plain, floor, live)
+    return Residuals(groups, root, plain, floor, live)
 
 
 def _unit(groups: np.ndarray, lead: int, scale: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.forward_selection import Selector
 from easi_jax.gap.linear_response import LinearResponse
 from easi_jax.gap.predictor import Predictor
+from easi_jax.gap.whitening import Residuals
 from easi_jax.gap.window_set import window_set
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import engine
@@ -125,12 +126,8 @@ def test_names_are_the_same_with_and_without(
     with engine.using("mujoco"):
         p = Predictor(m, space, layout, windows, DT)
     count = len(windows)
-    selector = Selector(
-        *(p, np.arange(p.blocks), count, bounds_of(space, layout)),
-        np.arange(count) % 4,
-        (),
-        rows=rows,
-    )
+    group = np.arange(count) % 4
+    selector = Selector(p, bounds_of(space, layout), group, rows=rows)
     selector.residuals = _plain(p, rows)  # type: ignore[assignment]
     base = selector.fit([], p.neutral)
     candidates = [Candidate(q, s) for q in found for s in q.starts]
@@ -164,6 +161,7 @@ def _plain(p: Predictor, rows: int | None) -> object:
     size = rows * p.nv
 
     class Plain:
+        of = Residuals.of
         plain = np.broadcast_to(np.eye(size), (len(p.windows), size, size))
 
         def grouped(self, errors: np.ndarray) -> np.ndarray:

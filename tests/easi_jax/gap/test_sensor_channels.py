@@ -304,5 +304,5 @@ def test_noise_of_no_sensors_is_none(arm: mujoco.MjModel) -> None:
     none, run = Sensors(), recorded(arm)
     assert none.readings(run).shape == (ROWS, 0)
     assert all(x.shape == (0,) for x in (*none.noise([run]), none.finest([run])))
-    kept = gap_metric.channels(arm, ["a"], [run], np.array([1e-4]), 20)
+    kept = gap_metric.channels(arm, [run], np.array([1e-4]), 20)
     assert kept.names == ("a",)

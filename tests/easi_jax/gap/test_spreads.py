@@ -12,6 +12,7 @@ from easi_jax.gap.effect_set import Model
 from easi_jax.gap.fitting import Fitting
 from easi_jax.gap.forward_selection import Selector
 from easi_jax.gap.result import Numbers, fit_covariance, score_of
+from easi_jax.gap.whitening import Residuals
 
 W, M = 200, 12  # windows, numbers of each
 SIZE = np.array([0.1, 2.0])
@@ -21,6 +22,7 @@ BOUNDS = Bounds(np.full(2, -np.inf), np.full(2, np.inf), SIZE)
 class Plain:
     """Errors that are white as they are."""
 
+    of = Residuals.of
     groups, live = np.eye(M), np.ones((W, M), bool)
 
     def grouped(self, errors: np.ndarray) -> np.ndarray:

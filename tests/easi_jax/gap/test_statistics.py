@@ -381,11 +381,13 @@ def test_a_run_that_the_others_contradict_is_told() -> None:
     run = np.repeat(np.arange(4), 10)
     square = rng.uniform(0.5, 1.5, (40, 1))
     scale = np.ones(1)
-    assert measure.odd_runs(square, scale, run) == {}
+    assert measure.odd_runs(square, scale, run, 1.0) == {}
     square[run == 2] *= 25.0
-    ((odd, times),) = measure.odd_runs(square, scale, run).items()
+    ((odd, times),) = measure.odd_runs(square, scale, run, 1.0).items()
     assert odd == 2 and times == pytest.approx(5.0, rel=0.2)
-    assert measure.odd_runs(square[20:], scale, run[20:]) == {}, "one of two: which?"
+    two = square[20:], scale, run[20:]
+    assert measure.odd_runs(*two, 0.3) == {}, "one of two: which?"
+    assert measure.odd_runs(square[:10], scale, run[:10], 1.0) == {}
 
 
 @pytest.mark.parametrize("bad", [0, 1])
@@ -395,12 +397,12 @@ def test_of_two_runs_that_contradict_the_one_that_is_not_followed_is_told(
     rng = np.random.default_rng(0)
     run, scale = np.repeat([0, 1], 10), np.ones(1)
     square = rng.uniform(0.5, 1.5, (20, 1))
-    assert measure.odd_of_two(square, scale, run, 1.0) == {}
+    assert measure.odd_runs(square, scale, run, 1.0) == {}
     square[run == bad] *= 100.0
-    ((odd, times),) = measure.odd_of_two(square, scale, run, 1.0).items()
+    ((odd, times),) = measure.odd_runs(square, scale, run, 1.0).items()
     assert odd == bad and times == pytest.approx(10.0, rel=0.2)
     # A model that misses both says nothing of either.
-    assert measure.odd_of_two(square, scale, run, 0.3) == {}
+    assert measure.odd_runs(square, scale, run, 0.3) == {}
 
 
 def test_what_is_not_finite_loses(model: mujoco.MjModel, runs: list[Run]) -> None:
@@ -410,9 +412,8 @@ def test_what_is_not_finite_loses(model: mujoco.MjModel, runs: list[Run]) -> Non
     assert windows is not None
     predictor = Predictor(model, ParameterSpace(()), layout, windows, DT)
     bounds = bounds_of(ParameterSpace(()), layout)
-    count, blocks = len(windows), np.arange(predictor.blocks)
-    group = np.arange(count) % 5
-    selector = Selector(predictor, blocks, count, bounds, group, ())
+    count = len(windows)
+    selector = Selector(predictor, bounds, np.arange(count) % 5)
     residual = np.ones((count, 4))
     residual[3, 2] = np.nan
     fit = Fitted(predictor.neutral, np.array([0]), residual, residual[..., None], 1.0)
@@ -422,22 +423,21 @@ def test_what_is_not_finite_loses(model: mujoco.MjModel, runs: list[Run]) -> Non
 
 
 def test_some_blocks_are_whitened_as_among_all(predictor: Predictor) -> None:
-    count, blocks = len(predictor.windows), np.arange(predictor.blocks)
-    layout = predictor.layout
-    bounds, group = bounds_of(ParameterSpace(()), layout), np.arange(count) % 5
-    selector = Selector(predictor, blocks, count, bounds, group, ())
+    count = len(predictor.windows)
+    bounds = bounds_of(ParameterSpace(()), predictor.layout)
+    selector = Selector(predictor, bounds, np.arange(count) % 5)
     rng = np.random.default_rng(0)
     groups = row_groups(predictor.steps + 1, 11)
     root = rng.normal(size=(count, len(groups), len(groups)))
     selector.residuals = Residuals(
-        *(groups, np.ones(1), root, root, np.zeros(count)),
+        *(groups, root, root, np.zeros(count)),
         np.ones(root.shape[:2], bool),
     )
     selector.steps = rng.normal(size=(count, predictor.steps + 1, 1))
     selector.moved = 1e-3 * rng.normal(size=(count, predictor.size))
     assert count % BLOCK  # the last block is not full
     x = np.append(predictor.neutral, 0.3)[None]
-    some = blocks[[0, -1]]
+    some = selector.blocks[[0, -1]]
     at = selector.windows_of(some)
     assert len(at) == BLOCK + count % BLOCK and at[-1] == count - 1
     np.testing.assert_allclose(
