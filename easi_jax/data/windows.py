@@ -96,7 +96,8 @@ def window_steps(dt: float, horizon_s: float) -> int:
 def window_rows(
     run: Run, horizon_s: float, every_s: float | None = None, lead: int = 0
 ) -> np.ndarray:
-    """Rows in which the windows of ``run`` begin, ``(W,)``; as `make_windows`."""
+    """Rows in which windows of ``run`` begin, ``(W,)``, so that all lie inside, each
+    ``lead`` rows longer than its horizon; else as `make_windows`."""
     if horizon_s <= 0 or (every_s is not None and every_s <= 0):
         raise ValueError("horizon and spacing of windows must be positive")
     steps = window_steps(run.dt, horizon_s)
@@ -108,8 +109,6 @@ def make_windows(
     run: Run,
     horizon_s: float,
     every_s: float | None = None,
-    lead: int = 0,
-    rows: np.ndarray | None = None,
 ) -> Windows:
     """Windows of ``run`` for open-loop prediction.
 
@@ -117,8 +116,6 @@ def make_windows(
         run: the recording.
         horizon_s: length of a window, s; rounded to control steps, at least 10.
         every_s: time from one start to the next, s; half a horizon by default.
-        lead: so many rows earlier a window begins, which is as much longer for it.
-        rows: of `window_rows`, in which those begin that are wanted; all if not given.
 
     Returns:
         Windows that lie wholly inside the run, the first at its first row; none
@@ -127,9 +124,8 @@ def make_windows(
     Raises:
         ValueError: a length that is not positive.
     """
-    start = window_rows(run, horizon_s, every_s, lead) if rows is None else rows
-    steps = window_steps(run.dt, horizon_s) + lead
-    row = start[:, None] + np.arange(steps)
+    start = window_rows(run, horizon_s, every_s)
+    row = start[:, None] + np.arange(window_steps(run.dt, horizon_s))
     velocity = fitted_velocity(run.qpos, run.dt, run.configuration)
     return Windows(
         start_row=start,

@@ -12,7 +12,12 @@ from easi_jax.data.drive_forces import exertion
 from easi_jax.data.law_states import law_states, times
 from easi_jax.data.recording import Run
 from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
-from easi_jax.data.windows import fitted_velocity, lead_rows, make_windows
+from easi_jax.data.windows import (
+    fitted_velocity,
+    lead_rows,
+    window_rows,
+    window_steps,
+)
 
 _BEFORE = 0.6  # s before a window in which a drive with play finds its side
 _EXTREME = 4  # for so many, one more that has large forces or speeds
@@ -138,9 +143,10 @@ def _windows_of(
 ) -> WindowSet:
     late = math.ceil(longest / run.dt - 1e-9)
     past = math.ceil(max(2 * longest, _BEFORE) / run.dt) + 2
-    w = make_windows(run, horizon_s, lead=lead_rows(run.dt), rows=rows)
+    lead = lead_rows(run.dt)
+    first = window_rows(run, horizon_s, lead=lead) if rows is None else rows
+    start, steps = first[:, None], window_steps(run.dt, horizon_s) + lead
     velocity = fitted_velocity(run.qpos, run.dt, run.configuration)
-    start, steps = w.start_row[:, None], w.ctrl.shape[1]
 
     def inside(rows: np.ndarray) -> np.ndarray:
         return np.clip(rows, 0, len(run) - 1)
@@ -151,23 +157,23 @@ def _windows_of(
     before = start + np.arange(-past, 0)
     seen = start + np.arange(-late - 1, steps + late + 1)
     return WindowSet(
-        run=np.full(len(w.start_row), number),
-        row=w.start_row,
-        start_qpos=run.qpos[w.start_row],
-        start_act=activation_guess(m, run)[w.start_row],
-        ctrl=w.ctrl,
+        run=np.full(len(first), number),
+        row=first,
+        start_qpos=run.qpos[first],
+        start_act=activation_guess(m, run)[first],
+        ctrl=run.ctrl[start + np.arange(steps)],
         past=run.sent_until[np.maximum(len(run.before) + before, 0)],
         past_qpos=run.qpos[inside(before)],
         past_qvel=moving(before),
         read=run.configuration.difference(run.qpos[start], run.qpos[inside(seen)]),
         speed=moving(start + np.arange(-late - 1, late + 1)),
         read_speed=run.qvel[inside(seen)],
-        led=w.start_row >= late,
+        led=first >= late,
         sensed=sensors.readings(run)[inside(seen)],
         known=1.0 * sensors.known(run)[inside(seen)],
-        last=run.ctrl[w.start_row + steps],
-        time=times(run)[w.start_row],
-        hidden=law_states(m, run)[w.start_row],
+        last=run.ctrl[first + steps],
+        time=times(run)[first],
+        hidden=law_states(m, run)[first],
     )
 
 
