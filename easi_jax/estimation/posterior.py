@@ -34,9 +34,6 @@ _KNOWN = 0.5  # of the initial range's top: a standard deviation that says somet
 _SURELY = 3.0  # of the cost, that a place is worse by: 20 to 1
 _WAY = 0.0, 0.125, 0.25, 0.5, 1.0  # from a fit to its mean with the initial range
 _HIDDEN = 0.1  # of what a model errs by, that a parameter takes up unseen
-# Steps of a piece: of longer ones starts take up less than a tenth of what is read, and
-# scatter between blocks says more of the spread than draws do.
-_BRIEF = 10
 UNSTATED = 2.0  # times the noise, that a model errs by with all doubts
 # Of a uniform initial range, unit coordinates.
 _MIDDLE, _INITIAL_VARIANCE = 0.5, 1.0 / 12.0
@@ -125,8 +122,8 @@ def estimate(
         refined: whether a fit follows.
         informed, robust, restarts: as in `begun`.
         adjusted: whether what the fitted starts add to the score is taken off
-            (`easi_jax.estimation.profile_score`), of brief pieces; not where starts are
-            exact, nor where slopes are differences (`Simulator.by_differences`).
+            (`easi_jax.estimation.profile_score`); not where starts are exact, nor where
+            slopes are differences (`Simulator.by_differences`).
         rest: more of the recording, the pieces among it: the fit ends on that
             (`easi_jax.estimation.polish`).
         doubts: the fit ends with these, on the same pieces.
@@ -364,10 +361,8 @@ def finish(
 
 
 def _adjusted(paired: PairedFit, fit: RefineResult) -> RefineResult:
-    """The fit with its score adjusted, where pieces are brief and the simulation gets
-    that far."""
-    long = paired.segments.horizon >= _BRIEF
-    if long or not paired.free_starts or paired.simulator.mj_model.nv > FORWARD_MODE:
+    """The fit with its score adjusted, where the simulation gets that far."""
+    if not paired.free_starts or paired.simulator.mj_model.nv > FORWARD_MODE:
         return fit
     found, left = adjust(paired, fit)
     fine = jnp.isfinite(left[1])
