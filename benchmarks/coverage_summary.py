@@ -197,7 +197,7 @@ SECTIONS = (
         *("coverage --late 0.005", _late),
     ),
     Section(
-        *("### Spreads of train.easi --data", "coverage_logs.jsonl"),
+        *("### Spreads of parameters from logs", "coverage_logs.jsonl"),
         *("coverage --logs", _logs),
     ),
     Section(
