@@ -104,7 +104,7 @@ def test_data_that_determine_nothing_say_of_what(
     model = easi_jax.read_model(tmp_path / "model.xml")
     space = easi_jax.read_parameters(tmp_path / "parameters.yaml", model)
     log = easi_jax.read_log(tmp_path / "log.csv", model)
-    small = {"population": 8, "generations": 2}
+    small: Any = {"population": 8, "generations": 2}
     answer = easi_jax.estimate_parameters(model, space, log, **small)
     assert (answer.outcome, answer.reason) == ("not determined", why)
     assert why in str(answer)
