@@ -27,7 +27,7 @@ REPLACED = {
         *("easi_jax/polish.py", "easi_jax/windows.py", "easi_jax/gap/fit.py"),
         *("easi_jax/gap/predictor.py", "easi_jax/gap/window_set.py"),
     ),
-    "easi_jax/gap": ("easi_jax/gap/",),
+    "easi_jax/gap": ("easi_jax/gap/",),  # three of those above among them
 }
 
 

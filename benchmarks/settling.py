@@ -66,7 +66,7 @@ class Config(Share):
     robots: tuple[str, ...] = ROBOTS
     """Built-in robots."""
     settings: tuple[str, ...] = tuple(SETTINGS)
-    """Settings, by the names that --list shows."""
+    """preset, clipped apart, rewards x 0.1, rewards x 0.3, rewards x 3."""
     budgets: tuple[float, ...] = BUDGETS
     """Times the control steps of the preset."""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -149,7 +149,7 @@ def _paragraphs(rows: list[dict[str, Any]]) -> list[str]:
                     **{"robot": robot, "setting": setting},
                     "steps": f"{some[0]['steps']:,}",
                     "returns": [r["return"] for r in some],
-                    "adds": added(some, by.get(1.5 * budget, [])),
+                    "adds": _told(some, by.get(1.5 * budget, []), budget),
                 }
             )
     columns = {
@@ -159,7 +159,7 @@ def _paragraphs(rows: list[dict[str, Any]]) -> list[str]:
         "return (every seed)": lambda r: (
             f"{mean(r['returns']):.1f} ({each_of(r['returns'], 1)})"
         ),
-        "half as many more add": lambda r: _told(r["adds"]),
+        "half as many more add": "{adds}",
     }
     return [
         "`python -m benchmarks.settling`: trainings in the robot as it is, by its "
@@ -180,12 +180,19 @@ def added(
     if not both:
         return None
     before, after = (mean(x) for x in zip(*both, strict=True))
-    return (after - before) / abs(before)
+    return (after - before) / max(abs(before), 1e-9)
 
 
-def _told(adds: float | None) -> str:
+def _told(
+    rows: Sequence[Mapping[str, Any]],
+    longer: Sequence[Mapping[str, Any]],
+    budget: float,
+) -> str:
+    adds = added(rows, longer)
     if adds is None:
-        return "not run"
+        return "not run" if 1.5 * budget in BUDGETS else "-"
+    if adds < -SETTLED:
+        return f"{adds:+.1%}: a training's chance is larger"
     return f"{adds:+.1%}" + (", settled" if adds < SETTLED else "")
 
 

@@ -41,7 +41,7 @@ def run(config: Config) -> None:
     """Trains what is missing, walks, draws."""
     from benchmarks._common import at_least_one
     from benchmarks.paper_cells import Cell
-    from benchmarks.paper_experiments import robots
+    from benchmarks.paper_experiments import ON_HARDWARE, robots
     from benchmarks.paper_twin import transferred
     from easi_jax.errors import UserError, nearest
     from easi_jax.io.report.video import check_video, side_by_side
@@ -54,8 +54,12 @@ def run(config: Config) -> None:
     if config.robot not in known:
         hint = nearest(config.robot, known)
         raise UserError(f"--robot {config.robot}: {', '.join(known)}{hint}")
-    if not 0 < config.seconds <= 60 or not config.methods:
-        raise UserError("--seconds: above 0, at most 60; --methods: at least one")
+    if not 0 < config.seconds <= 60:
+        raise UserError(f"--seconds {config.seconds:g}: above 0, at most 60")
+    for method in config.methods or ("",):
+        if method not in ON_HARDWARE:
+            hint = nearest(method, ON_HARDWARE)
+            raise UserError(f'--methods "{method}": {", ".join(ON_HARDWARE)}{hint}')
     motions, told = [], []
     for method in config.methods:
         cell = Cell(method, config.robot, "twin", config.seed, 1, config.env_steps)

@@ -378,6 +378,7 @@ def test_walks_in_a_twin_are_drawn_side_by_side(
         (["--robot", "ant"], "go2, go2-imitating"),
         (["--out", "walk.avi"], ".gif or .mp4"),
         (["--seconds", "0"], "above 0"),
+        (["--methods", "GARAT"], "UDR, EASI paper"),
     ],
 )
 def test_videos_that_cannot_be_made(words: list[str], said: str, capsys: Any) -> None:

@@ -47,7 +47,7 @@ def test_what_more_steps_add_is_of_the_same_seeds(tmp_path: Path) -> None:
     (tmp_path / "settling.jsonl").write_text(text)
     page = "\n".join(shown(settling.SECTIONS, tmp_path))
     assert "| 4,000,000 | 400.0 (100.0, 200.0, 900.0) | +2.0%, settled |" in page
-    assert "| 6,000,000 | 153.0 (102.0, 204.0) | not run |" in page
+    assert "| 6,000,000 | 153.0 (102.0, 204.0) | - |" in page
 
 
 @pytest.mark.fault("wrong options and files")

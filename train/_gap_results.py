@@ -51,6 +51,8 @@ def write_all(
     result = _result(problem, outcome)
     _write(folder, config, result, pictures)
     _write_effects(folder, problem, result)
+    for note in result.notes[len(problem.notes) :]:
+        say(f"note: {note}")
 
     def drawn(what: str, draw: "Callable[[], Picture | None]") -> None:
         made = extras.attempt(f'the picture "{what}"', draw, None)

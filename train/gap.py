@@ -62,14 +62,12 @@ def run(config: Config) -> None:
         problem.notes.extend(analysis.predictor.simulator.notes)
         for note in problem.notes:
             say(f"note: {note}")
-        told, outcome = len(problem.notes), analysis.run()
+        outcome = analysis.run()
         result, whole = write_all(folder, config, problem, analysis.final, outcome)
         if whole:
             analysis.journal.clear()
         else:
             say("the same command with --resume tries again what was left out")
-    for note in result.notes[told:]:
-        say(f"note: {note}")
     show(result, config.out / REPORT)
 
 

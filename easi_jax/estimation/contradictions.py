@@ -1,6 +1,6 @@
 """Recordings that lead elsewhere than the others do."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
@@ -42,7 +42,7 @@ def compared(
     weight: np.ndarray,
     apart: Sequence[Recording],
     few: bool,
-) -> list[Recording]:
+) -> Iterator[Recording]:
     """Recordings that can contradict others, as many pieces of each.
 
     Args:
@@ -57,17 +57,15 @@ def compared(
     sizes = [int((owner == name).sum()) for name in names]
     sizes += [r.pieces.count for r in apart]
     most = min(max(sizes, default=0), whole.count) if few else whole.count
-    found = []
     for name in names:
         mine = np.asarray(whole.weight * weight) * (owner == name)
         if np.any(mine > 0):
             pieces = replace(whole, weight=jnp.asarray(mine))
             pieces = alone(pieces, owner == name, most) if few else pieces
-            found.append(Recording(name, pieces))
+            yield Recording(name, pieces)
     for r in apart:
         own = np.ones(r.pieces.count, bool)
-        found.append(Recording(r.name, alone(r.pieces, own, most), held=True))
-    return found
+        yield Recording(r.name, alone(r.pieces, own, most), held=True)
 
 
 def held_apart(
@@ -78,32 +76,40 @@ def held_apart(
     every: int,
     sensors: Sensors,
 ) -> list[Recording]:
-    """Held-out recordings of which no fit has a row, cut as the pieces ``whole`` are.
+    """Held-out recordings of which no fit has a row, cut as the pieces ``whole`` are;
+    without those that lack what all that were fitted have measured.
 
     Args:
         runs: to fit, and held out.
         steps, every, sensors: of `easi_jax.estimation.pieces.segments_from_runs`.
     """
     fit, held = runs
-    fitted = {run.recording for run in fit}
-    out = [r for r in held if r.recording not in fitted and len(r) > steps]
+    fitted = {(run.source, run.recording) for run in fit}
     trusted, found = trusted_velocities(fit), []
-    for name in spread(list(dict.fromkeys(r.recording for r in out))):
-        mine = [r for r in out if r.recording == name]
+    apart: dict[tuple[str, str], list[Run]] = {}
+    for run in held:
+        key = run.source, run.recording
+        if key not in fitted and len(run) > steps:
+            apart.setdefault(key, []).append(run)
+    for mine in _some(list(apart.values())):
+        if (trusted & ~trusted_velocities(mine)).any():
+            continue
+        if not all(n.sensor in run.sensors for n in sensors for run in mine):
+            continue
         pieces = segments_from_runs(simulator, mine, steps, every, trusted, sensors)
         if isinstance(whole.read, tuple) != isinstance(pieces.read, tuple):
             if isinstance(whole.read, tuple):
-                continue  # it lacks readings of what all others have read
+                continue
             pieces = replace(pieces, read=np.ones_like(pieces.sensed))
         pieces = to_device(replace(pieces, weight=0.5 * pieces.weight))
-        found.append(Recording(name, pieces, held=True))
+        found.append(Recording(mine[0].recording, pieces, held=True))
     return found
 
 
-def spread(names: Sequence[str]) -> list[str]:
+def _some(every: Sequence[list[Run]]) -> list[list[Run]]:
     """`_COMPARED` of them at most, at even distances."""
-    at = np.linspace(0, len(names) - 1, min(len(names), _COMPARED))
-    return [names[int(i)] for i in at.round()]
+    at = np.linspace(0, len(every) - 1, min(len(every), _COMPARED))
+    return [every[int(i)] for i in at.round()]
 
 
 def worst(owner: np.ndarray, weight: np.ndarray) -> list[str]:
@@ -130,7 +136,7 @@ def alone(pieces: Segments, own: np.ndarray, count: int) -> Segments:
 
 def contradictions(
     space: ParameterSpace,
-    recordings: Sequence[Recording],
+    recordings: Iterable[Recording],
     found: Estimate,
     by_itself: Callable[[Recording], Estimate],
 ) -> list[str]:

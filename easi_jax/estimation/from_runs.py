@@ -246,9 +246,8 @@ class _Finish:
         whole = to_device(segments_from_runs(*given, sensors=self.sensors))
         self.whole = replace(whole, weight=0.5 * whole.weight)
         runs = problem.fit, problem.held
-        self.apart = held_apart(
-            *(self.whole, cutting, runs, self.steps, every, self.sensors)
-        )
+        cut = cutting, runs, self.steps, every, self.sensors
+        self.apart = held_apart(self.whole, *cut) if refined else []
         starts = [len(range(0, len(r) - self.steps, every)) for r in problem.fit]
         self.owner = np.repeat([r.recording for r in problem.fit], starts)
         self.pieces = few(simulator, self.whole, _FEW) if refined else self.whole
@@ -556,12 +555,20 @@ class _Finish:
         def by_itself(recording: Recording) -> Estimate:
             pieces = recording.pieces
             end = self.ending(doubts, pieces.count if few else None)
-            given = (
-                *(found.fit, found.search_cov, pieces, found.misfit),
-                (found.noise, found.start),
-            )
+
+            def ended(weighed: Segments) -> Estimate:
+                start, known = (found.fit, found.search_cov), (found.noise, found.start)
+                return distributed.local(
+                    end(*placed((*start, weighed, found.misfit, known)))
+                )
+
             self.tell(f"{recording.name} by itself, beside the others")
-            return distributed.local(end(*placed(given)))
+            alone = ended(pieces)
+            if not recording.held or self.lost(alone):
+                return alone
+            # Its pieces have not been weighed by how well they fit.
+            weight = self.judged(alone, pieces, pieces, found.noise)[1]
+            return ended(replace(pieces, weight=pieces.weight * weight))
 
         return contradictions(self.search.space, compared(*given), found, by_itself)
 

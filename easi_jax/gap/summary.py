@@ -92,8 +92,8 @@ def _not_determined(refitted: Sequence[Refitted]) -> list[str]:
     if not loose:
         return []
     return [
-        f"the data do not determine {', '.join(loose)}: what the refit made of it "
-        "means nothing"
+        f"the data do not determine {', '.join(loose)}: values of the refit there "
+        "mean nothing, also in effects.yaml and model.xml"
     ]
 
 

@@ -397,7 +397,9 @@ def words(capsys, files) -> str:
     """What the terminal and the report say, which is the same."""
     said = " ".join(capsys.readouterr().out.split())
     page = " ".join((files["out"] / "report.html").read_text().split())
-    for note in re.findall(r"note: (.*?)(?= note: | a policy for it: )", said):
+    notes = re.findall(r"note: (.*?)(?= note: | a policy for it: )", said)
+    assert notes
+    for note in notes:
         for part in re.split(r": | \(|\)$", note):
             assert part in html.unescape(page), note
     return said

@@ -146,8 +146,8 @@ def test_what_is_held_out_is_compared_as_well() -> None:
     (only,) = compared(whole, one, np.ones(6), apart, few=False)
     assert only.name == "b" and only.pieces.count == 6, "a program is of one size"
     assert only.pieces.weight.tolist() == [0.5] * 4 + [0.0] * 2
-    assert compared(whole, one, np.ones(6), [], few=False) == []
-    found = compared(whole, two, np.ones(6), apart, few=True)
+    assert not list(compared(whole, one, np.ones(6), [], few=False))
+    found = list(compared(whole, two, np.ones(6), apart, few=True))
     assert [r.name for r in found] == ["a", "c", "b"]
     assert [r.pieces.count for r in found] == [4, 4, 4]
     long = Recording("long", whole.take(np.arange(24) % 6), held=True)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -15,6 +16,7 @@ from easi_jax.data.recording import Run
 from easi_jax.data.segments import to_device
 from easi_jax.data.sensor_channels import NO_SENSORS, Sensors
 from easi_jax.estimation import from_runs, weights
+from easi_jax.estimation.contradictions import held_apart
 from easi_jax.estimation.normal_equations import PairedFit
 from easi_jax.estimation.pieces import segments_from_runs
 from easi_jax.estimation.problem import Problem, problem_of
@@ -94,6 +96,36 @@ def _problem(early: bool = False, name: engine.Engine = "mujoco") -> Problem:
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     return _problem()
+
+
+def test_held_out_recordings_are_cut_as_the_fitted_ones(problem: Problem) -> None:
+    """Those that lack what all of these have measured are not compared."""
+    m, (fit,) = problem.simulator.mj_model, problem.fit
+    sensors, steps, every = problem.fitted_sensors, 15, 8
+    given = problem.sensing, [fit], steps, every
+    whole = segments_from_runs(*given, sensors=sensors)
+    other = replace(_recorded(m, 2), source="day2.csv", name=fit.name)
+    half = {
+        k: np.where(np.arange(_ROWS)[:, None] < 150, v, np.nan)
+        for k, v in other.sensors.items()
+    }
+
+    def apart(*held: Run) -> list[str]:
+        runs = [fit], held
+        found = held_apart(whole, problem.sensing, runs, steps, every, sensors)
+        for one in found:
+            like = jax.tree.map(lambda x: x[:1], (one.pieces, whole))
+            chex.assert_trees_all_equal_shapes(*like)
+        return [one.name for one in found]
+
+    assert len(sensors) and fit.qvel_measured
+    assert apart(other) == [fit.name], "a name that two files share is two recordings"
+    assert apart(replace(other, source=fit.source)) == []
+    assert (
+        apart(replace(other, sensors={})) == apart(replace(other, sensors=half)) == []
+    )
+    assert apart(replace(other, qvel_measured=False)) == []
+    assert apart(rows_of(other, 0, steps)) == []
 
 
 def test_which_take_part_and_why_others_do_not(problem: Problem) -> None:
