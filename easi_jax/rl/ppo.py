@@ -344,7 +344,7 @@ def _optimizer(config: PpoConfig) -> optax.GradientTransformationExtraArgs:
     cut = optax.clip_by_global_norm(config.max_gradient)
     if config.clip_apart:
         build: Any = losses.PPONetworkParams
-        parts = {"policy": cut, "value": cut}
+        parts: Any = {"policy": cut, "value": cut}
         cut = optax.partition(parts, build(policy="policy", value="value"))
     if config.target_kl:
         adam = optax.flatten(optax.scale_by_adam())
