@@ -96,7 +96,7 @@ class Cell:
         """The log of what its policies imitate, if they do."""
         from benchmarks.demonstrated import demonstrated
 
-        if self.robot != IMITATING:
+        if self.machine.algorithm is None:
             return None
         return demonstrated(folder, ("trot",), self.env_steps)[0]
 

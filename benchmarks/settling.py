@@ -25,9 +25,8 @@ from train._command import main
 
 _FILE = "settling.jsonl"
 ROBOTS = ("cartpole", "ballbalance", "ant", "go2")
-AS_IS = "preset"
 SETTINGS: Mapping[str, Mapping[str, Any]] = {
-    AS_IS: {},
+    "preset": {},
     "clipped apart": {"clip_apart": True},
     "rewards x 0.1": {"reward_scaling": 0.1},
     "rewards x 0.3": {"reward_scaling": 0.3},

@@ -51,9 +51,9 @@ def compared(
         apart: held-out recordings (`held_apart`).
         few: no more pieces than the largest of them has; else as many as ``whole``.
     """
-    names = list(dict.fromkeys(owner.tolist()))
-    # One that all of the fit is about is the fit.
-    names = worst(owner, weight) if len(names) > 1 else []
+    names = worst(owner, weight)
+    if len(names) == 1:  # it is the fit
+        names = []
     sizes = [int((owner == name).sum()) for name in names]
     sizes += [r.pieces.count for r in apart]
     most = min(max(sizes, default=0), whole.count) if few else whole.count
@@ -91,7 +91,9 @@ def held_apart(
         key = run.source, run.recording
         if key not in fitted and len(run) > steps:
             apart.setdefault(key, []).append(run)
-    for mine in _some(list(apart.values())):
+    every_one = list(apart.values())
+    for i in _evenly(len(every_one), _COMPARED):
+        mine = every_one[i]
         if (trusted & ~trusted_velocities(mine)).any():
             continue
         if not all(n.sensor in run.sensors for n in sensors for run in mine):
@@ -106,10 +108,9 @@ def held_apart(
     return found
 
 
-def _some(every: Sequence[list[Run]]) -> list[list[Run]]:
-    """`_COMPARED` of them at most, at even distances."""
-    at = np.linspace(0, len(every) - 1, min(len(every), _COMPARED))
-    return [every[int(i)] for i in at.round()]
+def _evenly(count: int, most: int) -> list[int]:
+    """Places of ``most`` of ``count`` things at most, at even distances."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist()
 
 
 def worst(owner: np.ndarray, weight: np.ndarray) -> list[str]:
@@ -128,8 +129,7 @@ def alone(pieces: Segments, own: np.ndarray, count: int) -> Segments:
     """``count`` pieces: those that are ``own (M,)``, at even distances where there are
     more, then others of no weight."""
     first = np.flatnonzero(own)
-    at = np.linspace(0, len(first) - 1, min(count, len(first)))
-    first = first[at.round().astype(int)]
+    first = first[_evenly(len(first), count)]
     some = pieces.take(np.append(first, np.full(count - len(first), first[0])))
     return replace(some, weight=some.weight * (np.arange(count) < len(first)))
 

@@ -24,19 +24,19 @@ def law_curves(r: GapResult, m: mujoco.MjModel, runs: Sequence[Run]) -> list[Law
     out = []
     for e, law in laws:
         values = [e.values[n][0] for n in law.numbers]
-        force = [
-            sum(
-                (
-                    x * term_path(term, known, dt)
-                    for x, term in zip(values, law.terms, strict=True)
-                ),
-                np.zeros(np.shape(known.time)),
-            )
-            for known, dt in rows
-        ]
+        force = [_force(law, values, known, dt) for known, dt in rows]
         against, x = _against(law, m, [known for known, _ in rows])
         out.append(LawCurve(e.law, against, x, np.concatenate(force), e.force_unit))
     return out
+
+
+def _force(
+    law: FoundLaw, values: Sequence[float], known: Known, dt: float
+) -> np.ndarray:
+    total = np.zeros(np.shape(known.time))
+    for value, term in zip(values, law.terms, strict=True):
+        total = total + value * term_path(term, known, dt)
+    return total
 
 
 def _against(

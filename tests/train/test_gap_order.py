@@ -46,7 +46,9 @@ def write(
     monkeypatch.setattr(gap_report, "traces_picture", lambda _: some)
     config = dataclasses.replace(gap.Config(), out=tmp_path / "out", retrain="x")
     problem: Any = SimpleNamespace(
-        model=SimpleNamespace(mj_model=None, path=None, name="m"), held=[None]
+        model=SimpleNamespace(mj_model=None, path=None, name="m"),
+        held=[None],
+        notes=[],
     )
     nothing: Any = None
 
