@@ -167,9 +167,11 @@ def _limits(
     """Where joints may go, and what nothing checks."""
     import numpy as np
 
+    from easi_jax.excite.choose import check_excitable
     from easi_jax.excite.drives import limits_of
     from easi_jax.model.joint_space import scalar_dofs
 
+    check_excitable(m)
     speed = _numbers("--max-speed", config.max_speed, of_joint, np.full(m.nv, np.inf))
     default = np.full(m.nv, _TRAVEL[3])
     for j, (_, d) in scalar_dofs(m).items():

@@ -117,11 +117,14 @@ def _blocks_of(
     held = max(int(_OF_ONE * rows), math.ceil(HELD_OUT * every))
     held = min(held, round(_MOST * rows))
     if held < least:
-        longest = " of the longest run" if len(beside) > 1 else ""
+        longest = parts = ""
+        if len(beside) > 1:
+            longest = f", the longest of {len(beside)} runs,"
+            parts = ", or mend what parts the log (rows that are not finite, holes)"
         raise UserError(
             f"{run.source}: {rows} rows ({rows * run.dt:.3g} s){longest} are too few "
             f"to hold some out with a horizon of {horizon:g} s, which needs "
-            f"{math.ceil(least / _OF_ONE)}: record more, or shorten --horizon"
+            f"{math.ceil(least / _OF_ONE)}: record more{parts}, or shorten --horizon"
         )
     count = min(max(held // (least + gap), 1), _BLOCKS)
     size = math.ceil(held / count)

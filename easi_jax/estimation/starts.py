@@ -228,12 +228,13 @@ class Starts:
         rows alone, over which errors are nearly linear.
 
         Args:
-            begin: offsets to start from, ``(W, s)``.
+            begin: offsets to start from, ``(W, s)``, but where none fit better: what
+                was fitted to another model may be in another minimum.
 
         Returns:
             Offsets ``(W, s)`` and errors ``(W, T, c)``.
         """
-        whole, moved = self.rows, begin
+        whole, moved = self.rows, self._nearer(x, begin)
         before, errors = np.zeros(0), np.zeros(0)
         known = np.isfinite(self.noise).sum()
         for k in range(_LINEARIZED):
@@ -258,6 +259,15 @@ class Starts:
             moved = np.where(lost[:, None], begin, moved)
             errors = self.linearize(x, moved)
         return moved, errors
+
+    def _nearer(self, x: np.ndarray, begin: np.ndarray) -> np.ndarray:
+        """Offsets ``(W, s)``, or none where these fit better."""
+        if not begin.any():
+            return begin
+        simulate = self.simulate if self.begins is None else self.begins
+        both = np.stack([begin, np.zeros_like(begin)])
+        given, none = self._cost(simulate(np.repeat(x[None], 2, 0), both), both)
+        return np.where((none < given)[:, None], 0.0, begin)
 
     def _cost(self, errors: np.ndarray, moved: np.ndarray) -> np.ndarray:
         """Half the weighted squared error of each start, ``(B, W)``."""

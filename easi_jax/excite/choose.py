@@ -59,6 +59,12 @@ class Choice:
     vectors: int
 
 
+def check_excitable(m: mujoco.MjModel) -> None:
+    """Raises `UserError` for a model that no test moves."""
+    if not scalar_dofs(m):
+        raise UserError("the model has no hinge or slide joint: nothing to excite")
+
+
 def check_names(names: Sequence[str]) -> None:
     """Raises `UserError` for a name that is no effect's."""
     for name in names:
@@ -126,9 +132,8 @@ def choose(
     Raises:
         UserError: an effect that the model has no place for.
     """
+    check_excitable(m)
     runs = [t.run for t in tests]
-    if not scalar_dofs(m):
-        raise UserError("the model has no hinge or slide joint: nothing to excite")
     scales = scales_of(m, runs) if scales is None else replace(scales, dt=runs[0].dt)
     keys = {k for pair in pairs for k in pair}
     space = less_named(space, [p for p in places(m, scales) if p.key in keys], m)

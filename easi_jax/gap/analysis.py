@@ -180,17 +180,24 @@ class Analysis:
         for steps, windows in cut.items():
             if steps == reported:
                 found[steps] = self.reported
-            else:
+            elif self._moves(steps):
                 predictor = self.predictor.on(filled(windows))
                 found[steps] = self._fitting(predictor, windows, steps)
         if not found:
             return [self.reported]
         first = found[min(found)]
         least = window_steps(data.dt, _SHORT) + data.lead
-        if least < first.steps:
+        if least < first.steps and self._moves(least):
             given = first.predictor, first.windows, least
             found[least] = self._fitting(*given)
         return [found[steps] for steps in sorted(found)]
+
+    def _moves(self, steps: int) -> bool:
+        """Whether some channel moves by more than its noise in windows of so many
+        steps."""
+        data, compared = self.data, self.reported.starts.compared
+        given = data.m, data.fit, data.noise[:compared], steps - data.lead, data.sensors
+        return bool(np.isfinite(measure.channels(*given).scale).any())
 
     def _held_out(self, kept: WindowSet, first: int) -> HeldOut:
         """Held-out windows, from one block of the predictor's on."""

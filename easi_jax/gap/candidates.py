@@ -30,8 +30,9 @@ class _Object(NamedTuple):
         index: where its numbers are in fields of `Effects`.
         spot: the same for the catalog.
         is_all: it stands for all of its kind.
-        tied: names of the like places that it stands for, and ``among`` where their
-            numbers are.
+        tied: names of the like places that it stands for, ``among`` where their
+            numbers are, and ``all_drives`` whether these are all actuators.
+        range: where a spring at it may rest: at a joint, or at each of like joints.
     """
 
     name: str
@@ -40,6 +41,8 @@ class _Object(NamedTuple):
     is_all: bool = False
     tied: tuple[str, ...] = ()
     among: tuple[tuple[int, ...], ...] = ()
+    all_drives: bool = False
+    range: tuple[float, float] = (-np.inf, np.inf)
 
 
 def places(m: mujoco.MjModel, s: Scales) -> list[Place]:
@@ -60,7 +63,8 @@ def ripples(
 
 def _joint(m: mujoco.MjModel, j: int, s: Scales) -> _Object:
     dof = int(m.jnt_dofadr[j])
-    return _Object(name_of(m, "joint", j), (dof,), Spot(m, "joint", j, s))
+    spot = Spot(m, "joint", j, s)
+    return _Object(name_of(m, "joint", j), (dof,), spot, range=spot.range)
 
 
 def _objects(m: mujoco.MjModel, s: Scales) -> Iterator[_Object]:
@@ -85,15 +89,24 @@ def _objects(m: mujoco.MjModel, s: Scales) -> Iterator[_Object]:
 
 
 def _like(m: mujoco.MjModel, kind: str, s: Scales) -> Iterator[_Object]:
-    """Groups of like joints or actuators, but all actuators together."""
+    """Groups of like joints or actuators."""
     id_of = {"joint": m.joint, "actuator": m.actuator}[kind]
     for pattern, names in like_places(m, kind).items():
-        if kind == "actuator" and len(names) == m.nu:
-            continue
         ids = [int(id_of(name).id) for name in names]
         at = m.jnt_dofadr[ids].tolist() if kind == "joint" else ids
         among = tuple((k,) for k in at)
-        yield _Object(pattern, (), Spot(m, kind, ids[0], s), tied=names, among=among)
+        every = kind == "actuator" and len(names) == m.nu
+        rests = [Spot(m, kind, i, s).range for i in ids] if kind == "joint" else []
+        low, high = zip(*rests, (-np.inf, np.inf), strict=True)
+        yield _Object(
+            pattern,
+            (),
+            Spot(m, kind, ids[0], s),
+            tied=names,
+            among=among,
+            all_drives=every,
+            range=(max(low), min(high)),
+        )
 
 
 def _at(row: Effect, o: _Object, cycles: float = np.nan) -> Iterator[Place]:
@@ -105,13 +118,15 @@ def _at(row: Effect, o: _Object, cycles: float = np.nan) -> Iterator[Place]:
     columns = tuple(_column(part, o) for part in site.parts)
     if o.tied and not all(map(_adds, site.parts, columns)):
         return
+    if o.all_drives and row.is_shared:
+        return  # offered as that of all already
     starts = tuple(
         tuple(cycles if np.isnan(x) else float(x) for x in start)
         for start in site.starts_at(o.spot)
     )
     what = (row.name, o.name, "model" if o.is_all else kind, columns)
     if row.rests:
-        yield Place(*what, starts, rests=o.spot.range, tied=o.tied)
+        yield Place(*what, starts, rests=o.range, tied=o.tied)
         return
     if not site.parts[-1].number.is_shape:
         yield Place(*what, starts, tied=o.tied)

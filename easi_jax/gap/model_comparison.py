@@ -179,6 +179,13 @@ def cost(model: Model, less: Model, within: float = DECIDE.closed) -> float:
     return 0.5 * float(max(each, np.log(theirs.mean() / mine.mean())))
 
 
+def certainty(model: Model, less: Model) -> float:
+    """By how many standard errors between blocks an effect helps: by its share of what
+    is left without it."""
+    mine, theirs = (np.log(x.loss + _TINY) for x in (model, less))
+    return advantage(mine, theirs)
+
+
 def confidence(
     lost: float, odds: float, even: float = DECIDE.even, steep: float = DECIDE.steep
 ) -> float:

@@ -64,6 +64,9 @@ class Found:
         cost: of taking it out [nats for each independent number that was read]
             (`easi_jax.gap.model_comparison.cost`).
         outcome: how the fit of its numbers ended.
+        sure: standard errors by which it helps
+            (`easi_jax.gap.model_comparison.certainty`).
+        odds: of all its rivals together, but its twins.
     """
 
     place: Place
@@ -76,6 +79,8 @@ class Found:
     parts: tuple[Part, ...] = ()
     cost: float = 0.0
     outcome: Ended = "converged"
+    sure: float = 0.0
+    odds: float = 0.0
 
 
 @dataclass(frozen=True)

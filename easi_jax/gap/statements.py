@@ -12,7 +12,7 @@ from easi_jax.gap.effect_search import RIVALS, EffectSearch
 from easi_jax.gap.effect_set import Model, last
 from easi_jax.gap.fitting import Fitting
 from easi_jax.gap.held_out import HeldOut
-from easi_jax.gap.model_comparison import confidence, cost, odds_of
+from easi_jax.gap.model_comparison import certainty, confidence, cost, odds_of
 from easi_jax.gap.result import Figures, Found, Numbers, Outcome, Part, score_of
 from easi_jax.gap.table import Place
 from easi_jax.gap.verdict import Openness, openness, surely_better, verdict_of
@@ -179,6 +179,8 @@ class _Judge:
                     parts,
                     costs[place.key],
                     numbers.outcome(place),
+                    certainty(self.model, without[place.key]),
+                    odds,
                 )
             )
         return found

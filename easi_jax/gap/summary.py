@@ -141,6 +141,8 @@ def _effect(f: Found, gap: float) -> NamedEffect:
         std={columns[k].name: s for k, s in f.deviations.items()},
         shared=bool(f.parts),
         cost=f.cost,
+        sure=f.sure,
+        odds=f.odds,
         outcome=f.outcome,
         pattern=f.place.at if f.place.tied else "",
     )

@@ -209,6 +209,10 @@ def _look(m: mujoco.MjModel, kind: str, i: int) -> tuple[Any, ...]:
         at = driven_joint(m, i)
         look = (
             int(m.actuator_trntype[i]),
+            int(m.actuator_dyntype[i]),
+            *m.actuator_dynprm[i].tolist(),
+            int(m.actuator_gaintype[i]),
+            int(m.actuator_biastype[i]),
             _width(m.actuator_ctrlrange[i]),
             _mirrored(m.actuator_forcerange[i]),
             abs(float(m.actuator_gear[i, 0])),

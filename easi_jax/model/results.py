@@ -42,6 +42,9 @@ class NamedEffect:
         cost: of taking it out, in cross-validated log density: nats for each
             independent number that was read; None where no prediction uses it.
         outcome: how the fit of its values ended.
+        sure: standard errors between blocks of time by which it helps; None as
+            ``cost``.
+        odds: of its rivals together against it, twins aside; None as ``cost``.
     """
 
     effect: str
@@ -58,6 +61,8 @@ class NamedEffect:
     cost: float | None = None
     pattern: str = ""
     outcome: Outcome = "converged"
+    sure: float | None = None
+    odds: float | None = None
 
     @property
     def label(self) -> str:

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from tests.gap_cases import strengths
-from tests.gap_cases.effects import CaseError, Effect
+from tests.gap_cases.effects import UNLISTED, CaseError, Effect
 from tests.gap_cases.gap import Gap
-from tests.gap_cases.logs import Log, Noise, write_csv
+from tests.gap_cases.logs import READINGS, Log, Noise, velocities_of, write_csv
 from tests.gap_cases.mechanisms import Mechanism, Stated
-from tests.gap_cases.places import twins
+from tests.gap_cases.places import kindred, twins
 from tests.gap_cases.robots import build
 from tests.gap_cases.search import (
     LEAST,
@@ -25,7 +25,12 @@ from tests.gap_cases.search import (
     wrong_numbers,
 )
 from tests.gap_cases.settings import Setting, settle
+from tests.gap_cases.truth import apart
 
+LOUD, UNKNOWN = (3.4, 3000.0), (3.4, 40.0)
+"""Gaps in floors of wide cases: of an effect of the table, of what no table has."""
+LAGS = (0.006, 0.02)
+"""How late velocities are in wide cases [s]."""
 PERFECT = 1.1
 """Most that the owner's model may be off in a machine without effects, in floors."""
 COARSE = (1.3, 4.0)
@@ -46,15 +51,19 @@ class Case:
     gap: Gap
     directory: Path
     runs: tuple[str, ...]
+    reading: str
+    lag: float
 
 
 def _streams(seed: int, mechanism: str) -> list[np.random.Generator]:
     return np.random.default_rng([seed, zlib.crc32(mechanism.encode())]).spawn(4)
 
 
-def build_machine(seed: int, mechanism: str, stated: Stated) -> Mechanism:
+def build_machine(
+    seed: int, mechanism: str, stated: Stated, wide: bool = False
+) -> Mechanism:
     """The mechanism that `make_case` begins from."""
-    return build(mechanism, _streams(seed, mechanism)[0], stated)
+    return build(mechanism, _streams(seed, mechanism)[0], stated, wide)
 
 
 def make_case(
@@ -68,21 +77,24 @@ def make_case(
     kind: str = "",
     coarse: bool = False,
     most: float = MOST,
+    wide: bool = False,
 ) -> Case:
     """Write a case into `out_dir`.
 
-    Effects that come with their main parameter keep it; the others are sized until the
-    gap is between `LEAST` and `most` times the floor. With `wrong_own` the model's own
-    numbers are wrong instead. A `coarse` case is one whose model is off by its own
-    timestep and velocity fits. Raises CaseError where this cannot be had.
+    Effects that come with their main parameter keep it; the others are sized, each by
+    itself, until the gap is between `LEAST` and `most` times the floor. With
+    `wrong_own` the model's own numbers are wrong instead. A `coarse` case is one whose
+    model is off by its own timestep and velocity fits. A `wide` one has any rate,
+    speed and reading, and gaps as real machines have them. Raises CaseError where this
+    cannot be had.
     """
     for effect in effects:
         if effect.name not in strengths.SIZERS:
             raise ValueError(f"unknown effect {effect.name!r}")
-    machine = build_machine(seed, mechanism, stated or Stated())
+    machine = build_machine(seed, mechanism, stated or Stated(), wide)
     rngs = _streams(seed, mechanism)
     setting = settle(machine, rngs[1], coarse)
-    trial = Trial(setting, seed)
+    trial = Trial(setting, seed, most if wide else MOST)
     context = setting.context
     perfect = trial.gap(trial.logs(setting.plans, [], {}), quick=True).ratio
     low, high = COARSE if coarse else (0.0, PERFECT)
@@ -96,6 +108,9 @@ def make_case(
     sizing = [i for i, e in enumerate(effects) if not given(e, chosen[i], context)]
     for index in sizing:
         alternative = stronger(chosen, index, context)
+        if wide:
+            sizes = UNKNOWN if effects[index].name in UNLISTED else LOUD
+            target = rngs[3].uniform(*np.log(sizes))
         strength = trial.search(alternative, float(np.exp(target)))
         chosen[index] = alternative(strength)[0][0]
     if wrong_own:
@@ -107,10 +122,14 @@ def make_case(
         raise CaseError(f"a perfect model is at {gap.ratio:.2f} floors")
     if (sizing or wrong_own) and not LEAST <= gap.ratio <= most:
         raise CaseError(f"over all runs the gap is {gap.ratio:.2f} floors")
-    velocities = bool(rngs[3].random() < 1 / 3)
-    runs = _write(out_dir, setting, logs, velocities)
+    reading, lag = READINGS[int(rngs[3].random() < 1 / 3)], 0.0
+    if wide:
+        reading = str(rngs[3].choice(READINGS))
+        lag = float(f"{np.exp(rngs[3].uniform(*np.log(LAGS))):.2g}")
+    runs = _write(out_dir, setting, logs, reading, lag)
     case = Case(
-        seed, setting.mechanism, tuple(chosen), own, setting.noise, gap, out_dir, runs
+        *(seed, setting.mechanism, tuple(chosen), own, setting.noise, gap, out_dir),
+        *(runs, reading, lag),
     )
     answer = describe(case, kind, setting, perfect)
     (out_dir / "answer.json").write_text(json.dumps(answer, indent=2) + "\n")
@@ -118,7 +137,7 @@ def make_case(
 
 
 def _write(
-    out_dir: Path, setting: Setting, logs: Sequence[Log], velocities: bool
+    out_dir: Path, setting: Setting, logs: Sequence[Log], reading: str, lag: float
 ) -> tuple[str, ...]:
     out_dir.mkdir(parents=True, exist_ok=True)
     mechanism = setting.mechanism
@@ -127,8 +146,24 @@ def _write(
     actuators = [mechanism.joints[i].actuator for i in mechanism.driven]
     names = tuple(f"run{i + 1}.csv" for i in range(len(logs)))
     for name, log in zip(names, logs, strict=True):
+        velocities = velocities_of(log, reading, lag)
         write_csv(out_dir / name, log, joints, actuators, velocities)
     return names
+
+
+def _faults(case: Case) -> list[str]:
+    """Names of what is wrong with velocities that are late or filtered."""
+    if case.reading not in ("late velocities", "filtered velocities"):
+        return []
+    return [f"sensor_delay@qvel.{joint.name}" for joint in case.mechanism.joints]
+
+
+def _laws(case: Case) -> list[str]:
+    """Joints, and actuators at them, at which a law that no table has acts."""
+    unknown = [e for e in case.effects if e.kind == "outside"]
+    places = {e.at for e in unknown} | {str(e.parameters.get("other")) for e in unknown}
+    at = [j for j in case.mechanism.joints if {j.name, j.actuator} & places]
+    return sorted({n for j in at for n in (j.name, j.actuator) if n})
 
 
 def describe(
@@ -153,11 +188,15 @@ def describe(
                 "effect": effect.name,
                 "at": effect.at,
                 "kind": effect.kind,
+                "places": [one.at for one in apart(mechanism, [effect])],
                 "parameters": strengths.reported(effect),
                 "twins": twins(mechanism, effect),
+                "kindred": kindred(effect),
             }
             for effect in case.effects
         ],
+        "readings": _faults(case),
+        "laws": _laws(case),
         "own": {
             address: {"model": stated[address], "truth": value}
             for address, value in case.own.items()
@@ -181,6 +220,8 @@ def describe(
             for i, joint in enumerate(mechanism.joints)
         },
         "setting": {
+            "reading": case.reading,
+            "lag": case.lag,
             "timestep": mechanism.timestep,
             "control_step": mechanism.control_step,
             "truth_step": setting.fine,

@@ -92,6 +92,20 @@ class Gain:
         return command * (self.gain + self.drift * max(0.0, time) / self.duration)
 
 
+class Bent:
+    """Large commands count for more, or less: a share of their square is added."""
+
+    def __init__(self, at: int, bend: float) -> None:
+        self.at, self.bend = at, bend
+
+    def reset(self, rng: np.random.Generator) -> None:
+        del rng
+
+    def pass_on(self, command: float, time: float, fresh: bool) -> float:
+        del time, fresh
+        return command * (1.0 + self.bend * abs(command))
+
+
 class Lag:
     """First-order response, exact for commands held during a fine step."""
 

@@ -1,6 +1,8 @@
 """The effects: their names, the kinds of their places, and the scales of a motion."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 
 import numpy as np
 
@@ -15,7 +17,8 @@ class CaseError(Exception):
 
 @dataclass(frozen=True)
 class Effect:
-    """One effect at one place; `parameters` may leave some to be drawn."""
+    """One effect at one place, or at all like places of a pattern such as `*_calf`;
+    `parameters` may leave some to be drawn."""
 
     name: str
     at: str
@@ -30,6 +33,17 @@ class Effect:
 
     def number(self, name: str) -> float:
         return float(self.parameters[name])
+
+    @property
+    def tied(self) -> bool:
+        """Whether several places have it alike."""
+        return "*" in self.at
+
+    def apart(self, names: Iterable[str]) -> list["Effect"]:
+        """The same at each of its places, which are among `names`."""
+        if not self.tied:
+            return [self]
+        return [replace(self, at=n) for n in names if fnmatchcase(n, self.at)]
 
     def having(self, **parameters: float | str) -> "Effect":
         return replace(self, parameters={**self.parameters, **parameters})
@@ -64,6 +78,14 @@ KINDS = {
 ON_REQUEST = {"drive_stiffness", "drive_damping", "actuator_strength"}
 """Effects that a draw does not take by itself: seeds of older cases stay theirs."""
 OUTSIDE = ("hysteresis", "gain_drift", "coupling_spring", "dropped_commands")
+UNLISTED = (
+    *OUTSIDE,
+    *("cubic_spring", "one_way_damping", "place_friction", "warm_friction"),
+    "bent_gain",
+)
+"""What no table has, in wide draws."""
+LOSSES = ("coulomb_friction", "stribeck_friction", "viscous_damping", "armature")
+"""What real drives have."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +120,14 @@ class Context:
     fine: float
 
     def joint(self, name: str) -> int:
-        return [joint.name for joint in self.mechanism.joints].index(name)
+        """The joint, or the first one of a pattern."""
+        return _first(name, [joint.name for joint in self.mechanism.joints])
 
     def actuator(self, name: str) -> int:
+        """The actuator, or the first one of a pattern."""
         joints = self.mechanism.joints
-        return [joints[i].actuator for i in self.mechanism.driven].index(name)
+        return _first(name, [joints[i].actuator for i in self.mechanism.driven])
+
+
+def _first(pattern: str, names: list[str]) -> int:
+    return next(i for i, name in enumerate(names) if fnmatchcase(name, pattern))

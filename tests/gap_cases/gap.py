@@ -45,13 +45,15 @@ class Gap:
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows of one run: indices of their first rows, and their commands."""
+    """Windows of one run: indices of their first rows, and their commands; `sent` are
+    all commands of the run."""
 
     start: np.ndarray
     steps: int
     half: int
     dt: float
     ctrl: np.ndarray
+    sent: np.ndarray
 
     def rows(self) -> np.ndarray:
         """(N, H) indices of the predicted rows."""
@@ -78,7 +80,18 @@ def windows_of(log: Log, every: int = 1) -> Windows:
     last = len(log.time) - 1 - max(steps, half)
     start = np.arange(half, last + 1, every * max(1, steps // 2))
     rows = start[:, None] + np.arange(steps)
-    return Windows(start, steps, half, dt, log.ctrl[rows])
+    return Windows(start, steps, half, dt, log.ctrl[rows], log.ctrl)
+
+
+def activations(model: mujoco.MjModel, sent: np.ndarray, dt: float) -> np.ndarray:
+    """What commands (T, nu) make of the activations of exact filters, (T, na); settled
+    at the first row."""
+    of = np.flatnonzero(model.actuator_dyntype != mujoco.mjtDyn.mjDYN_NONE.value)
+    kept = np.exp(-dt / model.actuator_dynprm[of, 0])
+    found = sent[:, of].copy()
+    for row in range(1, len(found)):
+        found[row] = kept * found[row - 1] + (1.0 - kept) * sent[row - 1, of]
+    return found
 
 
 def predict(
@@ -92,6 +105,10 @@ def predict(
     initial = np.zeros((len(qpos), count))
     initial[:, 1 : 1 + model.nq] = qpos
     initial[:, 1 + model.nq : 1 + model.nq + model.nv] = qvel
+    if model.na:
+        first = 1 + model.nq + model.nv
+        act = activations(model, windows.sent, windows.dt)
+        initial[:, first : first + model.na] = act[windows.start]
     control = np.repeat(windows.ctrl, parts, axis=1)
     states, _ = rollout.rollout(model, mujoco.MjData(model), initial, control)
     model.opt.timestep = keep

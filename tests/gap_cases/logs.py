@@ -60,19 +60,40 @@ class Noise:
         return np.where(self.quantum > 0, grain * np.round(noisy / grain), noisy)
 
 
+READINGS = ("positions", "velocities", "late velocities", "filtered velocities")
+"""What wide draws log."""
+
+
+def velocities_of(log: Log, reading: str, lag: float) -> np.ndarray | None:
+    """Velocities as a reading has them, (T, nq), `lag` seconds late; None for none."""
+    if reading == "positions":
+        return None
+    noise = log.qvel - log.true_qvel
+    if reading == "late velocities":
+        after = log.time - log.time[0]
+        late = [np.interp(after - lag, after, column) for column in log.true_qvel.T]
+        return np.stack(late, axis=1) + noise
+    if reading == "filtered velocities":
+        found, kept = log.qvel.copy(), np.exp(-log.step / lag)
+        for row in range(1, len(found)):
+            found[row] = kept * found[row - 1] + (1.0 - kept) * log.qvel[row]
+        return found
+    return log.qvel
+
+
 def write_csv(
     path: Path,
     log: Log,
     joints: list[str],
     actuators: list[str],
-    velocities: bool,
+    velocities: np.ndarray | None,
 ) -> None:
     """Write a log; the time column keeps microseconds."""
     names = ["time", *(f"qpos.{name}" for name in joints)]
     columns = [log.time[:, None], log.qpos]
-    if velocities:
+    if velocities is not None:
         names += [f"qvel.{name}" for name in joints]
-        columns.append(log.qvel)
+        columns.append(velocities)
     names += [f"ctrl.{name}" for name in actuators]
     columns.append(log.ctrl)
     table = np.concatenate(columns, axis=1)

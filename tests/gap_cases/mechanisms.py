@@ -9,6 +9,8 @@ import numpy as np
 
 GRAVITY = 9.81
 ON_GROUND = ("leg", "hopper")
+LEGS = ("FL", "FR", "RL", "RR")
+"""Of a robot that hangs in a stand; its joints are LEG_hip, LEG_thigh and LEG_calf."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +25,10 @@ class Stated:
 
 @dataclass(frozen=True)
 class Joint:
-    """One joint and the drive at it; lengths in m or rad, by the joint's type."""
+    """One joint and the drive at it; lengths in m or rad, by the joint's type.
+
+    `filter` is the time constant of a drive that has an activation of its own [s].
+    """
 
     name: str
     body: str
@@ -41,6 +46,7 @@ class Joint:
     kp: float = 0.0
     kv: float = 0.0
     reach: float = 0.0
+    filter: float = 0.0
 
     @property
     def unit(self) -> str:
@@ -103,6 +109,14 @@ def _joint_xml(joint: Joint) -> str:
 
 
 def _drive_xml(joint: Joint) -> str:
+    if joint.filter:
+        stiffness = f'gainprm="{joint.kp:g}" biastype="affine"'
+        servo = f'{stiffness} biasprm="0 {-joint.kp:g} {-joint.kv:g}"'
+        kind = f'gear="{joint.gear:g}"' if joint.drive == "motor" else servo
+        return (
+            f'<general name="{joint.actuator}" joint="{joint.name}" {kind} '
+            f'dyntype="filterexact" dynprm="{joint.filter:g}"/>'
+        )
     text = f'<{joint.drive} name="{joint.actuator}" joint="{joint.name}"'
     if joint.drive == "motor":
         return f'{text} gear="{joint.gear:g}"/>'

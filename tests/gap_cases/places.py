@@ -18,7 +18,14 @@ def _bodies(mechanism: Mechanism) -> list[str]:
 def _joints(mechanism: Mechanism, effect: str) -> list[Joint]:
     """Joints at which a joint's effect is new to the model and visible."""
     joints = list(mechanism.joints)
-    if effect in ("coulomb_friction", "stribeck_friction", "hysteresis"):
+    if effect in ("cubic_spring", "one_way_damping"):
+        return [joint for joint in joints if joint.name != "height"]
+    if effect == "place_friction":
+        return [joint for joint in _hinges(mechanism) if not joint.frictionloss]
+    if effect in (
+        *("coulomb_friction", "stribeck_friction", "hysteresis"),
+        "warm_friction",
+    ):
         return [joint for joint in joints if not joint.frictionloss]
     if effect == "viscous_damping":
         return [joint for joint in joints if not joint.damping]
@@ -27,7 +34,11 @@ def _joints(mechanism: Mechanism, effect: str) -> list[Joint]:
     if effect == "torque_ripple":
         return _hinges(mechanism)
     if effect == "backlash":
-        return [joint for joint in joints if joint.armature and joint.drive]
+        return [
+            joint
+            for joint in joints
+            if joint.armature and joint.drive and not joint.filter
+        ]
     if effect == "armature":
         return [joint for joint in joints if joint.name != "height"]
     if effect == "coupling_spring":
@@ -63,6 +74,8 @@ def places(mechanism: Mechanism, effect: str) -> list[str]:
         return [""] if mechanism.on_ground else []
     if effect == "gravity_tilt":
         return [""]
+    if effect == "bent_gain":
+        return [joint.actuator for joint in driven if joint.drive == "motor"]
     if effect in ("gain_drift", "dropped_commands") or KINDS.get(effect) == "actuator":
         if effect == "actuator_deadband":
             driven = [joint for joint in driven if joint.drive != "position"]
@@ -83,6 +96,11 @@ def twins(mechanism: Mechanism, effect: Effect) -> list[str]:
     Only twins by nature are listed, exact or as good as exact; noise can make more.
     """
     joints = mechanism.joints
+    if effect.tied:
+        names = [n for j in joints for n in (j.name, j.actuator)]
+        one = effect.apart(names)[0]
+        leg = one.at.partition("_")[0]
+        return [twin.replace(f"@{leg}_", "@*_") for twin in twins(mechanism, one)]
     single = len(joints) == 1
     first = joints[0]
     found: list[str] = []
@@ -122,3 +140,23 @@ def twins(mechanism: Mechanism, effect: Effect) -> list[str]:
     if single and name in ("actuator_delay", "sensor_delay"):
         found += [f"actuator_delay@{first.actuator}", f"sensor_delay@{first.name}"]
     return sorted({twin for twin in found if twin != f"{name}@{at}"})
+
+
+FRICTIONS = ("coulomb_friction", "stribeck_friction")
+LAWS = {
+    **dict.fromkeys(("hysteresis", "place_friction", "warm_friction"), FRICTIONS),
+    **dict.fromkeys(FRICTIONS, FRICTIONS),
+    **dict.fromkeys(("cubic_spring", "coupling_spring"), ("joint_stiffness",)),
+    **dict.fromkeys(("one_way_damping", "quadratic_drag"), ("viscous_damping",)),
+    **dict.fromkeys(("gain_drift", "bent_gain"), ("actuator_gain",)),
+    "dropped_commands": ("actuator_delay", "actuator_lag"),
+}
+"""Effects of the table that are others in another law."""
+
+
+def kindred(effect: Effect) -> list[str]:
+    """Names, as `name@place`, of the same effect in another law."""
+    other = effect.parameters.get("other")
+    at = [effect.at, str(other)] if other else [effect.at]
+    names = [n for n in LAWS.get(effect.name, ()) if n != effect.name]
+    return [f"{name}@{place}" for name in names for place in at]

@@ -9,8 +9,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from tests.gap_cases.mechanisms import ON_GROUND, Draw, Joint, Mechanism, Stated
+from tests.gap_cases.mechanisms import (
+    LEGS,
+    ON_GROUND,
+    Draw,
+    Joint,
+    Mechanism,
+    Stated,
+)
 
+FILTERS = (0.01, 0.05)
+"""Time constants of drives with an activation [s]."""
+SPEEDS = (0.5, 4.0)
+"""Highest frequencies of wide draws [Hz]."""
 FOOT_RADIUS = 0.03
 Parts = tuple[list[Joint], str]
 
@@ -199,6 +210,51 @@ def _hopper(draw: Draw) -> Parts:
     )
 
 
+def _stand(draw: Draw) -> Parts:
+    """Four like legs that hang from a held trunk."""
+    mass = draw.near(0.7), draw.near(1.0), draw.near(0.25)
+    length = draw.near(0.21, 0.15)
+    calf = mass[2] * length**2 / 3
+    thigh = mass[1] * length**2 / 3 + mass[2] * (length**2 + length**2 / 3)
+    rows = (
+        ("hip", 0.35, thigh, 0.0),
+        ("thigh", 0.5, thigh, 0.7),
+        ("calf", 0.5, calf, -1.4),
+    )
+    like = [
+        draw.joint(name, name, "hinge", amplitude, inertia, "position", home)
+        for name, amplitude, inertia, home in rows
+    ]
+    joints, bodies = [], '    <body name="trunk" pos="0 0 1">\n'
+    for i, leg in enumerate(LEGS):
+        mine = [
+            replace(
+                joint,
+                name=f"{leg}_{joint.name}",
+                body=f"{leg}_{joint.name}_link",
+                actuator=f"{leg}_{joint.actuator}",
+            )
+            for joint in like
+        ]
+        joints += mine
+        hip, upper, lower = (joint.body for joint in mine)
+        at = f"{0.19 - 0.38 * (i // 2):g} {0.05 - 0.1 * (i % 2):g} 0"
+        bodies += (
+            f'      <body name="{hip}" pos="{at}">\n'
+            f'        <joint {{{leg}_hip}} axis="1 0 0"/>\n'
+            f'        <geom type="sphere" size="0.04" mass="{mass[0]:g}" '
+            'contype="0" conaffinity="0"/>\n'
+            f'        <body name="{upper}" pos="0 {0.08 - 0.16 * (i % 2):g} 0">\n'
+            f'          <joint {{{leg}_thigh}} axis="0 1 0"/>\n'
+            f"          {_link(length, mass[1], 0.02)}\n"
+            f'          <body name="{lower}" pos="0 0 -{length:g}">\n'
+            f'            <joint {{{leg}_calf}} axis="0 1 0"/>\n'
+            f"            {_link(length, mass[2], 0.015)}\n"
+            "          </body>\n        </body>\n      </body>\n"
+        )
+    return joints, bodies + "    </body>\n"
+
+
 _BUILDERS: dict[str, Callable[[Draw], Parts]] = {
     "slide": _slide,
     "pendulum": _pendulum,
@@ -212,10 +268,38 @@ _BUILDERS: dict[str, Callable[[Draw], Parts]] = {
 
 
 MECHANISMS = tuple(_BUILDERS)
+_BUILDERS["stand"] = _stand
+WIDE = tuple(_BUILDERS)
+"""Mechanisms of wide draws."""
 
 
-def build(name: str, rng: np.random.Generator, stated: Stated) -> Mechanism:
-    """A mechanism with its masses, lengths, gains and rates drawn from `rng`."""
+def build(
+    name: str, rng: np.random.Generator, stated: Stated, wide: bool = False
+) -> Mechanism:
+    """A mechanism with its masses, lengths, gains and rates drawn from `rng`; `wide`:
+    control rates to 1 kHz, slow and fast, and drives with an activation."""
+    machine = _narrow(name, rng, stated)
+    if not wide:
+        return machine
+    control_step = 1.0 / float(rng.choice((50, 100, 125, 200, 250, 500, 1000)))
+    steps = [h for h in (0.004, 0.002, 0.001, 0.0005) if h < control_step + 1e-9]
+    filtered = rng.random() < 0.2
+    time = float(f"{np.exp(rng.uniform(*np.log(FILTERS))):.2g}")
+    joints = tuple(
+        replace(j, filter=time) if filtered and j.drive in ("motor", "position") else j
+        for j in machine.joints
+    )
+    return replace(
+        machine,
+        joints=joints,
+        timestep=float(rng.choice(steps)),
+        control_step=control_step,
+        speed=float(np.exp(rng.uniform(*np.log(SPEEDS))))
+        * (0.5 if name in ON_GROUND else 1.0),
+    )
+
+
+def _narrow(name: str, rng: np.random.Generator, stated: Stated) -> Mechanism:
     joints, bodies = _BUILDERS[name](Draw(rng, stated))
     slow = name in ("slide", "pendulum", "cartpole")
     rates = (50, 100, 125, 200) if slow else (100, 125, 200)

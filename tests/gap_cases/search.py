@@ -19,10 +19,10 @@ Alternative = Callable[[float], tuple[list[Effect], dict[str, float]]]
 
 
 class Trial:
-    """Gaps of a setting with given effects."""
+    """Gaps of a setting with given effects; `most` is the largest ratio wanted."""
 
-    def __init__(self, setting: Setting, seed: int) -> None:
-        self.setting, self.seed = setting, seed
+    def __init__(self, setting: Setting, seed: int, most: float = MOST) -> None:
+        self.setting, self.seed, self.most = setting, seed, most
         self.model = owner_model(setting.mechanism)
 
     def logs(
@@ -66,7 +66,7 @@ class Trial:
         shortest = min(plans, key=lambda plan: plan.duration)
         strength = self._search([shortest], alternative, target, 0.15)
         try:
-            if LEAST <= self._ratio(plans, alternative, strength) <= MOST:
+            if LEAST <= self._ratio(plans, alternative, strength) <= self.most:
                 return strength
         except CaseError:
             strength *= 0.5
@@ -110,7 +110,7 @@ class Trial:
             if not low < guess < high:
                 guess = 1.0 if high == 1.0 and guess >= 1.0 else 0.5 * (low + high)
             strength = guess
-        if not 1.1 * LEAST <= best[2] <= 0.95 * MOST:
+        if not 1.1 * LEAST <= best[2] <= 0.95 * self.most:
             raise CaseError(f"at most {best[2]:.2f} floors")
         return best[1]
 

@@ -11,6 +11,8 @@ from tests.gap_cases.logs import Log, Noise
 from tests.gap_cases.mechanisms import Mechanism
 from tests.gap_cases.truth import Truth, felt_inertia, home
 
+_NONE = mujoco.mjtDyn.mjDYN_NONE.value
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -132,6 +134,8 @@ def record(truth: Truth, plan: Plan, noise: Noise) -> Log:
         record_of["qvel"][row] = past_speed[late, columns]
         record_of["reading"][row] = reading
         record_of["ctrl"][row] = command
+        if row == 0 and model.na:
+            data.act[:] = command[model.actuator_dyntype != _NONE]
         if simple:
             data.ctrl[:] = command
             mujoco.mj_step(model, data, nstep=parts)

@@ -148,6 +148,17 @@ SIZERS: dict[str, Sizer] = {
     "contact_friction": _contact_friction,
     "contact_softness": _softness,
     "hysteresis": _scaled("torque", lambda e, c, j: 0.7 * c.torque[j]),
+    "place_friction": _scaled("torque", lambda e, c, j: 0.6 * c.torque[j]),
+    "warm_friction": _scaled("torque", lambda e, c, j: 0.7 * c.torque[j]),
+    "cubic_spring": _scaled(
+        "stiffness", lambda e, c, j: 12.0 * c.torque[j] / c.span[j] ** 3
+    ),
+    "one_way_damping": _scaled(
+        "damping", lambda e, c, j: 1.5 * c.torque[j] / max(c.speed[j], 1e-3)
+    ),
+    "bent_gain": lambda e, s, c: {
+        "bend": e.number("sign") * 0.5 * s / c.command[c.actuator(e.at)]
+    },
     "gain_drift": lambda e, s, c: {"drift": e.number("sign") * 0.6 * s},
     "coupling_spring": _scaled(
         "stiffness", lambda e, c, j: 4.0 * c.torque[j] / c.span[j]
@@ -240,6 +251,13 @@ FILLERS: dict[str, Filler] = {
     "contact_softness": lambda e, r, c: {"ratio": float(r.uniform(0.3, 1.0))},
     "hysteresis": _loop,
     "gain_drift": _sign,
+    "bent_gain": _sign,
+    "place_friction": lambda e, r, c: {
+        "waves": float(r.uniform(1.0, 3.0) * 2 * np.pi / c.span[c.joint(e.at)])
+    },
+    "warm_friction": lambda e, r, c: {
+        "distance": float(r.uniform(1.0, 3.0) * c.speed[c.joint(e.at)])
+    },
     "coupling_spring": _partner,
 }
 PRIVATE = ("sign", "kinetic_share", "ratio")

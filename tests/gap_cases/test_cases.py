@@ -1,24 +1,32 @@
 """The hidden effects are what they are called, and cases keep the contract."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
+from benchmarks.gap import graded
 from tests.gap_cases import CaseError, Effect, Stated, draw_case, make_case, settings
-from tests.gap_cases.commands import Deadband, Delayed, Dropped, Gain, Lag
-from tests.gap_cases.draw import CASE_KINDS, is_one_spring
-from tests.gap_cases.effects import KINDS, OUTSIDE
-from tests.gap_cases.gap import half_width, measure, slope
-from tests.gap_cases.logs import Log, Noise
+from tests.gap_cases.commands import Bent, Deadband, Delayed, Dropped, Gain, Lag
+from tests.gap_cases.draw import CASE_KINDS, _overlap, is_one_spring
+from tests.gap_cases.effects import KINDS, UNLISTED
+from tests.gap_cases.gap import activations, half_width, measure, slope
+from tests.gap_cases.logs import READINGS, Log, Noise, velocities_of
 from tests.gap_cases.mechanisms import GRAVITY, Joint, Mechanism
-from tests.gap_cases.places import places, twins
-from tests.gap_cases.robots import MECHANISMS, build
+from tests.gap_cases.places import kindred, places, twins
+from tests.gap_cases.robots import WIDE, build
 from tests.gap_cases.simulate import Plan, record
 from tests.gap_cases.strengths import SIZERS
-from tests.gap_cases.torques import BoucWen, LuGre, TwoMassDrive
+from tests.gap_cases.torques import (
+    BoucWen,
+    LuGre,
+    PlaceFriction,
+    TwoMassDrive,
+    WarmFriction,
+)
 from tests.gap_cases.truth import Truth, _servo, assemble, tilted
 
 FINE = 2.5e-4
@@ -174,6 +182,39 @@ def test_hysteresis_saturates_and_remembers() -> None:
     assert travel(0.5, 4000) == pytest.approx(-2.0, rel=1e-3)
     assert travel(0.0, 1000) == pytest.approx(-2.0, rel=1e-3)
     assert travel(-0.5, 4000) == pytest.approx(2.0, rel=1e-3)
+
+
+def test_laws_that_no_table_has() -> None:
+    """A spring that stiffens, damping one way, friction by place and by warmth."""
+    spring = assemble(carriage(), slider("cubic_spring", stiffness=5.0), FINE).pushes[0]
+    damper = slider("one_way_damping", damping=3.0)
+    data = mujoco.MjData(assemble(carriage(), [], FINE).model)
+    for position in (0.3, -0.6):
+        data.qpos[0], data.qfrc_applied[0] = position, 0.0
+        spring.apply(data)
+        assert data.qfrc_applied[0] == pytest.approx(-5.0 * position**3)
+    assert coast(damper, 1.0)[1] == pytest.approx(np.exp(-3.0 * 0.4 / MASS), rel=1e-3)
+    assert coast(damper, -1.0)[1] == pytest.approx(-1.0)
+    np.testing.assert_allclose(
+        passed(Bent(0, 0.5), np.array([-2.0, 0.0, 1.0])), [-4.0, 0.0, 1.5]
+    )
+
+    def force(friction: LuGre, position: float, speed: float = 0.5) -> float:
+        data.qpos[0], data.qvel[0] = position, speed
+        for _ in range(4000):
+            data.qfrc_applied[0] = 0.0
+            friction.apply(data)
+        return float(data.qfrc_applied[0])
+
+    by_place = PlaceFriction(0, 2.0, 3.0, MASS, FINE)
+    for position in (0.0, np.pi / 6, -np.pi / 6):
+        level = 2.0 * (1.0 + 0.9 * np.sin(3.0 * position))
+        assert force(by_place, position) == pytest.approx(-level, rel=1e-3)
+    warm = WarmFriction(0, 2.0, 0.25, MASS, FINE)  # 1 s of travel is two distances
+    level = 2.0 * (0.4 + 0.6 * np.exp(-2.0))
+    assert force(warm, 0.0) == pytest.approx(-level, rel=1e-2)
+    warm.reset(np.random.default_rng(0))
+    assert warm.travel == 0.0
 
 
 # A payload against a model that was compiled with the mass.
@@ -369,6 +410,25 @@ def test_encoder_noise_and_grain() -> None:
     assert spread == pytest.approx(float(noise.total[0]), rel=0.03)
 
 
+def test_late_and_filtered_velocities() -> None:
+    time = 0.01 * np.arange(400)
+    speed = np.sin(3.0 * time)[:, None]
+    still = np.zeros_like(speed)
+    log = Log(time, still, speed + 0.1, still, still, speed, still, still)
+    assert velocities_of(log, "positions", 0.0) is None
+    assert velocities_of(log, "velocities", 0.0) is log.qvel
+    late = velocities_of(log, "late velocities", 0.02)
+    assert late is not None
+    np.testing.assert_allclose(late[2:], speed[:-2] + 0.1, atol=1e-12)
+    filtered = velocities_of(log, "filtered velocities", 0.02)
+    assert filtered is not None
+    # First order: a sine comes smaller and later.
+    size, lag = 1 / np.hypot(1.0, 3.0 * 0.02), np.arctan(3.0 * 0.02) / 3.0
+    expected = size * np.sin(3.0 * (time - lag)) + 0.1
+    np.testing.assert_allclose(filtered[100:, 0], expected[100:], atol=0.02)
+    assert len(READINGS) == 4
+
+
 # The gap.
 
 
@@ -376,6 +436,28 @@ def test_velocity_of_a_quadratic_is_exact() -> None:
     assert [half_width(dt) for dt in (0.02, 0.01, 0.005)] == [2, 2, 4]
     time = 0.005 * np.arange(-4, 5)
     assert slope(3.0 + 2.0 * time + 5.0 * time**2, 0.005) == pytest.approx(2.0)
+
+
+def test_activations_are_what_mujoco_makes_of_commands() -> None:
+    machine = build("stand", np.random.default_rng(2), Stated())
+    text = machine.xml()
+    for joint in machine.joints:
+        gains = f'kp="{joint.kp:g}" kv="{joint.kv:g}"'
+        name = f'name="{joint.actuator}"'
+        assert f"<position {name}" in text and gains in text
+    joints = tuple(replace(j, filter=0.03) for j in machine.joints)
+    m = mujoco.MjModel.from_xml_string(replace(machine, joints=joints).xml())
+    assert m.na == m.nu == 12
+    sent = np.random.default_rng(0).normal(size=(20, 12))
+    data = mujoco.MjData(m)
+    data.act[:] = sent[0]
+    found = []
+    for row in sent:
+        found.append(data.act.copy())
+        data.ctrl[:] = row
+        mujoco.mj_step(m, data, nstep=3)
+    mine = activations(m, sent, 3 * m.opt.timestep)
+    np.testing.assert_allclose(mine, found, atol=1e-12)
 
 
 def test_gap_of_a_wrong_mass_has_its_closed_form() -> None:
@@ -492,7 +574,7 @@ def test_names_are_checked(tmp_path: Path) -> None:
         draw_case(0, "triple", tmp_path)
     with pytest.raises(CaseError, match="cannot be seen"):
         draw_case(0, "single", tmp_path, effect="contact_softness", mechanism="slide")
-    assert len(CASE_KINDS) == 7
+    assert len(CASE_KINDS) == 8
 
 
 def test_a_mixed_case_has_one_effect_that_no_table_has(tmp_path: Path) -> None:
@@ -505,14 +587,83 @@ def test_a_mixed_case_has_one_effect_that_no_table_has(tmp_path: Path) -> None:
 
 def test_every_effect_has_a_place_and_a_strength() -> None:
     stated = Stated(armature=True)
-    machines = [build(name, np.random.default_rng(0), stated) for name in MECHANISMS]
-    for effect in (*KINDS, *OUTSIDE):
+    machines = [build(name, np.random.default_rng(0), stated) for name in WIDE]
+    for effect in (*KINDS, *UNLISTED):
         assert effect in SIZERS
         assert any(places(machine, effect) for machine in machines)
     for machine in machines:
         model = mujoco.MjModel.from_xml_string(machine.xml())
         assert model.nq == len(machine.joints)
         assert model.nu == len(machine.driven)
+
+
+def test_like_joints_have_an_effect_alike() -> None:
+    machine = build("stand", np.random.default_rng(0), Stated())
+    tied = Effect("coulomb_friction", "*_calf", {"torque": 0.2})
+    late = Effect("actuator_delay", "*_hip_position", {"delay": 0.01})
+    truth = assemble(machine, [tied, late], FINE)
+    assert [push.at for push in truth.pushes] == [2, 5, 8, 11]
+    assert [stage.at for stage in truth.stages] == [0, 3, 6, 9]
+    one = Effect("coulomb_friction", "RL_calf")
+    assert _overlap(tied, one) and _overlap(one, tied) and not _overlap(tied, late)
+    more = Effect("drive_damping", "*_hip_position", {"factor": 1.4})
+    assert twins(machine, more) == ["viscous_damping@*_hip"]
+
+
+def test_effects_in_another_law() -> None:
+    spring = Effect("coupling_spring", "shoulder", {"other": "elbow"})
+    both = ["joint_stiffness@shoulder", "joint_stiffness@elbow"]
+    assert kindred(spring) == both
+    assert kindred(Effect("coulomb_friction", "a")) == ["stribeck_friction@a"]
+    assert kindred(Effect("actuator_delay", "a")) == []
+
+
+def test_what_is_right_of_a_name() -> None:
+    """By the contract: another law of what is there where it takes half of the gap, a
+    law that was found where one acts, late velocities besides."""
+    gap = {"before": 1.0, "refit": 1.0, "after": 0.1, "floor": 0.1}
+    hidden = {
+        **{"effect": "hysteresis", "at": "elbow", "kind": "outside"},
+        **{"twins": [], "kindred": ["coulomb_friction@elbow"], "parameters": {}},
+    }
+    answer = {
+        **{"kind": "outside", "mechanism": "arm2", "effects": [hidden]},
+        **{"verdicts": ["unexplained"], "setting": {}, "gap": {"floor": 0.1}},
+        **{"laws": ["elbow"], "readings": ["sensor_delay@qvel.elbow"]},
+    }
+
+    def named(effect: str, at: str, explains: float) -> dict:
+        return {
+            **{"effect": effect, "at": at, "explains": explains, "confidence": 0.5},
+            **{"removal_cost": 1.0, "removal_sure": 2.0, "rival_odds": 0.1},
+            **{"gap_after": 0.1, "outcome": "converged", "parameters": {}},
+            "indistinguishable": [],
+        }
+
+    for share, there in ((0.4, False), (0.6, True)):
+        effects = [
+            named("coulomb_friction", "elbow", share),
+            named("found_law", "elbow", 0.1),
+            named("found_law", "shoulder", 0.1),
+            named("viscous_damping", "elbow", 0.9),
+            named("sensor_delay", "qvel.elbow", 0.0),
+        ]
+        told = {"effects": effects, "verdict": "unexplained", "gap": gap}
+        row = graded(told | {"unexplained_share": 0.0}, answer)
+        assert row["there"] == [there, True, False, False] and row["right"]
+        assert row["readings"] == ["sensor_delay@qvel.elbow"]
+        assert len(row["named"]) == len(row["removal_sure"]) == 4
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("real", 0), ("single", 3)])
+def test_a_wide_case(kind: str, seed: int, tmp_path: Path) -> None:
+    case = draw_case(seed, kind, tmp_path, cheap=True, wide=True)
+    _, _, answer = read_case(tmp_path)
+    assert answer["setting"]["reading"] in READINGS and answer["gap"]["ratio"] > 3.0
+    outside = [e for e in answer["effects"] if e["kind"] == "outside"]
+    assert bool(outside) == bool(answer["laws"]) == (kind == "real")
+    late = case.reading in ("late velocities", "filtered velocities")
+    assert bool(answer["readings"]) == late
 
 
 def test_a_spring_and_what_moves_its_rest_are_one() -> None:

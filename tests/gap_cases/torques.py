@@ -82,6 +82,47 @@ class LuGre:
         return self.stiffness * self.bend + self.damping * change
 
 
+class PlaceFriction(LuGre):
+    """Coulomb's, whose level waves with the position by `share` of itself."""
+
+    def __init__(
+        self,
+        at: int,
+        torque: float,
+        waves: float,
+        inertia: float,
+        fine: float,
+        share: float = 0.9,
+    ) -> None:
+        super().__init__(at, torque, torque, 1.0, inertia, fine)
+        self.torque, self.waves, self.share = torque, waves, share
+
+    def apply(self, data: mujoco.MjData) -> None:
+        wave = math.sin(self.waves * float(data.qpos[self.at]))
+        self.static = self.kinetic = self.torque * (1.0 + self.share * wave)
+        super().apply(data)
+
+
+class WarmFriction(LuGre):
+    """Coulomb's, which falls to two fifths over a travel of `distance`."""
+
+    def __init__(
+        self, at: int, torque: float, distance: float, inertia: float, fine: float
+    ) -> None:
+        super().__init__(at, torque, torque, 1.0, inertia, fine)
+        self.torque, self.distance, self.travel = torque, distance, 0.0
+
+    def reset(self, rng: np.random.Generator) -> None:
+        super().reset(rng)
+        self.travel = 0.0
+
+    def apply(self, data: mujoco.MjData) -> None:
+        self.travel += self.fine * abs(float(data.qvel[self.at]))
+        cold = math.exp(-self.travel / self.distance)
+        self.static = self.kinetic = self.torque * (0.4 + 0.6 * cold)
+        super().apply(data)
+
+
 class BoucWen:
     """Hysteresis: a torque with memory that saturates beyond `width` of travel."""
 

@@ -16,6 +16,7 @@ STAGE_ORDER = (
     "actuator_deadband",
     "actuator_gain",
     "gain_drift",
+    "bent_gain",
     "actuator_lag",
 )
 
@@ -155,19 +156,32 @@ def _push(truth: Truth, effect: Effect, inertia: np.ndarray) -> torques.Push | N
         kinetic = static if plain else number("kinetic")
         velocity = 1.0 if plain else number("velocity")
         return torques.LuGre(at, static, kinetic, velocity, inertia[at], fine)
+    if effect.name == "place_friction":
+        waves = number("waves")
+        given = at, number("torque"), waves, inertia[at], fine
+        return torques.PlaceFriction(*given)
+    if effect.name == "warm_friction":
+        given = at, number("torque"), number("distance"), inertia[at], fine
+        return torques.WarmFriction(*given)
     if effect.name == "hysteresis":
         return torques.BoucWen(at, number("torque"), number("width"), fine)
     if effect.name == "coupling_spring":
         other = joints.index(str(effect.parameters["other"]))
         rest = truth.mechanism.joints[at].home - truth.mechanism.joints[other].home
         return torques.Coupling(at, other, number("stiffness"), rest)
-    law = _law(effect)
+    law = _law(effect, truth.mechanism.joints[at].home)
     return torques.Law(at, law) if law else None
 
 
-def _law(effect: Effect) -> Callable[[float, float], float] | None:
+def _law(effect: Effect, home: float) -> Callable[[float, float], float] | None:
     """Torque as a function of position and speed."""
     number = effect.number
+    if effect.name == "cubic_spring":
+        stiffness = number("stiffness")
+        return lambda q, v: -stiffness * (q - home) ** 3
+    if effect.name == "one_way_damping":
+        damping = number("damping")
+        return lambda q, v: -damping * max(v, 0.0)
     if effect.name == "viscous_damping":
         damping = number("damping")
         return lambda q, v: -damping * v
@@ -201,6 +215,8 @@ def _stage(truth: Truth, effect: Effect, duration: float) -> commands.Stage | No
         return commands.Deadband(at, number("width"), subtractive)
     if effect.name == "actuator_gain":
         return commands.Gain(at, number("gain"))
+    if effect.name == "bent_gain":
+        return commands.Bent(at, number("bend"))
     if effect.name == "gain_drift":
         return commands.Gain(at, 1.0, number("drift"), duration)
     return commands.Lag(at, number("time_constant"), truth.fine)
@@ -229,9 +245,9 @@ def nearest(
     """
     truth = Truth(mechanism, _with_own(mechanism, own))
     model = truth.model
-    for effect in effects:
+    for effect in apart(mechanism, effects):
         _change_model(truth, effect)
-        if effect.name == "coulomb_friction":
+        if effect.name in ("coulomb_friction", "place_friction", "warm_friction"):
             at = model.joint(effect.at).id
             model.dof_frictionloss[at] += effect.number("torque")
         elif effect.name == "stribeck_friction":
@@ -247,6 +263,13 @@ def nearest(
     return model
 
 
+def apart(mechanism: Mechanism, effects: Sequence[Effect]) -> list[Effect]:
+    """The effects, those of a pattern at each of its places."""
+    joints = mechanism.joints
+    names = [n for j in joints for n in (j.name, j.body, j.actuator) if n]
+    return [one for effect in effects for one in effect.apart(names)]
+
+
 def assemble(
     mechanism: Mechanism,
     effects: Sequence[Effect],
@@ -259,6 +282,7 @@ def assemble(
     `own` maps addresses such as `joint.hinge.damping` to true values of what the model
     states; `duration` is the time over which a gain drifts, s.
     """
+    effects = apart(mechanism, effects)
     model = _with_own(mechanism, own or {})
     model.opt.timestep = fine
     truth = Truth(

@@ -111,6 +111,8 @@ def test_gap_json_holds_every_key_of_the_format() -> None:
         "confidence": 0.9,
         "explains": pytest.approx((0.2**2 - 0.1**2) / (0.2**2 - 0.1**2)),
         "removal_cost": 0.7,
+        "removal_sure": None,
+        "rival_odds": None,
         "outcome": "converged",
         "indistinguishable": ("viscous_damping@rad",),
         "gap_after": 0.1,

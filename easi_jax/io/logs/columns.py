@@ -1,5 +1,6 @@
 """The columns that a model gives a log, and their check."""
 
+import difflib
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -214,10 +215,10 @@ def check_columns(
         more = f" (also missing: {others}" if others else ""
         if more and len(missing) > _LISTED:
             more += f" and {len(missing) - _LISTED} more"
-        near = nearest(missing[0], strangers)
-        lost = "" if near else _undetermined(model, columns, missing)
-        if near:
-            theirs = near.split('"')[1]
+        theirs = _nearest(missing[0], strangers)
+        near, lost = "", "" if theirs else _undetermined(model, columns, missing)
+        if theirs:
+            near = f'; did you mean "{theirs}"?'
             near += f" ({cure(f'columns: {{{theirs}: {missing[0]}}}')} renames it)"
         elif strangers:
             shown = " ".join(", ".join(strangers[:_LISTED]).split())
@@ -253,6 +254,15 @@ def check_columns(
                 "give all velocities of a joint or none"
             )
     return ignored
+
+
+def _nearest(column: str, strangers: Sequence[str]) -> str:
+    """Which of a file's columns is named most like one that is missing, what all such
+    columns begin with aside; empty where none is."""
+    kind, dot, name = column.partition(".")
+    by_name = {s.removeprefix(kind + dot) if dot else s: s for s in strangers}
+    found = difflib.get_close_matches(name or kind, list(by_name), n=1, cutoff=0.5)
+    return by_name[found[0]] if found else ""
 
 
 def _undetermined(

@@ -104,6 +104,8 @@ def _effect_json(r: GapResult, e: NamedEffect) -> Iterator[dict[str, Any]]:
             "confidence": e.confidence,
             "explains": r.share(before, gap),
             "removal_cost": e.cost,
+            "removal_sure": e.sure,
+            "rival_odds": e.odds,
             "outcome": e.outcome,
             "indistinguishable": e.indistinguishable,
             "gap_after": gap,

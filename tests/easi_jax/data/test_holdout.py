@@ -91,6 +91,12 @@ def test_a_run_with_no_room_for_a_prediction_is_refused():
         split_held_out(SLIDE, [make_run(np.zeros(86))], 0.2)
 
 
+def test_a_log_in_many_short_runs_says_so():
+    runs = [make_run(np.zeros(2), f"r{i}") for i in range(250)]
+    with pytest.raises(UserError, match=r"2 rows .* the longest of 250 runs, are too"):
+        split_held_out(SLIDE, runs, 0.2)
+
+
 @pytest.mark.parametrize(
     "rows", [(1990, 9), (10, 1989), (1900, 100), (1985, 15), (800, 200), (950, 30, 20)]
 )

@@ -296,3 +296,29 @@ def test_the_floor_meets_the_wrong_minima_that_readings_lead_to() -> None:
     got = (errors[:, ROWS:] ** 2).mean()
     drawn = floor(starts, np.zeros(1), moved, 20, np.zeros(1), np.random.default_rng(0))
     assert np.sqrt(got / drawn[:, ROWS:].mean()) == pytest.approx(1.0, abs=0.12)
+
+
+def test_a_start_in_the_minimum_of_another_model_is_left() -> None:
+    """Of a mirrored path, whose other branch an earlier model's start is on."""
+    rng, t = np.random.default_rng(3), DT * np.arange(T)[:, None]
+
+    def mirrored(start: np.ndarray) -> np.ndarray:
+        q = start[..., :1, None] + start[..., 1:, None] * t
+        return np.abs(q) + 0.02 * q
+
+    true = np.stack([rng.uniform(0.2, 0.4, W), rng.uniform(0.0, 0.5, W)], 1)
+    read = mirrored(true) + NOISE * rng.normal(size=(W, T, 1))
+    guess = true + np.array([2e-3, 0.05]) * rng.normal(size=true.shape)
+    wide = np.array([1.0, 1.0])
+    starts = Starts(
+        lambda x, moved: mirrored(guess + moved) - read,
+        *(NOISE, wide, ROWS, 1e-3 * wide, 0.1 * wide, 0.1 * wide),
+    )
+    x, other = np.zeros(1), -2.0 * guess
+    other[::2] = 0.01  # near enough, and kept
+    moved, errors = starts.solve(x, other)
+    right = (np.abs(guess + moved - true) < 0.1).all(1)
+    assert right.mean() > 0.98
+    assert np.sqrt((errors[right] ** 2).mean()) == pytest.approx(NOISE[0], rel=0.1)
+    (stuck,), _ = starts.fit(x[None], other[None])
+    assert ((guess + stuck)[1::2, 0] < 0).all()

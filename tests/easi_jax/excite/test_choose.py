@@ -1,8 +1,11 @@
 """What a test is chosen for."""
 
+import mujoco
 import numpy as np
+import pytest
 
-from easi_jax.excite.choose import effects_wanted, less_named
+from easi_jax.errors import UserError
+from easi_jax.excite.choose import check_excitable, effects_wanted, less_named
 from easi_jax.gap.candidates import places
 from easi_jax.model.effect_catalog import Scales
 from easi_jax.model.parameter_proposal import own_space
@@ -26,3 +29,12 @@ def test_a_named_effect_is_no_parameter_of_the_model() -> None:
     less = less_named(own, named, m)
     assert set(own.names) - set(less.names) == {"joint.cart.frictionloss"}
     assert key in [p.key for p in effects_wanted(m, less, scales, ())]
+
+
+def test_a_body_that_only_flies_is_refused() -> None:
+    m = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='0.1'/></body></worldbody>"
+        "</mujoco>"
+    )
+    with pytest.raises(UserError, match="no hinge or slide joint"):
+        check_excitable(m)

@@ -87,6 +87,24 @@ def test_fits_see_the_same_windows_whatever_the_horizon() -> None:
     assert [steps - 5 for steps, _ in seen[0]] == [10, 20, 100]
 
 
+def test_lengths_in_which_nothing_moves_are_left_out() -> None:
+    """A slow motion shows in windows of 0.2 s, and in none of 0.05 s."""
+    m = mujoco.MjModel.from_xml_string(MODEL.format(more=""))
+    time, c, noise = np.arange(1500) * 0.005, Configuration.of(m), 2e-3
+    runs = []
+    for k in (0, 1):
+        rng = np.random.default_rng(k)
+        q = 0.5 * np.sin(2 * np.pi * 0.06 * time + k)[:, None]
+        read = q + noise * rng.normal(size=q.shape)
+        v = fitted_velocity(read, 0.005, c)
+        runs.append(Run(str(k), "made", 0.005, time, read, v, False, 0 * q, c))
+    given = m, ParameterSpace(()), runs[:1], runs[1:], np.array([noise]), 0.2
+    with engine.using("mujoco"):
+        search = Analysis(*given).search
+    assert [round(f.steps * 0.005, 2) for f in search.lengths] == [0.23, 1.03]
+    assert search.settles == 0
+
+
 @pytest.mark.slow
 def test_what_is_named_does_not_depend_on_the_horizon(
     analysed: Callable[[float], Outcome],

@@ -32,6 +32,7 @@ from easi_jax.gap.model_comparison import (
     advantage,
     are_twins,
     better,
+    certainty,
     confidence,
     cost,
     probability,
@@ -597,6 +598,16 @@ def test_twins_predict_the_same() -> None:
         # A limit acts in few windows, and is no twin of what does nothing there.
         moved[2] += 1.0
         assert not are_twins(one, other, led)
+
+
+def test_certainty_is_in_standard_errors_between_blocks() -> None:
+    """Of logarithms, so that a block with most of the error counts like the others."""
+    loss = np.array([1.0, 2.0, 100.0, 5.0])
+    times = np.exp([0.1, 0.2, 0.3, 0.4])
+    model, less = of_loss(loss), of_loss(loss * times)
+    of_the_mean = np.std([0.1, 0.2, 0.3, 0.4], ddof=1) / 2
+    assert certainty(model, less) == pytest.approx(0.25 / of_the_mean)
+    assert certainty(less, model) == pytest.approx(-0.25 / of_the_mean)
 
 
 def test_the_cost_is_what_is_open_without_an_effect_by_what_is_open_with_it() -> None:

@@ -83,6 +83,27 @@ def test_a_tied_number_moves_all_of_its_places(offered: dict[str, Place]) -> Non
     np.testing.assert_allclose(late, [0.0, 0.01, 0.0, 0.01], atol=1e-7)
 
 
+def test_drives_that_are_all_alike_are_tied() -> None:
+    """Two wheels; what all actuators have alike by itself is offered once."""
+    wheel = """<body pos="0 {y} 1"><joint name="{n}_wheel" axis="0 1 0" {range}/>
+    <geom size="0.1" mass="0.5"/></body>"""
+    bodies = wheel.format(n="left", y=1, range='range="-70 10"')
+    bodies += wheel.format(n="right", y=-1, range='range="-10 70"')
+    drives = "".join(
+        f'<motor name="{n}_motor" joint="{n}_wheel"/>' for n in ("left", "right")
+    )
+    m = mujoco.MjModel.from_xml_string(
+        f'<mujoco><compiler autolimits="true"/><worldbody>{bodies}</worldbody>'
+        f"<actuator>{drives}</actuator></mujoco>"
+    )
+    found = {p.key: p for p in places(m, scales_of(m, [recorded_of(m, 0)]))}
+    assert found["actuator_gain@*_motor"].tied == ("left_motor", "right_motor")
+    assert "actuator_delay@*_motor" not in found and "actuator_delay@" in found
+    spring = found["joint_stiffness@*_wheel"]
+    np.testing.assert_allclose(np.rad2deg(spring.rests), [-10.0, 10.0])
+    assert not spring.possible(np.array([2.0, -0.5 * 2.0]))
+
+
 def test_what_the_refit_does_at_one_place_is_not_offered_at_all(
     offered: dict[str, Place],
 ) -> None:

@@ -131,6 +131,25 @@ def test_a_leg_of_its_own_is_not_tied() -> None:
     assert "joint.*_calf_joint.damping" in found
 
 
+def test_drives_of_another_kind_are_not_tied() -> None:
+    """A filter before one of two muscles."""
+    kinds = (
+        '<motor name="pull_a" joint="a"/><motor name="pull_b" joint="b"/>',
+        '<motor name="pull_a" joint="a"/><general name="pull_b" joint="b" '
+        'dyntype="filter" dynprm="0.02"/>',
+    )
+    like, unlike = (
+        addresses(
+            f"""<mujoco><worldbody><body><joint name="a"/>{LINK}</body>
+            <body pos="1 0 0"><joint name="b"/>{LINK}</body></worldbody>
+            <actuator>{drives}</actuator></mujoco>"""
+        )
+        for drives in kinds
+    )
+    assert [a for a in like if a == "actuator.pull_*.gain"]
+    assert {"actuator.pull_a.gain", "actuator.pull_b.gain"} <= {*unlike}
+
+
 def test_what_moves_nothing_is_left_out() -> None:
     """A body of a milligram, a base that is fixed, a drive without gear."""
     assert "body.frame.mass" not in addresses(MODELS["tiny body"])

@@ -187,6 +187,15 @@ def test_missing_column_is_named_with_the_nearest(tmp_path, cart, extension):
     assert 'did you mean "qpos.pol"?' in text
 
 
+def test_the_log_of_another_robot_is_offered_no_column_by_chance(tmp_path, cart):
+    """What all columns of positions begin with makes none alike."""
+    columns = cart_columns()
+    for mine, other in (("slider", "drone.6"), ("pole", "drone.5")):
+        columns[f"qpos.{other}"] = columns.pop(f"qpos.{mine}")
+    text = failure(save(tmp_path / "a.csv", columns), cart)
+    assert "did you mean" not in text and "drone.6" in text
+
+
 def test_all_missing_columns_are_named(tmp_path, cart):
     text = failure(save(tmp_path / "a.csv", {"time": np.arange(3)}), cart)
     for name in ("qpos.slider", "qpos.pole", "ctrl.drive"):
