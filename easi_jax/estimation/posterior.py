@@ -16,7 +16,7 @@ from easi_jax.errors import UserError
 from easi_jax.estimation import limits
 from easi_jax.estimation.blocks import scattered
 from easi_jax.estimation.doubts import Doubts, followed, without
-from easi_jax.estimation.least_squares import inverted
+from easi_jax.estimation.least_squares import inverted, raised_to_range
 from easi_jax.estimation.levenberg_marquardt import RefineResult, refine
 from easi_jax.estimation.normal_equations import RESOLVED, PairedFit
 from easi_jax.estimation.pieces import effective_noise, finish_pieces, finish_rest
@@ -135,7 +135,9 @@ def estimate(
     whole = replace(paired, segments=pieces, start=fit.start)
     starts = fit.delta if rest is None else None
     ends = {"adjusted": adjusted, "doubts": doubts, "starts": starts}
-    more = polished(whole, fit.fit, cov, informed, **ends)
+    # What is as good as zero without doubts need not be with them: there is no slope.
+    at = fit.fit if doubts is None else raised_to_range(paired.space, fit.fit)
+    more = polished(whole, at, cov, informed, **ends)
     return replace(more, simulated=fit.simulated + more.simulated)
 
 
