@@ -112,7 +112,7 @@ class LawSearch:
     def _known(self) -> np.ndarray:
         """What the model was fitted by, ``(W m, a)``, each of unit size."""
         slope = self._root[..., None] * self.model.fit.slope
-        flat = slope.reshape(-1, slope.shape[-1])
+        flat = slope.reshape(self._left.size, slope.shape[-1])
         size = np.linalg.norm(flat, axis=0)
         return flat[:, size > 0] / size[size > 0]
 
@@ -157,7 +157,7 @@ class LawSearch:
         window, ``(blocks,)``."""
         known = np.concatenate([self._known, columns.T], 1)
         windows = len(self.at.windows)
-        x = known.reshape(windows, -1, known.shape[1])
+        x = known.reshape(windows, len(known) // windows, known.shape[1])
         r = self._left.reshape(windows, -1)
         group = self.at.selector.group
         names = np.unique(group)

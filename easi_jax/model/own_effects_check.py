@@ -22,6 +22,7 @@ from easi_jax.errors import UserError, nearest, source_of, told_by_line
 from easi_jax.model import effects
 from easi_jax.model.effect_numbers import NUMBERS
 from easi_jax.model.effects import Effects
+from easi_jax.model.found_laws import law_of
 from easi_jax.model.own_laws import Law
 
 _MOST_SECONDS = 1.0  # of one call as Python, or of all calls compiled
@@ -32,14 +33,16 @@ _SIZES = 0.3, 0.7  # of the range of each number, where a law is tried
 
 
 def check_own_effects(m: mujoco.MjModel, names: Sequence[str] | None = None) -> None:
-    """Refuses effects that are registered, or those of some ``names``.
+    """Refuses effects of the owner's that are registered, or those of some ``names``.
+
+    Laws that were found in data may be of another machine; `check_law` checks them.
 
     Raises:
         UserError: what is wrong with one of them, where in its file, what to do.
     """
     e = effects.none(m)
     for law in e.laws:
-        if names is None or law.name in names:
+        if law_of(law.name) is None if names is None else law.name in names:
             _check(m, e, law)
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from easi_jax.data.recording import Run
 from easi_jax.data.windows import fitted_velocity
+from easi_jax.gap import fitting
 from easi_jax.gap.analysis import Analysis, proposed_laws
 from easi_jax.gap.effect_search import Places
 from easi_jax.gap.offered_terms import offered
@@ -18,6 +19,7 @@ from easi_jax.model.found_laws import FOUND_LAW, FoundLaw, add_law, public_name
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.law_terms import Term
 from easi_jax.model.own_effects import registered
+from easi_jax.model.own_effects_check import check_own_effects
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation import engine
 
@@ -113,6 +115,25 @@ def test_laws_of_an_earlier_analysis_are_not_offered() -> None:
         given = a.m, a.space, a.data.scales
         assert not [p for p in Places(*given).known if p.startswith(name)]
         assert f"{name}@j" in Places(*given, only=[f"{name}@j"]).known
+
+
+def test_a_law_is_looked_for_where_nothing_was_fitted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """No effect, no parameter, and steps whose error does not show."""
+    monkeypatch.setattr(fitting, "STEPS_SEEN", np.inf)
+    with engine.using("mujoco"):
+        a = analysis(lambda d: 0.05 * np.abs(d.qvel))
+        model = a._chosen().model
+        assert not len(model.fit.active)
+        (law, *_) = proposed_laws(a, model)
+    assert law.law.terms[0].text == "abs(qvel.j)"
+
+
+def test_laws_of_another_machine_are_not_tried_on_this_one() -> None:
+    """As where one process has looked at both."""
+    add_law(FoundLaw((("elbow", 1.0),), (Term("qvel.elbow**0.3"),)))
+    check_own_effects(mujoco.MjModel.from_xml_string(ONE))
 
 
 def test_what_is_offered_between_joints() -> None:
