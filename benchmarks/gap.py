@@ -8,6 +8,7 @@ cases that are there already are left out, so a run that was stopped goes on.
 """
 
 import dataclasses
+import itertools
 import json
 import tempfile
 import time
@@ -125,8 +126,9 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
     first names have to be the truth's, in any order (``found``). ``listed``: what is
     among the names that the held-out data do not tell from one of those. ``there``: of
     each name whether that acts at this place; an effect in another law does, where it
-    takes half of the gap, and so does a law that was found where one acts that no table
-    has. Velocities that are late or filtered are named besides, rightly.
+    takes half of the gap, or of what was left of it before it joined, and so does a law
+    that was found where one acts that no table has. Velocities that are late or
+    filtered are named besides, rightly.
     """
     known = [e for e in answer["effects"] if e["kind"] != "outside"]
     truth = dict(zip(keys_of(known), (set(e["twins"]) for e in known), strict=True))
@@ -153,7 +155,10 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
         "mechanism": answer["mechanism"],
         "truth": list(truth),
         "named": named,
-        "there": [_there(e, n, answer) for e, n in zip(effects, named, strict=True)],
+        "there": [
+            _there(e, n, answer, part)
+            for e, n, part in zip(effects, named, _taken(told, effects), strict=True)
+        ],
         "readings": sorted(faults & {*keys_of(told["effects"])}),
         "setting": answer["setting"],
         "confidence": [e["confidence"] for e in effects],
@@ -178,11 +183,24 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _there(effect: dict[str, Any], name: str, answer: dict[str, Any]) -> bool:
-    """Whether a named effect acts at its place."""
+def _taken(told: dict[str, Any], effects: list[dict[str, Any]]) -> list[float]:
+    """What share each effect takes of what is left of the squared gap before it."""
+    gap = told["gap"]
+    path = [gap["refit"], *(e["gap_after"] for e in effects)]
+    left = [max(x**2 - gap["floor"] ** 2, 0.0) for x in path]
+    return [
+        1.0 - after / before if before > 0 else 0.0
+        for before, after in itertools.pairwise(left)
+    ]
+
+
+def _there(
+    effect: dict[str, Any], name: str, answer: dict[str, Any], taken: float
+) -> bool:
+    """Whether a named effect acts at its place; it takes a share of what is left."""
     if effect["effect"] == "found_law":
         return effect["at"] in answer.get("laws", ())
-    half = (effect["explains"] or 0.0) >= _HALF
+    half = max(effect["explains"] or 0.0, taken) >= _HALF
     return any(
         name in {key, *e["twins"]} or (half and name in e.get("kindred", ()))
         for key, e in zip(keys_of(answer["effects"]), answer["effects"], strict=True)

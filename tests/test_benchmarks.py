@@ -77,6 +77,7 @@ def case(
         "named": named,
         "confidence": [sure] * len(named),
         "verdict": "explained",
+        "verdicts": ["explained"] if truth else ["no_gap"],
         "found": {k: k in named[: len(truth)] for k in truth},
         "listed": {k: k == listed for k in truth},
         "right": right,
@@ -95,7 +96,9 @@ def test_cases_of_the_gap_are_counted() -> None:
     assert not gap_score.told(case("pair", ["a@x", "b@x"], ["a@x"], 1.0))
     assert gap_score.told(case("pair", ["a@x", "b@x"], ["a@x"], 1.0, listed="b@x"))
     got = gap_score.shares(rows)
-    assert got["right name and place first"] == (2, 3)
+    assert got["right name and place first"] == (1, 3)
+    assert got["the same, or listed as alike"] == (2, 3)
+    assert got["verdict right"] == (4, 6)
     assert got["false alarms without effect"] == (1, 2)
     assert got["wrong with confidence above 0.8"] == (1, 6)
     assert got["pairs both found"] == (1, 1)

@@ -632,17 +632,18 @@ def test_what_is_right_of_a_name() -> None:
         **{"laws": ["elbow"], "readings": ["sensor_delay@qvel.elbow"]},
     }
 
-    def named(effect: str, at: str, explains: float) -> dict:
+    def named(effect: str, at: str, explains: float, after: float = 0.5) -> dict:
         return {
             **{"effect": effect, "at": at, "explains": explains, "confidence": 0.5},
             **{"removal_cost": 1.0, "removal_sure": 2.0, "rival_odds": 0.1},
-            **{"gap_after": 0.1, "outcome": "converged", "parameters": {}},
+            **{"gap_after": after, "outcome": "converged", "parameters": {}},
             "indistinguishable": [],
         }
 
-    for share, there in ((0.4, False), (0.6, True)):
+    cases = (0.4, 0.8, False), (0.6, 0.6, True), (0.3, 0.5, True)
+    for share, after, there in cases:
         effects = [
-            named("coulomb_friction", "elbow", share),
+            named("coulomb_friction", "elbow", share, after),
             named("found_law", "elbow", 0.1),
             named("found_law", "shoulder", 0.1),
             named("viscous_damping", "elbow", 0.9),
