@@ -27,6 +27,7 @@ from easi_jax.model.joint_space import (
 )
 
 _JOINT_EQUALITY = int(mujoco.mjtEq.mjEQ_JOINT)
+_TENDON_EQUALITY = int(mujoco.mjtEq.mjEQ_TENDON)
 # Half the travel of a joint, by its range or by its spring under twice the weight, up
 # to which it is play or compliance of the joint beside it and no joint of its own.
 _PLAY = {"rad": 0.15, "m": 0.01}
@@ -51,10 +52,10 @@ def joint_dofs(m: mujoco.MjModel, joints: Collection[int]) -> np.ndarray:
 def placed_by_model(m: mujoco.MjModel, measured: Collection[int]) -> dict[int, str]:
     """Hinges and slides that the model itself places, given the ``measured`` joints.
 
-    Those are joints that an active equality couples to a measured one or holds at a
-    number, and play: a joint without an actuator beside a measured one (same body, next
-    body up or down the chain), with a small range or a stiff spring. A joint that was
-    placed places others.
+    Those are joints that an active equality couples to measured ones, also by fixed
+    tendons, or holds at a number, and play: a joint without an actuator beside a
+    measured one (same body, next body up or down the chain), with a small range or a
+    stiff spring. A joint that was placed places others.
 
     Returns:
         What places each, in words.
@@ -72,7 +73,14 @@ def placed_by_model(m: mujoco.MjModel, measured: Collection[int]) -> dict[int, s
 def _placed(m: mujoco.MjModel, j: int, known: Collection[int]) -> str:
     """What places joint ``j`` where ``known`` joints are given, or ``""``."""
     for e in range(m.neq):
-        if int(m.eq_type[e]) != _JOINT_EQUALITY or not m.eq_active0[e]:
+        if not m.eq_active0[e]:
+            continue
+        if int(m.eq_type[e]) == _TENDON_EQUALITY:
+            others = _beside_in_tendons(m, e, j)
+            if others is not None and others <= {*known}:
+                names = ", ".join(given_name(m, k) for k in sorted(others))
+                return f"coupled to {names}" if names else "held by an equality"
+        if int(m.eq_type[e]) != _JOINT_EQUALITY:
             continue
         first, second = int(m.eq_obj1id[e]), int(m.eq_obj2id[e])
         if j == first and second < 0:
@@ -87,6 +95,21 @@ def _placed(m: mujoco.MjModel, j: int, known: Collection[int]) -> str:
         return ""
     beside = next((k for k in known if _beside(m, j, k)), None)
     return "" if beside is None else f"play beside {given_name(m, beside)}"
+
+
+def _beside_in_tendons(m: mujoco.MjModel, e: int, j: int) -> set[int] | None:
+    """Other joints of the fixed tendons that equality ``e`` couples, or holds; None
+    where it says nothing of joint ``j``."""
+    told: dict[int, bool] = {}  # joints, and whether the equality tells where they are
+    for at, t in enumerate((int(m.eq_obj1id[e]), int(m.eq_obj2id[e]))):
+        first = m.tendon_adr[t]
+        for w in range(first, first + m.tendon_num[t]) if t >= 0 else ():
+            if m.wrap_type[w] != mujoco.mjtWrap.mjWRAP_JOINT:
+                return None
+            # A polynomial in the second without a linear term tells nothing of it.
+            tells = m.wrap_prm[w] != 0 and (at == 0 or m.eq_data[e, 1] != 0)
+            told[int(m.wrap_objid[w])] = bool(tells)
+    return {*told} - {j} if told.get(j) else None
 
 
 def is_play(m: mujoco.MjModel, j: int) -> bool:

@@ -58,6 +58,14 @@ def equality(inside: str, active: bool = True) -> str:
     return f'<equality><joint active="{on}" {inside}/></equality>'
 
 
+def tendons(second: str = "", inside: str = 'tendon1="t"', own: str = "1") -> str:
+    """Fixed tendons, of which an equality says something."""
+    made = '<fixed name="t"><joint joint="drive" coef="2"/>'
+    made += f'<joint joint="other" coef="{own}"/></fixed>'
+    return f"<tendon>{made}{second}</tendon><equality><tendon {inside}/></equality>"
+
+
+ALONE = '<fixed name="u"><joint joint="{}" coef="1"/></fixed>'
 PLAY = '<joint name="other" axis="0 1 0" range="-.04 .04" limited="true"/>'
 
 
@@ -84,6 +92,25 @@ PLAY = '<joint name="other" axis="0 1 0" range="-.04 .04" limited="true"/>'
         ({"rest": equality('joint1="other" joint2="drive"', active=False)}, ""),
         (
             {"rest": equality('joint1="drive" joint2="other" polycoef="0 0 1 0 0"')},
+            "",
+        ),
+        ({"rest": tendons()}, "coupled to drive"),
+        ({"rest": tendons(ALONE.format("drive"), 'tendon1="u"')}, ""),
+        (
+            {"rest": tendons(ALONE.format("other"), 'tendon1="u"')},
+            "held by an equality",
+        ),
+        (
+            {"rest": tendons(ALONE.format("drive"), 'tendon1="u" tendon2="t"')},
+            "coupled to drive",
+        ),
+        (
+            {
+                "rest": tendons(
+                    ALONE.format("drive"),
+                    'tendon1="u" tendon2="t" polycoef="0 0 1 0 0"',
+                )
+            },
             "",
         ),
         # No chain leads from the measured joint to this one.
