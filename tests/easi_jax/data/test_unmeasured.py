@@ -95,7 +95,6 @@ PLAY = '<joint name="other" axis="0 1 0" range="-.04 .04" limited="true"/>'
             "",
         ),
         ({"rest": tendons()}, "coupled to drive"),
-        ({"rest": tendons(ALONE.format("drive"), 'tendon1="u"')}, ""),
         (
             {"rest": tendons(ALONE.format("other"), 'tendon1="u"')},
             "held by an equality",
