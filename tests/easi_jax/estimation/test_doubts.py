@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from easi_jax.data.recording import Run
 from easi_jax.data.scales import scales_of
 from easi_jax.data.segments import Segments, cut, join, to_device
 from easi_jax.errors import UserError
+from easi_jax.estimation import posterior
 from easi_jax.estimation.doubts import (
     LAG,
     LATE,
@@ -26,7 +28,7 @@ from easi_jax.estimation.doubts import (
 )
 from easi_jax.estimation.levenberg_marquardt import RefineResult
 from easi_jax.estimation.normal_equations import PairedFit
-from easi_jax.estimation.posterior import Estimate, no_region, polished
+from easi_jax.estimation.posterior import Estimate, estimate, no_region, polished
 from easi_jax.model.distribution import covariance
 from easi_jax.model.joint_space import Configuration
 from easi_jax.model.parameters import ParameterSpace, declare
@@ -167,6 +169,31 @@ def test_values_hold_where_commands_come_late(doubts: Doubts) -> None:
     spreads = [np.sqrt(np.diag(covariance(x.distribution))) for x in (alone, marginal)]
     assert off(marginal, marginal) < 3.0 and (spreads[1] < 3.0 * spreads[0]).all()
     assert not list(told(doubts.parameters, np.asarray(marginal.doubts), 0.002))
+
+
+def test_what_is_as_good_as_zero_without_doubts_need_not_be_with_them(
+    doubts: Doubts, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There the logarithm has no slope, so that a fit with doubts begins above it."""
+    simulator = doubts.simulator
+    m, space = simulator.mj_model, _space(simulator.mj_model)
+    plain = Simulator(m, space, _DT, engine="mujoco")
+    truth = space.to_unit(jnp.asarray(space.nominal))
+    late, _ = _recorded(m, 2, simulator.past_steps, 0)
+    given = PairedFit(plain, space, late, jnp.asarray(_NOISE, jnp.float32))
+    at = list(_PLACES).index("damping")
+    mean = truth.at[at].set(-16.0)
+    begun = posterior.begun
+
+    def lost(*given: Any, **more: Any) -> Estimate:
+        return replace(begun(*given, **more), fit=mean)
+
+    monkeypatch.setattr(posterior, "begun", lost)
+    fit = jax.jit(lambda m: estimate(given, m, 0.01 * jnp.eye(3), True, doubts=doubts))
+    found = fit(truth)
+    std = np.sqrt(np.diag(covariance(found.distribution)))
+    assert (np.abs(found.distribution.mean - truth) < 3.0 * std).all()
+    assert std[at] < 0.3
 
 
 def test_what_is_in_doubt_where_something_is_missing() -> None:
