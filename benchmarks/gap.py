@@ -133,12 +133,10 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
     known = [e for e in answer["effects"] if e["kind"] != "outside"]
     truth = dict(zip(keys_of(known), (set(e["twins"]) for e in known), strict=True))
     outside = answer["kind"] == "outside"
-    faults = set(answer.get("readings", ()))
-    effects = [
-        e
-        for k, e in zip(keys_of(told["effects"]), told["effects"], strict=True)
-        if k not in faults
-    ]
+    keys = keys_of(told["effects"])
+    readings = sorted({*keys} & {*answer["readings"]})
+    every = zip(keys, told["effects"], strict=True)
+    effects = [e for k, e in every if k not in readings]
     named = keys_of(effects)
     first = named[: max(1, len(truth))]
     found = {
@@ -159,7 +157,7 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
             _there(e, n, answer, part)
             for e, n, part in zip(effects, named, _taken(told, effects), strict=True)
         ],
-        "readings": sorted(faults & {*keys_of(told["effects"])}),
+        "readings": readings,
         "setting": answer["setting"],
         "confidence": [e["confidence"] for e in effects],
         **{k: [e[k] for e in effects] for k in _EVIDENCE},
@@ -199,10 +197,10 @@ def _there(
 ) -> bool:
     """Whether a named effect acts at its place; it takes a share of what is left."""
     if effect["effect"] == "found_law":
-        return effect["at"] in answer.get("laws", ())
+        return effect["at"] in answer["laws"]
     half = max(effect["explains"] or 0.0, taken) >= _HALF
     return any(
-        name in {key, *e["twins"]} or (half and name in e.get("kindred", ()))
+        name in {key, *e["twins"]} or (half and name in e["kindred"])
         for key, e in zip(keys_of(answer["effects"]), answer["effects"], strict=True)
     )
 

@@ -132,7 +132,7 @@ def by_gaps(rows: Sequence[dict[str, Any]], anyway: float) -> Said:
         floor, least = r["gap"]["floor"], anyway**2 - 1.0
         path = [r["gap"]["refit"], *r["gap_after"]]
         left = [max((x / floor) ** 2 - 1.0, 0.0) + least for x in path]
-        for k, ok in enumerate(r.get("there") or [ok for ok, _ in judged([r])]):
+        for k, (ok, _) in enumerate(judged([r])):
             without = max(left[k] - left[k + 1], 0.0) + left[-1]
             cost.append(0.5 * np.log(without / left[-1]))
             there.append(bool(ok))

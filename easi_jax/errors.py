@@ -16,10 +16,16 @@ class UserError(Exception):
     """
 
 
+def closest(name: str, known: Iterable[str]) -> str:
+    """The known name that is most like ``name``, or ``''`` where none is."""
+    found = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return found[0] if found else ""
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Returns ``'; did you mean "x"?'`` for the closest known name, or ``''``."""
-    found = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f'; did you mean "{found[0]}"?' if found else ""
+    found = closest(name, known)
+    return f'; did you mean "{found}"?' if found else ""
 
 
 def source_of(function: Callable[..., Any]) -> str:

@@ -30,8 +30,8 @@ class _Object(NamedTuple):
         index: where its numbers are in fields of `Effects`.
         spot: the same for the catalog.
         is_all: it stands for all of its kind.
-        tied: names of the like places that it stands for, ``among`` where their
-            numbers are, and ``all_drives`` whether these are all actuators.
+        tied: names of the like places that it stands for, and ``among`` where their
+            numbers are.
         range: where a spring at it may rest: at a joint, or at each of like joints.
     """
 
@@ -41,7 +41,6 @@ class _Object(NamedTuple):
     is_all: bool = False
     tied: tuple[str, ...] = ()
     among: tuple[tuple[int, ...], ...] = ()
-    all_drives: bool = False
     range: tuple[float, float] = (-np.inf, np.inf)
 
 
@@ -95,7 +94,6 @@ def _like(m: mujoco.MjModel, kind: str, s: Scales) -> Iterator[_Object]:
         ids = [int(id_of(name).id) for name in names]
         at = m.jnt_dofadr[ids].tolist() if kind == "joint" else ids
         among = tuple((k,) for k in at)
-        every = kind == "actuator" and len(names) == m.nu
         rests = [Spot(m, kind, i, s).range for i in ids] if kind == "joint" else []
         low, high = zip(*rests, (-np.inf, np.inf), strict=True)
         yield _Object(
@@ -104,7 +102,6 @@ def _like(m: mujoco.MjModel, kind: str, s: Scales) -> Iterator[_Object]:
             Spot(m, kind, ids[0], s),
             tied=names,
             among=among,
-            all_drives=every,
             range=(max(low), min(high)),
         )
 
@@ -118,8 +115,8 @@ def _at(row: Effect, o: _Object, cycles: float = np.nan) -> Iterator[Place]:
     columns = tuple(_column(part, o) for part in site.parts)
     if o.tied and not all(map(_adds, site.parts, columns)):
         return
-    if o.all_drives and row.is_shared:
-        return  # offered as that of all already
+    if row.is_shared and len(o.tied) == o.spot.m.nu:
+        return  # offered as that of all actuators already
     starts = tuple(
         tuple(cycles if np.isnan(x) else float(x) for x in start)
         for start in site.starts_at(o.spot)

@@ -1,6 +1,5 @@
 """The columns that a model gives a log, and their check."""
 
-import difflib
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +8,7 @@ from pathlib import Path
 import mujoco
 
 from easi_jax.data.unmeasured import placed_by_model
-from easi_jax.errors import UserError, nearest
+from easi_jax.errors import UserError, closest, nearest
 from easi_jax.io.logs.cure import cure
 from easi_jax.io.models.completed import held_joint
 from easi_jax.model.addresses import matching
@@ -215,11 +214,11 @@ def check_columns(
         more = f" (also missing: {others}" if others else ""
         if more and len(missing) > _LISTED:
             more += f" and {len(missing) - _LISTED} more"
-        theirs = _nearest(missing[0], strangers)
+        theirs = _closest(missing[0], strangers)
         near, lost = "", "" if theirs else _undetermined(model, columns, missing)
         if theirs:
-            near = f'; did you mean "{theirs}"?'
-            near += f" ({cure(f'columns: {{{theirs}: {missing[0]}}}')} renames it)"
+            renamed = cure(f"columns: {{{theirs}: {missing[0]}}}")
+            near = f'; did you mean "{theirs}"? ({renamed} renames it)'
         elif strangers:
             shown = " ".join(", ".join(strangers[:_LISTED]).split())
             near = f" (it has {shown}; " + (
@@ -256,13 +255,13 @@ def check_columns(
     return ignored
 
 
-def _nearest(column: str, strangers: Sequence[str]) -> str:
+def _closest(column: str, strangers: Sequence[str]) -> str:
     """Which of a file's columns is named most like one that is missing, what all such
     columns begin with aside; empty where none is."""
     kind, dot, name = column.partition(".")
     by_name = {s.removeprefix(kind + dot) if dot else s: s for s in strangers}
-    found = difflib.get_close_matches(name or kind, list(by_name), n=1, cutoff=0.5)
-    return by_name[found[0]] if found else ""
+    found = closest(name or kind, by_name)
+    return by_name[found] if found else ""
 
 
 def _undetermined(

@@ -58,10 +58,10 @@ def equality(inside: str, active: bool = True) -> str:
     return f'<equality><joint active="{on}" {inside}/></equality>'
 
 
-def tendons(second: str = "", inside: str = 'tendon1="t"', own: str = "1") -> str:
+def tendons(second: str = "", inside: str = 'tendon1="t"') -> str:
     """Fixed tendons, of which an equality says something."""
     made = '<fixed name="t"><joint joint="drive" coef="2"/>'
-    made += f'<joint joint="other" coef="{own}"/></fixed>'
+    made += '<joint joint="other" coef="1"/></fixed>'
     return f"<tendon>{made}{second}</tendon><equality><tendon {inside}/></equality>"
 
 
