@@ -321,7 +321,7 @@ def _ratios(rows: list[dict[str, Any]]) -> list[np.ndarray]:
 
 
 def _spread(rows: list[dict[str, Any]]) -> str:
-    ratios = np.concatenate(_ratios(rows))
+    ratios = np.concatenate([np.zeros(0), *_ratios(rows)])
     if not len(ratios):
         return "none is told"
     low, middle, high = np.quantile(ratios, (0.025, 0.5, 0.975))
@@ -340,18 +340,21 @@ def _right(rows: list[dict[str, Any]]) -> str:
     return f"{sum(map(_is_right, rows))} of {len(rows)}"
 
 
+def _seconds(rows: list[dict[str, Any]]) -> str:
+    return f"{np.median([row['seconds'] for row in rows]):.0f}" if rows else ""
+
+
 def _found(row: dict[str, Any]) -> bool:
     return any(name.split("@")[0] == row["hidden"] for name in row["named"])
 
 
 def _by_margin(rows: list[dict[str, Any]]) -> list[tuple[str, list[dict[str, Any]]]]:
-    """All of the rows, then those of each value of each margin."""
+    """All of the rows, then those of each value of each margin, none left out."""
     margins = {"rate": RATES, "speed": SPEEDS, "reading": READINGS, "machine": MACHINES}
     lines = [("all", rows)]
     for name, values in margins.items():
         for value in values:
-            some = [row for row in rows if row[name] == value]
-            lines += [(f"{name}: {value}", some)] if some else []
+            lines.append((f"{name}: {value}", [r for r in rows if r[name] == value]))
     return lines
 
 
@@ -376,6 +379,8 @@ def _at_floor(rows: list[dict[str, Any]]) -> str:
 
 def _power(rows: list[dict[str, Any]]) -> str:
     """How many are found, and whether that is the goal or cannot be told from it."""
+    if not rows:
+        return "no case yet"
     hit = np.array(list(map(_found, rows)))
     found, count = int(hit.sum()), len(hit)
     low, high = wilson(found, count)
@@ -404,9 +409,7 @@ def paragraphs(rows: list[dict[str, Any]]) -> list[str]:
                     "gap over floor: median (95 %)": lambda line: _spread(line[1]),
                     "goal": lambda line: _at_floor(line[1]),
                     "nothing named": lambda line: _right(line[1]),
-                    "median seconds": lambda line: (
-                        f"{np.median([row['seconds'] for row in line[1]]):.0f}"
-                    ),
+                    "median seconds": lambda line: _seconds(line[1]),
                 },
             ),
             computing(clean),
@@ -418,8 +421,9 @@ def paragraphs(rows: list[dict[str, Any]]) -> list[str]:
         said += [
             "`python -m benchmarks.floor --hidden`: an effect that raises the gap to "
             f"about three floors. It did raise it to {_CLEAR:g} at least in "
-            f"{len(clear)} of {len(hidden)} cases. Found by name, of these; goal in "
-            f"every margin {100 * POWER:.0f} %, with 95 % intervals:",
+            f"{len(clear)} of {len(hidden)} cases; commits {commits_of(hidden)}. "
+            f"Found by name, of these; goal in every margin {100 * POWER:.0f} %, with "
+            "95 % intervals:",
             table(
                 _by_margin(clear) if clear else [],
                 {

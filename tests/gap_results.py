@@ -9,6 +9,7 @@ from easi_jax.model.results import (
     GapResult,
     NamedEffect,
     Refitted,
+    Site,
 )
 
 
@@ -31,12 +32,11 @@ def effect(
     return NamedEffect(
         name,
         kind,
-        (at,),
+        (Site(at, gaps[1]),),
         values,
         0.9,
         (rival,) if rival else (),
         gaps[0],
-        (gaps[1],),
         {column: 0.01},
         {column: 0.001},
         cost=0.7,

@@ -181,7 +181,7 @@ class Chunked:
             else "Fisher information ..."
         )
         result = as_read_back(distributed.local(jax.jit(fun)(*args)))
-        found_check(setup.seeds, setup.pipe.env.space.names, result.distribution)
+        found_check(setup.seeds, setup.pipe.env.space.names, result)
         checkpoints.save(place, 1, result, config_hash=folder.config_hash)
         return result
 

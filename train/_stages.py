@@ -240,25 +240,23 @@ def search_check(
 
 
 def found_check(seeds: Sequence[int], names: Sequence[str], found: Any) -> None:
-    """Stops where the `Distribution` that a search found is no number: a policy trained
-    under it would be worth nothing, and nothing would tell. ``found`` has one a seed.
+    """Stops where a fit diverged: a policy trained under what is no number would be
+    worth nothing, and nothing would tell. ``found`` has an `Estimate` of each seed.
 
     Raises:
-        UserError: names the seed and the parameters.
+        UserError: names the seed and the reason.
     """
-    import numpy as np
+    import jax
 
     from easi_jax.errors import UserError
+    from easi_jax.estimation.posterior import diverged
 
-    bad = ~np.isfinite(np.asarray(found.mean))
-    bad |= ~np.isfinite(np.asarray(found.factor)).all(-1)
-    for seed, some in zip(seeds, bad, strict=True):
-        if some.any():
-            named = ", ".join(names[int(i)] for i in np.flatnonzero(some))
+    for i, seed in enumerate(seeds):
+        why = diverged(jax.tree.map(lambda x, i=i: x[i], found), names)
+        if why:
             raise UserError(
-                f"seed {seed}: the search's result is not finite for {named}; another "
-                "seed or --no-refine may do, but please report it: the fault is in "
-                "easi_jax"
+                f"seed {seed}: the fit diverged: {why}; another seed or --no-refine "
+                "may do, but please report it: the fault is in easi_jax"
             )
 
 

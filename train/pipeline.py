@@ -165,7 +165,7 @@ def _told(folder: "RunFolder", setup: "Setup", out: Any) -> "dict[str, Curve]":
             "a generation had no finite simulation: run train.udr and train.easi, "
             "which stop there and name the parameters"
         )
-    found_check(seeds, names, out["estimate"].distribution)
+    found_check(seeds, names, out["estimate"])
     return curves
 
 

@@ -10,6 +10,7 @@ Huber 1967, White 1982). Bias they do not show, for it is the same in every bloc
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from scipy import stats
 
 from easi_jax.estimation.normal_equations import RESOLVED
@@ -21,6 +22,8 @@ _MOST = 40
 _PIECES = 4
 # Probability of less scatter with a right model: of more, the information stands.
 _SURE = 0.95
+# Standard errors of a correlation of neighbours that is none, which 2.5 % exceed.
+_ALIKE = 1.96
 
 
 def enough(pieces: int) -> bool:
@@ -47,8 +50,9 @@ def scattered(
 
     Along each principal direction of ``hessian``, scaled to a unit diagonal, the
     variance is multiplied by that of the blocks' gradients over what it should be.
-    Neighbours that lean the same way count as one longer block (Newey and West 1987,
-    one lag).
+    Where neighbouring blocks surely lean the same way, errors hang together for longer
+    than a block: blocks are twice as long there. What neighbours still have in common
+    is added (Newey and West 1987, one lag).
 
     Args:
         information: what counts, ``(n, n)``; at another place than ``hessian`` where a
@@ -58,22 +62,16 @@ def scattered(
     pieces = len(gradients)
     if not enough(pieces):
         return information
-    count = min(_MOST, pieces // _PIECES)
-    block = jnp.arange(pieces) * count // pieces
-    sums = jax.ops.segment_sum(gradients, block, count)
     # What has no slope at the fit has no direction of its own in this scale.
     largest = jnp.maximum(jnp.diag(hessian), jnp.diag(information))
     size = jnp.sqrt(jnp.maximum(largest, 1e-12))
     values, vectors = jnp.linalg.eigh(hessian / size[:, None] / size)
-    along = ((sums - sums.mean(0)) / size) @ vectors  # (count, n)
-    variance = (along**2).sum(0)
-    alike = (along[1:] * along[:-1]).sum(0) / jnp.maximum(variance, 1e-30)
-    ratio = variance / jnp.maximum(values, RESOLVED) * count / (count - 1)
-    free = count - 1
-    more = (values > RESOLVED) & (ratio > float(stats.chi2.ppf(_SURE, free)) / free)
-    # The variance of Student's t: a ratio from few blocks is itself not sure.
-    longer = (1.0 + 2.0 * jnp.maximum(alike, 0.0)) * free / (free - 2)
-    extra = jnp.where(more, jnp.maximum(ratio * longer - 1.0, 0.0), 0.0)
+    along = gradients / size @ vectors  # (M, n)
+    most = min(_MOST, pieces // _PIECES)
+    extra, alike = _more(along, values, most)
+    if most >= 2 * FEWEST:
+        longer, _ = _more(along, values, most // 2)
+        extra = jnp.where(alike > _ALIKE / np.sqrt(most), longer, extra)
     # Variance is added, so that information is never more than it was (Woodbury).
     scaled = information / size[:, None] / size
     own = jnp.maximum((vectors * (scaled @ vectors)).sum(0), RESOLVED)
@@ -81,4 +79,24 @@ def scattered(
     seen = scaled @ root
     taken = seen @ jnp.linalg.solve(jnp.eye(len(size)) + root.T @ seen, seen.T)
     left = (scaled - 0.5 * (taken + taken.T)) * size[:, None] * size
-    return jnp.where(more.any(), left, information)
+    return jnp.where(extra.any(), left, information)
+
+
+def _more(
+    along: jax.Array, values: jax.Array, count: int
+) -> tuple[jax.Array, jax.Array]:
+    """Variance beyond that of the noise, as a share of it, and the correlation of
+    neighbours, by ``count`` blocks of gradients ``(M, n)`` along directions with that
+    information ``(n,)``; 0 where it may be chance."""
+    pieces = len(along)
+    block = jnp.arange(pieces) * count // pieces
+    sums = jax.ops.segment_sum(along, block, count)
+    sums -= sums.mean(0)
+    variance = (sums**2).sum(0)
+    alike = (sums[1:] * sums[:-1]).sum(0) / jnp.maximum(variance, 1e-30)
+    ratio = variance / jnp.maximum(values, RESOLVED) * count / (count - 1)
+    free = count - 1
+    more = (values > RESOLVED) & (ratio > float(stats.chi2.ppf(_SURE, free)) / free)
+    # The variance of Student's t: a ratio from few blocks is itself not sure.
+    longer = (1.0 + 2.0 * jnp.maximum(alike, 0.0)) * free / (free - 2)
+    return jnp.where(more, jnp.maximum(ratio * longer - 1.0, 0.0), 0.0), alike

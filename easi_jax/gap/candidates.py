@@ -74,7 +74,7 @@ def _objects(m: mujoco.MjModel, s: Scales) -> Iterator[_Object]:
     if m.nu > 1:
         # A number of each drive would be one of dozens, and hardly help alone.
         yield _Object("", (), Spot(m, "actuator", 0, s), is_all=True)
-    for kind in ("joint", "actuator"):
+    for kind in ("joint", "actuator", "body"):
         yield from _like(m, kind, s)
     for b in range(1, m.nbody):
         if m.body_mass[b] > 0:
@@ -88,8 +88,8 @@ def _objects(m: mujoco.MjModel, s: Scales) -> Iterator[_Object]:
 
 
 def _like(m: mujoco.MjModel, kind: str, s: Scales) -> Iterator[_Object]:
-    """Groups of like joints or actuators."""
-    id_of = {"joint": m.joint, "actuator": m.actuator}[kind]
+    """Groups of like joints, actuators or bodies."""
+    id_of = {"joint": m.joint, "actuator": m.actuator, "body": m.body}[kind]
     for pattern, names in like_places(m, kind).items():
         ids = [int(id_of(name).id) for name in names]
         at = m.jnt_dofadr[ids].tolist() if kind == "joint" else ids
@@ -112,8 +112,14 @@ def _at(row: Effect, o: _Object, cycles: float = np.nan) -> Iterator[Place]:
     site = row.sites.get(kind)
     if site is None or not site.offered(o.spot) or (o.is_all and not row.is_shared):
         return
-    columns = tuple(_column(part, o) for part in site.parts)
-    if o.tied and not all(map(_adds, site.parts, columns)):
+    parts = site.parts
+    if o.tied and kind == "body":
+        # A mass acts where theirs is; directions are mirror images, left and right.
+        parts = tuple(p for p in parts if not p.number.is_shape)
+        if len(parts) > 1:
+            return
+    columns = tuple(_column(part, o) for part in parts)
+    if o.tied and not all(map(_adds, parts, columns)):
         return
     if row.is_shared and len(o.tied) == o.spot.m.nu:
         return  # offered as that of all actuators already
@@ -125,7 +131,7 @@ def _at(row: Effect, o: _Object, cycles: float = np.nan) -> Iterator[Place]:
     if row.rests:
         yield Place(*what, starts, rests=o.range, tied=o.tied)
         return
-    if not site.parts[-1].number.is_shape:
+    if not parts[-1].number.is_shape:
         yield Place(*what, starts, tied=o.tied)
         return
     fitted = (True,) * (len(columns) - 1) + (False,)

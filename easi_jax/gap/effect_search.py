@@ -28,9 +28,11 @@ from easi_jax.gap.model_comparison import (
 )
 from easi_jax.gap.screening import expanded, screened, shortlist
 from easi_jax.gap.table import Place, covered, does
+from easi_jax.model import addresses as language
 from easi_jax.model.effect_catalog import Scales
 from easi_jax.model.found_laws import law_of
 from easi_jax.model.joint_space import is_hinge, scalar_dofs
+from easi_jax.model.parameter_proposal import like_places
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.progress import Tell
 
@@ -113,8 +115,16 @@ class Places:
         return [
             p
             for p in self.everywhere
-            if (p.effect, p.kind) == (place.effect, "actuator")
+            if (p.effect, p.kind, p.tied) == (place.effect, "actuator", ())
         ]
+
+    def groups(self) -> dict[str, tuple[str, ...]]:
+        """Names of actuators by the pattern of those that are like each other; of one
+        that is like no other, by its name."""
+        like = like_places(self.m, "actuator")
+        grouped = {name for names in like.values() for name in names}
+        single = [n for n in language.names(self.m, "actuator") if n not in grouped]
+        return like | {name: (name,) for name in single}
 
 
 def _cycles(m: mujoco.MjModel, j: int, scales: Scales) -> list[float]:

@@ -26,25 +26,12 @@ from easi_jax.gap.verdict import Openness
 from easi_jax.gap.window_set import WindowSet
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.results import Outcome as Ended
-from easi_jax.model.results import Refitted
+from easi_jax.model.results import Refitted, Site
 
 # Sizes of differences, that a number without bounds may be off which no data determine.
 _ANYTHING = 1e3
 _ALIKE = 1e-12  # least eigenvalue of a correlation matrix that is no rounding
 _TELLS = 0.5  # of the deviation without data: less, and data determine a number
-
-
-@dataclass(frozen=True)
-class Part:
-    """One actuator of an effect that all have.
-
-    Attributes:
-        place: the same effect there.
-        gap_after: held-out gap with the effect at it and those before it.
-    """
-
-    place: Place
-    gap_after: float
 
 
 @dataclass(frozen=True)
@@ -60,7 +47,8 @@ class Found:
         gap_after: held-out gap with it and those before it.
         fitted: value of each of the place's columns, by its number among them.
         deviations: standard deviations of those that the fit moved.
-        parts: of a shared effect (`Place.shared`), the actuators that it is seen at.
+        sites: of a shared effect (`Place.shared`), where it is seen: like actuators
+            together, others by themselves.
         cost: of taking it out [nats for each independent number that was read]
             (`easi_jax.gap.model_comparison.cost`).
         outcome: how the fit of its numbers ended.
@@ -76,7 +64,7 @@ class Found:
     gap_after: float
     fitted: dict[int, float] = field(default_factory=dict)
     deviations: dict[int, float] = field(default_factory=dict)
-    parts: tuple[Part, ...] = ()
+    sites: tuple[Site, ...] = ()
     cost: float = 0.0
     outcome: Ended = "converged"
     sure: float = 0.0

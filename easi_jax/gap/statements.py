@@ -13,10 +13,16 @@ from easi_jax.gap.effect_set import Model, last
 from easi_jax.gap.fitting import Fitting
 from easi_jax.gap.held_out import HeldOut
 from easi_jax.gap.model_comparison import certainty, confidence, cost, odds_of
-from easi_jax.gap.result import Figures, Found, Numbers, Outcome, Part, score_of
+from easi_jax.gap.result import Figures, Found, Numbers, Outcome, score_of
 from easi_jax.gap.table import Place
 from easi_jax.gap.verdict import Openness, openness, surely_better, verdict_of
 from easi_jax.model.parameters import ParameterSpace
+from easi_jax.model.results import Site
+
+_AS_IF_ALL = (
+    "standard deviations of what is named count as if nothing else were missing; what "
+    "is may have moved the values by more"
+)
 
 
 @dataclass
@@ -93,11 +99,11 @@ def stated(
             f"the gap itself: {end.figures.gap:.3g} would be {fair:.3g} without "
             "its error; a smaller timestep in the model takes it away"
         )
-    notes += too_few(len(at.windows), "windows") if found else []
+    verdict = verdict_of(bool(found), refit.open, end.open)
+    notes += _on_deviations(len(at.windows), verdict) if found else []
     data, x = at.data, at.plain(x)
-    steps = held_out.predictor.steps - data.lead
     return Outcome(
-        verdict=verdict_of(bool(found), refit.open, end.open),
+        verdict=verdict,
         found=found,
         refitted=(numbers or _numbers(at, end.model)).refitted(space),
         before=before,
@@ -113,9 +119,14 @@ def stated(
         x=x,
         active=[i for i in model.fit.active.tolist() if i < len(x)],
         notes=notes,
-        horizon=steps * data.dt,
+        horizon=(held_out.predictor.steps - data.lead) * data.dt,
         start=data.lead * data.dt,
     )
+
+
+def _on_deviations(windows: int, verdict: str) -> list[str]:
+    left = [_AS_IF_ALL] if verdict == "unexplained" else []
+    return [*too_few(windows, "windows"), *left]
 
 
 def _numbers(at: Fitting, model: Model) -> Numbers:
@@ -165,18 +176,19 @@ class _Judge:
                 model = self.at.without(self.model, places[k + 1 :])
                 figures = self.held_out.figures(self.at.plain(model.fit.x))
             odds, same = self._odds(last(self.model, place), rivals[place.key])
-            parts = self._parts(model.fit.x, place, figures) if place.shared else ()
-            mine = {place.key, *(p.place.key for p in parts)}
+            sites = self._sites(model.fit.x, place, figures) if place.shared else ()
+            at = {place.at, *(name for s in sites for name in (s.at, *s.names))}
+            mine = {f"{place.effect}@{name}" for name in at}
             found.append(
                 Found(
                     place,
                     numbers.values(place),
                     confidence(costs[place.key], odds),
-                    [k for k in dict.fromkeys(p.key for p in same) if k not in mine],
+                    [k for k in dict.fromkeys(same) if k not in mine],
                     figures.gap,
                     numbers.fitted(place),
                     numbers.deviations(place),
-                    parts,
+                    sites,
                     costs[place.key],
                     numbers.outcome(place),
                     certainty(self.model, without[place.key]),
@@ -185,37 +197,48 @@ class _Judge:
             )
         return found
 
-    def _odds(self, mine: Model, rivals: Sequence[Model]) -> tuple[float, list[Place]]:
-        """Odds of an effect's rivals but its twins, and those that predict held-out
-        data as well."""
-        same: list[Place] = []
+    def _odds(self, mine: Model, rivals: Sequence[Model]) -> tuple[float, list[str]]:
+        """Odds of an effect's rivals but its twins, and the names of those that predict
+        held-out data as well."""
+        same: list[str] = []
         for rival in rivals[:RIVALS]:
             if self._as_good(self.whole.square, self._fair(rival).square):
                 other = rival.places[-1]
-                singles = self.search.offered.singles(other)
-                same += singles if other.shared else [other]
+                groups = self.search.offered.groups() if other.shared else [other.at]
+                same += [f"{other.effect}@{at}" for at in groups]
         return odds_of(mine, rivals[:RIVALS], self.at.windows.led), same
 
-    def _parts(self, x: np.ndarray, place: Place, whole: Figures) -> tuple[Part, ...]:
-        """The actuators that a shared effect is seen at: without it at one of them the
-        held-out data are predicted worse. What moves them most comes first.
+    def _sites(self, x: np.ndarray, place: Place, whole: Figures) -> tuple[Site, ...]:
+        """Where a shared effect is seen: without it there the held-out data are
+        predicted worse. What moves them most comes first. Where all actuators are like
+        others and all have it, they are one site.
 
         Args:
             x: vector with the effect.
             whole: its figures.
         """
-        singles = self.search.offered.singles(place)
-        each = self.search.each
-        without = [[p for p in singles if p is not one] for one in singles]
-        squares = self._squares([each(x, place, kept) for kept in without])
+        single = {p.at: p for p in self.search.offered.singles(place)}
+        groups = self.search.offered.groups()
+
+        def only(kept: Sequence[str]) -> np.ndarray:
+            names = [name for at in kept for name in groups[at]]
+            return self.search.each(x, place, [single[name] for name in names])
+
+        every = list(groups)
+        squares = self._squares([only([k for k in every if k != at]) for at in every])
         (mine,) = self._squares([x])
         scale = self.held_out.channels.scale
         order = np.argsort(-np.asarray(measure.gap(squares.mean(1), scale)))
-        seen = [singles[i] for i in order if not self._as_good(mine, squares[i])]
-        seen = seen or [singles[i] for i in order]
-        some = [each(x, place, seen[:k]) for k in range(1, len(seen))]
-        gaps = [float(measure.gap(s.mean(0), scale)) for s in self._squares(some)]
-        return tuple(map(Part, seen, [*gaps, whole.gap]))
+        ranked = [every[i] for i in order]
+        seen = [
+            every[i] for i in order if not self._as_good(mine, squares[i])
+        ] or ranked
+        if 1 < len(every) == len(seen) and all(len(x) > 1 for x in groups.values()):
+            return (Site("*", whole.gap, tuple(single)),)
+        some = self._squares([only(seen[:k]) for k in range(1, len(seen))])
+        gaps = [*(float(measure.gap(s.mean(0), scale)) for s in some), whole.gap]
+        like = [names if len(names) > 1 else () for names in map(groups.get, seen)]
+        return tuple(map(Site, seen, gaps, like))
 
     def _squares(self, vectors: Sequence[np.ndarray]) -> np.ndarray:
         """Mean squares of each held-out window, ``(B, W, c)``."""

@@ -19,6 +19,7 @@ from easi_jax.model.results import (
     GapResult,
     NamedEffect,
     Refitted,
+    Site,
     Traces,
 )
 
@@ -124,27 +125,22 @@ def _effects(o: Outcome) -> tuple[NamedEffect, ...]:
 
 
 def _effect(f: Found, gap: float) -> NamedEffect:
-    parts = [(p.place.at, p.gap_after) for p in f.parts]
-    parts = parts or [(name, f.gap_after) for name in f.place.tied]
-    at, gaps = zip(*(parts or [(f.place.at, f.gap_after)]), strict=True)
-    columns = f.place.columns
+    columns, single = f.place.columns, Site(f.place.at, f.gap_after, f.place.tied)
     return NamedEffect(
         effect=f.place.effect,
-        kind=f.parts[0].place.kind if f.parts else f.place.kind,
-        at=at,
+        kind="actuator" if f.sites else f.place.kind,
+        sites=f.sites or (single,),
         values=f.values,
         confidence=f.confidence,
         indistinguishable=tuple(map(public_name, f.indistinguishable)),
         gap_before=gap,
-        gaps=gaps,
         columns={columns[k].name: x for k, x in f.fitted.items()},
         std={columns[k].name: s for k, s in f.deviations.items()},
-        shared=bool(f.parts),
+        shared=bool(f.sites),
         cost=f.cost,
         sure=f.sure,
         odds=f.odds,
         outcome=f.outcome,
-        pattern=f.place.at if f.place.tied else "",
     )
 
 
@@ -153,12 +149,11 @@ def _reading(r: ReadingFault, gap: float) -> NamedEffect:
     return NamedEffect(
         effect=r.effect,
         kind="sensor",
-        at=(r.at,),
+        sites=(Site(r.at, gap),),
         values=r.parameters,
         confidence=r.confidence,
         indistinguishable=(),
         gap_before=gap,
-        gaps=(gap,),
         columns=r.columns,
         std=r.std,
     )

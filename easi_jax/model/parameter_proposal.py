@@ -173,20 +173,24 @@ def _groups(
 
 
 def like_places(m: mujoco.MjModel, kind: str) -> dict[str, tuple[str, ...]]:
-    """Groups of joints or actuators that are alike in type, depth in the tree and what
-    the model states, up to mirroring: names by the pattern of each group."""
+    """Groups of joints, actuators or bodies with mass that are alike in type, depth in
+    the tree and what the model states, up to mirroring: names by the pattern of each
+    group."""
     objects = language.names(m, kind)
-    traits = {
-        name: (*_look(m, kind, i), *_stated(m, kind, i))
-        for name, i in objects.items()
-        if kind != "joint" or is_scalar(m, i)
-    }
+    some = dict(objects)
+    if kind == "joint":
+        some = {name: i for name, i in objects.items() if is_scalar(m, i)}
+    if kind == "body":
+        some = {name: i for name, i in objects.items() if m.body_mass[i] > 0}
+    traits = {n: (*_look(m, kind, i), *_stated(m, kind, i)) for n, i in some.items()}
     groups = _groups(traits, list(objects), True)
     return {k: tuple(members) for k, members in groups if len(members) > 1}
 
 
 def _stated(m: mujoco.MjModel, kind: str, i: int) -> tuple[float, ...]:
-    """Numbers of a joint or an actuator."""
+    """Numbers of a joint, an actuator or a body."""
+    if kind == "body":
+        return (float(m.body_mass[i]),)
     if kind == "joint":
         d = int(m.jnt_dofadr[i])
         own = (m.dof_damping[d], m.dof_frictionloss[d], m.dof_armature[d])

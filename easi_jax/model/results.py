@@ -22,23 +22,41 @@ UNMEASURED = "not measured"  # the reason why a joint without readings is no cha
 
 
 @dataclass(frozen=True)
+class Site:
+    """Where an effect acts.
+
+    Attributes:
+        at: a place of the model, or a pattern; "" for the whole model.
+        gap_after: held-out gap with the effect there and those before it.
+        like: places that the pattern stands for, which have the effect alike.
+    """
+
+    at: str
+    gap_after: float
+    like: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Places of the model."""
+        return self.like or (self.at,)
+
+
+@dataclass(frozen=True)
 class NamedEffect:
     """One effect that a model lacks, or that is in a sensor's readings.
 
     Attributes:
         effect: name.
         kind: what its places are: joint, actuator, body, sensor, geom or model.
-        at: its places; several where like actuators have it alike, ``("",)`` for the
-            whole model.
+        sites: where it acts; several where actuators have it alike that are not like
+            each other.
         values: of its parameters.
         confidence: probability of this name against its rivals.
         indistinguishable: rivals that predict the held-out data as well.
         gap_before: held-out gap before it.
-        gaps: held-out gap with it at each of ``at`` and those before.
         columns: values of fields of `easi_jax.model.effects.Effects`, by name.
         std: their standard deviations, where known.
         shared: whether it was found as one of all actuators.
-        pattern: of its places, where it was found as one of like places.
         cost: of taking it out, in cross-validated log density: nats for each
             independent number that was read; None where no prediction uses it.
         outcome: how the fit of its values ended.
@@ -49,17 +67,15 @@ class NamedEffect:
 
     effect: str
     kind: str
-    at: tuple[str, ...]
+    sites: tuple[Site, ...]
     values: Values
     confidence: float
     indistinguishable: tuple[str, ...]
     gap_before: float
-    gaps: tuple[float, ...]
     columns: Mapping[str, float]
     std: Mapping[str, float]
     shared: bool = False
     cost: float | None = None
-    pattern: str = ""
     outcome: Outcome = "converged"
     sure: float | None = None
     odds: float | None = None
@@ -67,8 +83,12 @@ class NamedEffect:
     @property
     def label(self) -> str:
         """``effect@at``, ``effect@all``, or ``effect@PATTERN``."""
-        one = self.pattern or self.at[0]
-        return f"{self.name}@{'all' if self.shared else one}"
+        return f"{self.name}@{'all' if self.shared else self.sites[0].at}"
+
+    @property
+    def at(self) -> tuple[str, ...]:
+        """All places of the model where it acts; ``("",)`` for the whole model."""
+        return tuple(name for site in self.sites for name in site.names)
 
     @property
     def name(self) -> str:
@@ -91,7 +111,7 @@ class NamedEffect:
     @property
     def gap_after(self) -> float:
         """Held-out gap with it and those before it."""
-        return self.gaps[-1]
+        return self.sites[-1].gap_after
 
     @property
     def rises(self) -> bool:

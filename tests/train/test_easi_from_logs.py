@@ -379,6 +379,18 @@ def test_a_seed_without_a_result_has_a_reason_and_no_number(files, capsys, monke
     assert "seed 0 has no result: its mean or its spread" in words(capsys, files)
 
 
+def test_a_machine_with_an_unknown_law_gets_no_region(files, capsys):
+    """A spring that grows with the cube of the angle. The log is short, too."""
+    spring = MODEL.replace('damping="0.05"', 'damping="0.05" stiffness="0 0 4"')
+    swing(files["log"], damping=0.1, rows=600, noise=1e-4, model=spring)
+    call(*arguments(files))
+    seed = json.loads((files["out"] / "distribution.json").read_text())["seeds"]["0"]
+    assert seed["no_region"].startswith("no region is stated: the model errs by")
+    said = words(capsys, files)
+    assert seed["no_region"] in said
+    assert "too few to see how values scatter between" in said
+
+
 def diverging(passes):
     """The first fit's mean is no number."""
     count = iter(range(100))
@@ -490,10 +502,15 @@ def test_a_fit_on_some_of_the_logs_ends_where_all_have_it(files, capsys, monkeyp
 
 
 def swing(
-    path: Path, damping: float, rows: int = 1500, noise: float = 1e-3, seed: int = 0
+    path: Path,
+    damping: float,
+    rows: int = 1500,
+    noise: float = 1e-3,
+    seed: int = 0,
+    model: str = MODEL,
 ) -> None:
     """A log of the model, damped otherwise, with sensor noise [rad]."""
-    m = mujoco.MjModel.from_xml_string(MODEL)
+    m = mujoco.MjModel.from_xml_string(model)
     m.dof_damping[0] = damping
     d, rng, lines = mujoco.MjData(m), np.random.default_rng(seed), []
     for k in range(rows):

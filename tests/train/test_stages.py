@@ -1,7 +1,7 @@
 """A stage that was stopped keeps what it had told, and tells the rest once."""
 
+import dataclasses
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from easi_jax.errors import UserError
+from easi_jax.estimation.posterior import Estimate
 from easi_jax.io.runs.folder import RunFolder
 from easi_jax.io.runs.metrics import read_metrics
+from easi_jax.model.distribution import Distribution
 from train._stages import found_check, run_stage
 
 
@@ -55,13 +57,32 @@ def test_metrics_of_a_stage_that_goes_on(
     assert [row["step"] for row in told] == [k * per_step for k in range(1, 7)]
 
 
-def test_a_result_that_is_no_number_is_named() -> None:
-    def found(mean: float, factor: float) -> SimpleNamespace:
-        means, factors = np.zeros((2, 2)), np.stack([np.eye(2)] * 2)
-        means[1, 0], factors[1, 1, 0] = mean, factor
-        return SimpleNamespace(mean=jnp.array(means), factor=jnp.array(factors))
+@pytest.mark.fault("simulations that explode, parameters at absurd corners")
+def test_a_fit_that_diverged_is_no_result() -> None:
+    """The second of two seeds: its mean, its spread, or every cost."""
 
-    found_check((3, 7), ("mass", "kp"), found(0.5, 0.1))
-    for odd, name in ((found(np.nan, 0.1), "mass"), (found(0.5, np.inf), "kp")):
-        with pytest.raises(UserError, match=f"seed 7: .* not finite for {name};"):
-            found_check((3, 7), ("mass", "kp"), odd)
+    def found(**changed: np.ndarray) -> Estimate:
+        none: dict[str, Any] = {
+            f.name: jnp.zeros((2, 0)) for f in dataclasses.fields(Estimate)
+        }
+        given = {"mean": np.zeros((2, 2)), "factor": np.stack([np.eye(2)] * 2)}
+        given |= {"cost": np.ones((2, 3)), "hessian": np.stack([np.eye(2)] * 2)}
+        for key, value in changed.items():
+            given[key][1] = value
+        a = {key: jnp.array(value) for key, value in given.items()}
+        none_of = dict.fromkeys(("low", "high", "uniform"), jnp.zeros((2, 0)))
+        told = Distribution(mean=a.pop("mean"), factor=a.pop("factor"), **none_of)
+        return Estimate(**none | a | {"distribution": told, "doubted": ()})
+
+    found_check((3, 7), ("mass", "kp"), found())
+    for odd, why in (
+        (
+            {"mean": np.array([np.nan, 0.0])},
+            "mean or its spread is not finite for mass",
+        ),
+        ({"factor": np.diag([1.0, np.inf])}, "mean or its spread is not finite for kp"),
+        ({"cost": np.full(3, np.nan)}, "no simulation of the measured pieces stays"),
+        ({"hessian": np.full((2, 2), np.inf)}, "what the data say of the parameters"),
+    ):
+        with pytest.raises(UserError, match=f"seed 7: the fit diverged: .*{why}"):
+            found_check((3, 7), ("mass", "kp"), found(**odd))

@@ -86,15 +86,13 @@ def gap_json(result: GapResult) -> dict[str, Any]:
 
 
 def _effect_json(r: GapResult, e: NamedEffect) -> Iterator[dict[str, Any]]:
-    """One entry, or one for each actuator that has alike what all may have."""
-    each = zip(e.at, (e.gap_before, *e.gaps), e.gaps, strict=False)
-    if e.pattern:
-        each = [(e.pattern, e.gap_before, e.gap_after)]
-    for at, before, gap in each:
+    """An entry for each of its sites."""
+    before = e.gap_before
+    for site in e.sites:
         yield {
             "effect": e.name,
-            "at": at,
-            **({"places": e.at} if e.pattern else {}),
+            "at": site.at,
+            **({"places": site.like} if site.like else {}),
             **({"law": e.law} if e.law else {}),
             "kind": e.kind,
             "parameters": {
@@ -102,14 +100,15 @@ def _effect_json(r: GapResult, e: NamedEffect) -> Iterator[dict[str, Any]]:
                 for k, (v, s, u) in e.values.items()
             },
             "confidence": e.confidence,
-            "explains": r.share(before, gap),
+            "explains": r.share(before, site.gap_after),
             "removal_cost": e.cost,
             "removal_sure": e.sure,
             "rival_odds": e.odds,
             "outcome": e.outcome,
             "indistinguishable": e.indistinguishable,
-            "gap_after": gap,
+            "gap_after": site.gap_after,
         }
+        before = site.gap_after
 
 
 def gap_report(
@@ -196,14 +195,13 @@ def _most_of_it(r: GapResult) -> str:
 def sentence(e: NamedEffect) -> str:
     """What a roboticist would say of an effect."""
     shown = {k: measured(v, u, 3) for k, (v, _, u) in e.values.items()}
-    at, words = e.at[0], CATALOG[e.effect].sentence
+    at, words = e.sites[0].at, CATALOG[e.effect].sentence
     names = (f'"{name}"' for name in at.split("/"))
     pair = f" between {' and '.join(names)}" if e.kind == "geom" else ""
     if e.shared:
         words = words.replace('actuator "{at}"', "{at}")
         at = f"{len(e.at)} actuators alike ({', '.join(e.at)})"
-    elif e.pattern:
-        at = e.pattern
+    elif e.sites[0].like:
         words += f" (alike at {', '.join(e.at)})"
     return words.format(at=at, kind=e.kind, pair=pair, **shown)
 
@@ -264,7 +262,7 @@ def effect_rows(r: GapResult, between: str, none: str) -> list[tuple[str, ...]]:
     return [
         (
             f"{e.name}: {e.law}" if e.law else e.name,
-            e.pattern or ", ".join(e.at) or "whole model",
+            ", ".join(site.at for site in e.sites) or "whole model",
             _marked(parameters_text(e.values, between), e.outcome),
             f"{e.confidence:.2f}",
             _change(e, none),

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from easi_jax.estimation.blocks import enough, scattered
+from easi_jax.estimation.blocks import enough, scattered, too_few
 
 PIECES, SIZE = 400, np.array([3.0, 40.0, 900.0])
 
@@ -37,7 +37,7 @@ def test_a_right_model_keeps_what_it_knows() -> None:
     assert ratios.mean() < 1.08
 
 
-@pytest.mark.parametrize("alike", [0.5, 0.8])
+@pytest.mark.parametrize("alike", [0.5, 0.8, 0.9])
 def test_errors_that_hang_together_count_as_fewer(alike: float) -> None:
     """By the share that is known of such a series: (1 + a) / (1 - a)."""
     ratios = np.array([left(alike, seed) for seed in range(60)])
@@ -76,5 +76,8 @@ def test_no_slope_at_the_fit_is_not_told_by_others() -> None:
 def test_few_pieces_are_left_as_they_are() -> None:
     info, gradients = (jnp.asarray(x) for x in score(0.8, 0))
     assert enough(PIECES) and not enough(79)
+    (note,) = too_few(79, "pieces")
+    assert note.startswith("spreads are those of the noise model: 79 pieces make fewer")
+    assert too_few(80, "pieces") == []
     np.testing.assert_array_equal(scattered(info, info, gradients[:79]), info)
     np.testing.assert_array_equal(scattered(info, info, gradients[:0]), info)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from easi_jax.data.scales import scales_of
+from easi_jax.gap import effect_search
 from easi_jax.gap.candidates import places
 from easi_jax.gap.effect_set import Model
 from easi_jax.gap.effect_vector import Layout
@@ -19,7 +20,7 @@ from easi_jax.model.found_effects import FoundEffects, joined
 from easi_jax.model.parameter_proposal import like_places
 from easi_jax.model.parameters import Parameter, ParameterSpace
 from tests.commands import command
-from tests.easi_jax.gap.test_lengths import recorded_of
+from tests.easi_jax.gap.test_lengths import DT, recorded_of
 from tests.easi_jax.gap.test_statistics import of_loss
 from train import gap
 
@@ -83,6 +84,20 @@ def test_a_tied_number_moves_all_of_its_places(offered: dict[str, Place]) -> Non
     np.testing.assert_allclose(late, [0.0, 0.01, 0.0, 0.01], atol=1e-7)
 
 
+def test_bodies_that_are_alike_may_be_heavier_alike(offered: dict[str, Place]) -> None:
+    """Where each has its own; directions of left and right are mirror images."""
+    m, tied = robot(), offered["payload_mass@*_calf"]
+    assert tied.tied == ("left_calf", "right_calf") and tied.kind == "body"
+    layout = Layout(m, [*offered.values()])
+    x = layout.neutral.copy()
+    x[layout.where(tied)] = 0.1
+    heavier = np.asarray(layout.effects(jnp.asarray(x, jnp.float32)).mass)
+    calves = [m.body(f"{n}_calf").id for n in ("left", "right")]
+    np.testing.assert_allclose(np.flatnonzero(heavier), calves)
+    assert not any(p.tied for p in offered.values() if p.effect == "com_offset")
+    assert [*like_places(m, "body")] == ["*_thigh", "*_calf"]
+
+
 def test_drives_that_are_all_alike_are_tied() -> None:
     """Two wheels; what all actuators have alike by itself is offered once."""
     wheel = """<body pos="0 {y} 1"><joint name="{n}_wheel" axis="0 1 0" {range}/>
@@ -129,20 +144,51 @@ def test_the_tied_one_wins_where_it_predicts_as_well(offered: dict[str, Place]) 
         assert simplest([one, tied], base).places[0].key == keys[wins]
 
 
+def write_logs(folder: Path, m: mujoco.MjModel, late: int = 0) -> list[Path]:
+    """Two recordings of a machine whose commands arrive some rows late."""
+    names = [m.joint(j).name for j in range(m.njnt)]
+    head = ["time", *(f"qpos.{n}" for n in names), *(f"ctrl.{n}" for n in names)]
+    for k in range(2):
+        run = recorded_of(m, k, 400)
+        sent = np.r_[run.ctrl[late:], np.repeat(run.ctrl[-1:], late, 0)]
+        rows = np.c_[run.time, run.qpos, sent]
+        text = {"delimiter": ",", "header": ",".join(head), "comments": ""}
+        np.savetxt(folder / f"run{k}.csv", rows[: len(rows) - late], "%.9g", **text)
+    return [folder / f"run{k}.csv" for k in range(2)]
+
+
+def test_commands_that_all_come_late_are_one_entry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Hips are like hips, and knees like knees: nothing is at a place of its own."""
+    monkeypatch.setattr(
+        *(effect_search, "places"),
+        lambda *a: [p for p in places(*a) if p.effect == "actuator_delay"],
+    )
+    monkeypatch.setattr(effect_search, "ripples", lambda *a: [])
+    (tmp_path / "robot.xml").write_text(robot_xml().format(more=""))
+    logs, out = write_logs(tmp_path, robot(), late=1), tmp_path / "out"
+    command(
+        *(gap, "--model", tmp_path / "robot.xml", "--data", *logs, "--out", out),
+        *("--engine", "mujoco"),
+    )
+    told = json.loads((out / "gap.json").read_text())
+    (found,) = told["effects"]
+    assert (found["effect"], found["at"]) == ("actuator_delay", "*")
+    assert found["kind"] == "actuator" and len(found["places"]) == 4
+    assert found["gap_after"] == pytest.approx(told["gap"]["after"])
+    assert found["parameters"]["delay"]["value"] == pytest.approx(DT, rel=0.2)
+    assert "4 actuators alike (" in (out / "report.html").read_text()
+    entries = read_effects(out / "effects.yaml")[0]
+    assert sorted(e.at for e in entries) == sorted(found["places"])
+
+
 @pytest.mark.slow
 def test_what_both_knees_have_is_named_once(tmp_path: Path) -> None:
     """Both knees turn heavier than the model says."""
     (tmp_path / "robot.xml").write_text(robot_xml().format(more=""))
     m = mujoco.MjModel.from_xml_string(robot_xml().format(more='armature="0.01"'))
-    names = [m.joint(j).name for j in range(m.njnt)]
-    head = ["time", *(f"qpos.{n}" for n in names), *(f"ctrl.{n}" for n in names)]
-    for k in range(2):
-        run = recorded_of(m, k, 400)
-        rows = np.c_[run.time, run.qpos, run.ctrl]
-        text = {"delimiter": ",", "header": ",".join(head), "comments": ""}
-        np.savetxt(tmp_path / f"run{k}.csv", rows, "%.9g", **text)
-    logs = [tmp_path / f"run{k}.csv" for k in range(2)]
-    out = tmp_path / "out"
+    logs, out = write_logs(tmp_path, m), tmp_path / "out"
     command(
         *(gap, "--model", tmp_path / "robot.xml", "--data", *logs, "--out", out),
         *("--engine", "mujoco"),
