@@ -119,12 +119,12 @@ class Places:
         ]
 
     def groups(self) -> dict[str, tuple[str, ...]]:
-        """Names of actuators by the pattern of those that are like each other; of one
-        that is like no other, by its name."""
+        """Names of actuators that are like each other, by their pattern; none by the
+        name of one that is like no other."""
         like = like_places(self.m, "actuator")
         grouped = {name for names in like.values() for name in names}
         single = [n for n in language.names(self.m, "actuator") if n not in grouped]
-        return like | {name: (name,) for name in single}
+        return like | {name: () for name in single}
 
 
 def _cycles(m: mujoco.MjModel, j: int, scales: Scales) -> list[float]:

@@ -221,7 +221,7 @@ class _Judge:
         groups = self.search.offered.groups()
 
         def only(kept: Sequence[str]) -> np.ndarray:
-            names = [name for at in kept for name in groups[at]]
+            names = [name for at in kept for name in groups[at] or (at,)]
             return self.search.each(x, place, [single[name] for name in names])
 
         every = list(groups)
@@ -230,15 +230,13 @@ class _Judge:
         scale = self.held_out.channels.scale
         order = np.argsort(-np.asarray(measure.gap(squares.mean(1), scale)))
         ranked = [every[i] for i in order]
-        seen = [
-            every[i] for i in order if not self._as_good(mine, squares[i])
-        ] or ranked
-        if 1 < len(every) == len(seen) and all(len(x) > 1 for x in groups.values()):
+        worse = [every[i] for i in order if not self._as_good(mine, squares[i])]
+        seen = worse or ranked
+        if 1 < len(every) == len(seen) and all(groups.values()):
             return (Site("*", whole.gap, tuple(single)),)
         some = self._squares([only(seen[:k]) for k in range(1, len(seen))])
         gaps = [*(float(measure.gap(s.mean(0), scale)) for s in some), whole.gap]
-        like = [names if len(names) > 1 else () for names in map(groups.get, seen)]
-        return tuple(map(Site, seen, gaps, like))
+        return tuple(map(Site, seen, gaps, (groups[at] for at in seen)))
 
     def _squares(self, vectors: Sequence[np.ndarray]) -> np.ndarray:
         """Mean squares of each held-out window, ``(B, W, c)``."""

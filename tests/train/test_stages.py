@@ -72,7 +72,8 @@ def test_a_fit_that_diverged_is_no_result() -> None:
         a = {key: jnp.array(value) for key, value in given.items()}
         none_of = dict.fromkeys(("low", "high", "uniform"), jnp.zeros((2, 0)))
         told = Distribution(mean=a.pop("mean"), factor=a.pop("factor"), **none_of)
-        return Estimate(**none | a | {"distribution": told, "doubted": ()})
+        none |= {**a, "distribution": told, "doubted": ()}
+        return Estimate(**none)
 
     found_check((3, 7), ("mass", "kp"), found())
     for odd, why in (
