@@ -116,7 +116,7 @@ def _at(row: Effect, o: _Object, cycles: float = np.nan) -> Iterator[Place]:
     if o.tied and kind == "body":
         # A mass acts where theirs is; directions are mirror images, left and right.
         parts = tuple(p for p in parts if not p.number.is_shape)
-        if len(parts) > 1:
+        if len(parts) != 1:
             return
     columns = tuple(_column(part, o) for part in parts)
     if o.tied and not all(map(_adds, parts, columns)):
