@@ -147,12 +147,12 @@ def _centered(rows: list[dict[str, Any]]) -> list[str]:
     most, count = max(means)
     error = count**-0.5
     least = most - _TWO_SIDED * error
-    told = met(most <= OFF) if most <= OFF or least > OFF else NOT_TOLD
+    end = met(most <= OFF) if most <= OFF or least > OFF else NOT_TOLD
     return [
         f"Of {len(told)} parameters, where the data determine them, the mean error "
         f"after refinement is {most:.2f} of its stated standard deviation at most "
         f"(by {count} targets, standard error {error:.2f}); goal {OFF:g}: "
-        f"{told}."
+        f"{end}."
     ]
 
 
