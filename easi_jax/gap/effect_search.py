@@ -145,6 +145,7 @@ class EffectSearch:
 
     Attributes:
         at: the windows that what was found is fitted to at the end.
+        asked: the lengths that had a say.
     """
 
     def __init__(
@@ -152,7 +153,7 @@ class EffectSearch:
     ) -> None:
         self.lengths, self.settles, self.offered = lengths, settles, offered
         self.tell = tell
-        self.at = lengths[settles]
+        self.at, self.asked = lengths[settles], [lengths[settles]]
         # Of a larger robot, names that promised most at any stage, or came in since.
         self._likely: set[str] | None = (
             set() if self.at.predictor.simulator.wide else None
@@ -166,7 +167,7 @@ class EffectSearch:
         what it does there is not linear in what it lacks. Longer ones are asked for
         what shorter ones cannot show, once nothing is left open in those.
         """
-        self.at, found = self.lengths[self.settles], start
+        self.at, self.asked, found = self.lengths[self.settles], [], start
         fitted_to = self.at
         homes: dict[str, Fitting] = {}
         spared: set[str] = set()  # shown by windows of other lengths
@@ -178,6 +179,7 @@ class EffectSearch:
                 before = self.lengths[k - 1]
                 if before.sticks or not before.closed_by(found):
                     break
+            self.asked.append(length)
             known = {p.key for p in found.places}
             seconds = (length.steps - length.data.lead) * length.data.dt
             self.tell(f"windows of {seconds:.3g} s:")

@@ -165,9 +165,8 @@ class _Judge:
 
     def found(self, rivals: Mapping[str, Sequence[Model]]) -> list[Found]:
         """All effects, what it costs most to take out first."""
-        numbers = self.numbers
-        without = {p.key: self.at.without(self.model, [p]) for p in self.model.places}
-        costs = {k: cost(self.model, less) for k, less in without.items()}
+        numbers, missed = self.numbers, self._missed()
+        costs = {key: lost for key, (lost, _) in missed.items()}
         places = sorted(self.model.places, key=lambda p: -costs[p.key])
         found = []
         for k, place in enumerate(places):
@@ -191,11 +190,24 @@ class _Judge:
                     sites,
                     costs[place.key],
                     numbers.outcome(place),
-                    certainty(self.model, without[place.key]),
+                    missed[place.key][1],
                     odds,
                 )
             )
         return found
+
+    def _missed(self) -> dict[str, tuple[float, float]]:
+        """What it costs to take each effect out, and how sure that is, in windows of
+        the length that shows it most: each length has rows of its own noise and
+        nothing is added across them."""
+        found: dict[str, list[tuple[float, float]]] = {}
+        for length in self.search.asked:
+            mine = self.model if length is self.at else length.again(self.model)
+            for place in self.model.places:
+                less = length.without(mine, [place])
+                both = cost(mine, less), certainty(mine, less)
+                found.setdefault(place.key, []).append(both)
+        return {key: max(each) for key, each in found.items()}
 
     def _odds(self, mine: Model, rivals: Sequence[Model]) -> tuple[float, list[str]]:
         """Odds of an effect's rivals but its twins, and the names of those that predict

@@ -91,11 +91,12 @@ class Place:
         return not self.at and self.row.is_shared
 
     def possible(self, values: np.ndarray) -> bool:
-        """Whether a machine can have it with these values of its columns."""
+        """Whether a machine can have it with these values of its columns. A spring that
+        does not stiffen is a constant force, which has a name of its own."""
         low, high = self.rests
-        if not self.row.rests or not values[0] > 0:
+        if not self.row.rests or not np.any(values):
             return True
-        return bool(low <= values[1] / values[0] <= high)
+        return bool(values[0] > 0 and low <= values[1] / values[0] <= high)
 
     def unlikely(self, values: np.ndarray) -> int:
         """For how many reasons few machines have it with these values of its columns:

@@ -131,7 +131,8 @@ def test_a_spring_rests_where_its_joint_can_be() -> None:
         assert -most - 1e-9 <= low < high <= most + 1e-9
         assert spring.possible(np.array([2.0, 2.0 * 0.9 * high]))
         assert not spring.possible(np.array([2.0, 2.0 * 1.1 * high]))
-        assert spring.possible(np.array([0.0, 100.0])), "without a spring"
+        assert not spring.possible(np.array([0.0, 100.0])), "a constant force"
+        assert spring.possible(np.zeros(2))
 
 
 def test_friction_that_stops_all_motion_is_out_of_bounds() -> None:
