@@ -116,7 +116,7 @@ class Analysis:
         shown = [*self.places.everywhere, *self.places.ripples]
         layout = Layout(mj_model, shown)
         self.bounds = bounds_of(space, layout)
-        cut = WindowsOf(mj_model, scales.longest, sensors)
+        self._windows = cut = WindowsOf(mj_model, scales.longest, sensors)
         reported, kept = cut.some(fit, horizon), cut.all(held, horizon, len(fit))
         if reported is None or kept is None:
             what = "to fit" if reported is None else "held out"
@@ -158,7 +158,9 @@ class Analysis:
             (k for k, f in enumerate(lengths) if f.steps <= middle), default=0
         )
         self.search = EffectSearch(lengths, settles, self.places, tell)
-        self.held_out = self._held_out(kept, len(seen) // BLOCK)
+        channels = self.reported.channels
+        first = len(seen) // BLOCK
+        self.held_out = self._held_out(kept, self.predictor, first, channels)
 
     def _fitting(self, predictor: Predictor, windows: WindowSet, steps: int) -> Fitting:
         given = self.data, predictor, windows, steps
@@ -199,13 +201,15 @@ class Analysis:
         given = data.m, data.fit, data.noise[:compared], steps - data.lead, data.sensors
         return bool(np.isfinite(measure.channels(*given).scale).any())
 
-    def _held_out(self, kept: WindowSet, first: int) -> HeldOut:
-        """Held-out windows, from one block of the predictor's on."""
-        data, p = self.data, self.predictor
+    def _held_out(
+        self, kept: WindowSet, p: Predictor, first: int, channels: measure.Channels
+    ) -> HeldOut:
+        """Held-out windows, from one block of a predictor's on."""
+        data = self.data
         blocks = np.arange(first, p.blocks)
         given = self.m, p, data.fit, data.scales, data.noise, blocks, len(kept)
         return HeldOut(
-            *(self.m, data.runs, p, kept, self.reported.channels),
+            *(self.m, data.runs, p, kept, channels),
             *(window_starts(*given), data.lead, data.resolution),
         )
 
@@ -371,7 +375,8 @@ class Analysis:
         if at.sticks or len(c.model.fit.active):
             noises = at.doubt_steps(c.model.fit.x, self._finer(at))
         found = c.base, c.model, c.rivals
-        outcome = stated(search, self.held_out, self.space, *found, self.step)
+        windows = self.held_out, self.judges(at)
+        outcome = stated(search, *windows, self.space, *found, self.step)
         if not at.sticks or noises < STEPS_SEEN:
             return outcome
         note = (
@@ -380,6 +385,23 @@ class Analysis:
             "told from what the model lacks: a smaller timestep takes it away"
         )
         return replace(outcome, notes=[*outcome.notes, note])
+
+    def judges(self, at: Fitting) -> HeldOut:
+        """Held-out windows as long as those of ``at``; those of the horizon where they
+        are, or where no run is that long."""
+        data = self.data
+        if at.steps == self.predictor.steps:
+            return self.held_out
+        seconds = (at.steps - data.lead) * data.dt
+        held = data.runs[len(data.fit) :]
+        windows = self._windows.all(held, seconds, len(data.fit))
+        if windows is None:
+            return self.held_out
+        every, most = len(windows), at.predictor.capacity
+        if every > most:
+            windows = windows.take(np.arange(most) * every // most)
+        predictor = at.predictor.on(filled(windows))
+        return self._held_out(windows, predictor, 0, at.channels)
 
     def _finer(self, at: Fitting) -> Predictor:
         """Predictions in the windows of ``at``, but of sensors, by native MuJoCo with

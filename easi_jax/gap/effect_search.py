@@ -145,7 +145,6 @@ class EffectSearch:
 
     Attributes:
         at: the windows that what was found is fitted to at the end.
-        asked: the lengths that had a say.
     """
 
     def __init__(
@@ -153,7 +152,7 @@ class EffectSearch:
     ) -> None:
         self.lengths, self.settles, self.offered = lengths, settles, offered
         self.tell = tell
-        self.at, self.asked = lengths[settles], [lengths[settles]]
+        self.at = lengths[settles]
         # Of a larger robot, names that promised most at any stage, or came in since.
         self._likely: set[str] | None = (
             set() if self.at.predictor.simulator.wide else None
@@ -167,7 +166,7 @@ class EffectSearch:
         what it does there is not linear in what it lacks. Longer ones are asked for
         what shorter ones cannot show, once nothing is left open in those.
         """
-        self.at, self.asked, found = self.lengths[self.settles], [], start
+        self.at, found = self.lengths[self.settles], start
         fitted_to = self.at
         homes: dict[str, Fitting] = {}
         spared: set[str] = set()  # shown by windows of other lengths
@@ -179,7 +178,6 @@ class EffectSearch:
                 before = self.lengths[k - 1]
                 if before.sticks or not before.closed_by(found):
                     break
-            self.asked.append(length)
             known = {p.key for p in found.places}
             seconds = (length.steps - length.data.lead) * length.data.dt
             self.tell(f"windows of {seconds:.3g} s:")
@@ -220,7 +218,8 @@ class EffectSearch:
                     break
             else:
                 self.tell(f"- {place.key}: windows of no length need it")
-                found = self.at.without(found, [place])
+                less = self.at.without(found, [place])
+                found = self.at.selector.fit(less.places, less.fit.x)
         return found
 
     def _added(self, at: Fitting, start: Model, spared: Collection[str]) -> Model:

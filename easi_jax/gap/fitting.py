@@ -325,12 +325,13 @@ class Fitting:
         return self.selector.fit(model.places, self.vector(model.fit.x))
 
     def without(self, model: Model, gone: Sequence[Place]) -> Model:
-        """A model of these windows fitted without some of its effects."""
+        """A model of these windows fitted without some of its effects. What is left may
+        be what no machine has: that says no more of what went."""
         kept = [p for p in model.places if p not in gone]
         x = model.fit.x
         for place in gone:
             x = self.selector.without(x, place, kept)
-        return self.selector.fit(kept, x)
+        return self.selector.fit(kept, x, possible=False)
 
     def stuck(self, model: Model) -> list[int]:
         """The model's own parameters that a refit moved to a bound."""

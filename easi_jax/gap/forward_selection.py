@@ -154,11 +154,13 @@ class Selector:
         out[index] = self.predictor.neutral[index]
         return out
 
-    def model(self, places: list[Place], fit: Fitted) -> Model:
-        """A fit with its cross-validated loss."""
-        unlikely = sum(p.unlikely(fit.x[self.columns(p, fitted=False)]) for p in places)
+    def model(self, places: list[Place], fit: Fitted, possible: bool = True) -> Model:
+        """A fit with its cross-validated loss; infinite where no machine can be so, if
+        it is to be ``possible``."""
+        numbers = [fit.x[self.columns(p, fitted=False)] for p in places]
+        unlikely = sum(map(Place.unlikely, places, numbers))
         windows = self.cross_validated(fit)
-        if not all(p.possible(fit.x[self.columns(p, fitted=False)]) for p in places):
+        if possible and not all(map(Place.possible, places, numbers)):
             windows = np.full_like(windows, np.inf)
         loss, gap = self._of_blocks(windows)
         felt = {p.key: self._felt(p, fit) for p in places}
@@ -173,10 +175,10 @@ class Selector:
             return sum(place.fitted)
         return int((change > DECIDE.felt * change.max()).sum())
 
-    def fit(self, places: list[Place], x: np.ndarray) -> Model:
-        """The best fit of some effects from ``x``."""
+    def fit(self, places: list[Place], x: np.ndarray, possible: bool = True) -> Model:
+        """The best fit of some effects from ``x``; ``possible`` as of `model`."""
         problem = least_squares(x[None], self.active(places), self.bounds, self.weight)
-        return self.model(places, self._solved([problem])[0])
+        return self.model(places, self._solved([problem])[0], possible)
 
     def _solved(self, problems: Sequence[Asks]) -> list[Fitted]:
         def solve() -> Arrays:

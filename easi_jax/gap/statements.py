@@ -33,18 +33,53 @@ class _Look:
         model: that was looked at.
         figures: of it.
         noise: mean squares of a perfect model, ``(c,)``.
+        scale: of each channel, ``(c,)``.
         open: the one beside the other.
     """
 
     model: Model
     figures: Figures
     noise: np.ndarray
+    scale: np.ndarray
     open: Openness
+
+
+@dataclass
+class _Looks:
+    """A model as given, refitted, and with effects (without any, the refit again)."""
+
+    given: Figures
+    refit: _Look
+    end: _Look
+
+    @property
+    def undone(self) -> bool:
+        """Whether the refit predicts worse than the model as given."""
+        return surely_better(self.given.square, self.refit.figures.square, self._scale)
+
+    @property
+    def fine(self) -> bool:
+        """Whether the effects only make up for a refit that went wrong, which is
+        nothing that is missing."""
+        given = openness(self.given.square, self.refit.noise, self._scale)
+        return self.undone and not given.is_open.any()
+
+    @property
+    def shown(self) -> bool:
+        """Whether data show the effects."""
+        least = self.given if self.undone else self.refit.figures
+        better = surely_better(self.end.figures.square, least.square, self._scale)
+        return better and not self.fine
+
+    @property
+    def _scale(self) -> np.ndarray:
+        return self.refit.scale
 
 
 def stated(
     search: EffectSearch,
     held_out: HeldOut,
+    judges: HeldOut,
     space: ParameterSpace,
     base: Model,
     model: Model,
@@ -54,6 +89,8 @@ def stated(
     """What the held-out data say of the refit, and of the effects that joined.
 
     Args:
+        judges: the held-out data in windows as long as those that effects come from:
+            these say what is named, whatever length figures are reported at.
         base: the refit of the model's own parameters.
         model: with the effects.
         rivals: of each effect, best first.
@@ -61,25 +98,19 @@ def stated(
     """
     at, scale = search.at, held_out.channels.scale
     notes: list[str] = []
-    held_out.starts.noise = at.starts.noise
-    before = held_out.look(at.plain(at.neutral))
-    refit = end = _looked(at, held_out, base)
-    undone = surely_better(before.square, refit.figures.square, scale)
-    given = openness(before.square, refit.noise, scale)
-    # What only makes up for a refit that went wrong is nothing that is missing.
-    fine = undone and not given.is_open.any()
+    looks = _looks(at, held_out, base, model)
+    judged = looks if judges is held_out else _looks(at, judges, base, model)
+    refit, end, undone = looks.refit, looks.end, judged.undone
     found: list[Found] = []
     numbers: Numbers | None = None
     if model.places:
-        end = _looked(at, held_out, model)
         # With one noise that all tell: the refit beside the better floor.
         refit.open = openness(refit.figures.square, end.noise, scale)
-        least = before if undone else refit.figures
-        if not fine and surely_better(end.figures.square, least.square, scale):
+        if judged.shown:
             judge = _Judge(search, held_out, base, end)
             found, numbers = judge.found(rivals), judge.numbers
         else:
-            notes.append(_not_named(model, fine))
+            notes.append(_not_named(model, judged.fine))
     if undone and not found:
         notes.append(
             "refitted to the fitting data, the model's own parameters predict the "
@@ -106,7 +137,7 @@ def stated(
         verdict=verdict,
         found=found,
         refitted=(numbers or _numbers(at, end.model)).refitted(space),
-        before=before,
+        before=looks.given,
         refit=refit.figures,
         after=end.figures,
         floor=float(measure.gap(end.noise, scale)),
@@ -124,6 +155,33 @@ def stated(
     )
 
 
+def missed(search: EffectSearch, model: Model) -> dict[str, tuple[float, float]]:
+    """What it costs to take each effect of a model out, and how sure that is, in
+    windows of the length that shows it most.
+
+    Nothing is added across lengths, which share rows. Where feet stick and slip, what
+    is long is not linear in what lacks, and has no say.
+
+    Args:
+        model: of the windows ``search.at``.
+
+    Returns:
+        `cost` and `certainty` by the effect's key.
+    """
+    found: dict[str, list[tuple[float, float]]] = {p.key: [] for p in model.places}
+    for length in search.lengths:
+        mine = model if length is search.at else length.again(model)
+        slips = length.sticks and length is not search.at
+        if slips or not np.isfinite(mine.loss).all():
+            continue
+        for place in model.places:
+            less = length.without(mine, [place])
+            lost = cost(mine, less)
+            if np.isfinite(lost):
+                found[place.key].append((lost, certainty(mine, less)))
+    return {key: max(each, default=(0.0, 0.0)) for key, each in found.items()}
+
+
 def _on_deviations(windows: int, verdict: str) -> list[str]:
     left = [_AS_IF_ALL] if verdict == "unexplained" else []
     return [*too_few(windows, "windows"), *left]
@@ -139,7 +197,14 @@ def _numbers(at: Fitting, model: Model) -> Numbers:
 def _looked(at: Fitting, held_out: HeldOut, model: Model) -> _Look:
     x, scale = at.plain(model.fit.x), held_out.channels.scale
     figures, noise = held_out.look(x), held_out.floor(x)
-    return _Look(model, figures, noise, openness(figures.square, noise, scale))
+    return _Look(model, figures, noise, scale, openness(figures.square, noise, scale))
+
+
+def _looks(at: Fitting, held_out: HeldOut, base: Model, model: Model) -> _Looks:
+    held_out.starts.noise = at.starts.noise
+    given, refit = held_out.look(at.plain(at.neutral)), _looked(at, held_out, base)
+    end = _looked(at, held_out, model) if model.places else refit
+    return _Looks(given, refit, end)
 
 
 class _Judge:
@@ -165,8 +230,8 @@ class _Judge:
 
     def found(self, rivals: Mapping[str, Sequence[Model]]) -> list[Found]:
         """All effects, what it costs most to take out first."""
-        numbers, missed = self.numbers, self._missed()
-        costs = {key: lost for key, (lost, _) in missed.items()}
+        numbers, each = self.numbers, missed(self.search, self.model)
+        costs = {key: lost for key, (lost, _) in each.items()}
         places = sorted(self.model.places, key=lambda p: -costs[p.key])
         found = []
         for k, place in enumerate(places):
@@ -190,24 +255,11 @@ class _Judge:
                     sites,
                     costs[place.key],
                     numbers.outcome(place),
-                    missed[place.key][1],
+                    each[place.key][1],
                     odds,
                 )
             )
         return found
-
-    def _missed(self) -> dict[str, tuple[float, float]]:
-        """What it costs to take each effect out, and how sure that is, in windows of
-        the length that shows it most: each length has rows of its own noise and
-        nothing is added across them."""
-        found: dict[str, list[tuple[float, float]]] = {}
-        for length in self.search.asked:
-            mine = self.model if length is self.at else length.again(self.model)
-            for place in self.model.places:
-                less = length.without(mine, [place])
-                both = cost(mine, less), certainty(mine, less)
-                found.setdefault(place.key, []).append(both)
-        return {key: max(each) for key, each in found.items()}
 
     def _odds(self, mine: Model, rivals: Sequence[Model]) -> tuple[float, list[str]]:
         """Odds of an effect's rivals but its twins, and the names of those that predict

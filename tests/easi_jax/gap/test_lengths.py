@@ -72,18 +72,25 @@ def analysed(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], Outcome]:
     return found
 
 
-def test_fits_see_the_same_windows_whatever_the_horizon() -> None:
+def test_names_see_the_same_windows_whatever_the_horizon() -> None:
+    """Those that are fitted, and those held out that say whether names hold."""
     m = mujoco.MjModel.from_xml_string(MODEL.format(more=""))
     runs = [recorded(k) for k in (0, 1)]
-    seen = []
+    seen, judged = [], []
     for horizon in (0.1, 0.2, 0.6):
         given = m, ParameterSpace(()), runs[:1], runs[1:], np.array([NOISE]), horizon
         with engine.using("mujoco"):
-            search = Analysis(*given).search
+            analysis = Analysis(*given)
+            search, judges = analysis.search, analysis.judges(analysis.search.at)
         assert search.at.steps * DT == pytest.approx(0.25)
+        assert (judges is analysis.held_out) == (horizon == 0.2)
+        judged.append(judges.windows.row.tolist())
+        x = search.at.plain(search.at.neutral)
+        judged.append(round(judges.look(x).gap, 9))
         lengths = [(f.steps, f.windows.row.tolist()) for f in search.lengths]
         seen.append(lengths)
     assert seen[0] == seen[1] == seen[2]
+    assert judged[:2] == judged[2:4] == judged[4:]
     assert [steps - 5 for steps, _ in seen[0]] == [10, 20, 100]
 
 

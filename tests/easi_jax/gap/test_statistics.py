@@ -2,6 +2,8 @@
 
 import copy
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import mujoco
 import numpy as np
@@ -25,6 +27,7 @@ from easi_jax.gap.batched_least_squares import (
 )
 from easi_jax.gap.candidates import places, ripples
 from easi_jax.gap.discretization_error import error_of_steps, within_a_step
+from easi_jax.gap.effect_search import EffectSearch
 from easi_jax.gap.effect_set import Candidate, Model
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.forward_selection import Selector
@@ -42,6 +45,7 @@ from easi_jax.gap.model_comparison import (
 from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.screening import as_sine, shortlist
 from easi_jax.gap.sensor_faults import reading_faults
+from easi_jax.gap.statements import missed
 from easi_jax.gap.table import Place
 from easi_jax.gap.whitening import Residuals, make_residuals, row_groups
 from easi_jax.gap.window_set import window_set
@@ -579,6 +583,44 @@ def test_what_costs_much_to_take_out_is_sure() -> None:
     assert sure == sorted(sure) and sure[0] == 0.0
     assert sure[1] < 0.05 and sure[2] < 0.5 < sure[3] and 0.9 < sure[-1] < 1.0
     assert confidence(3.0, 1.0) == pytest.approx(0.5 * sure[-1])
+
+
+def test_an_effect_is_missed_as_in_the_windows_that_show_it_most() -> None:
+    """Light damping shows in long windows, which say all that they say alone; where
+    feet slip, or the rest is no machine, a length has no say."""
+    rng, damping = (
+        np.random.default_rng(0),
+        Place("viscous_damping", "j", "joint", (), ()),
+    )
+
+    class Length:
+        """Windows of one length, in which errors grow so much without the effect."""
+
+        def __init__(self, times: float, sticks: bool = False) -> None:
+            self.times, self.sticks = times, sticks
+            self.mine = of_loss(10.0 + rng.random(10))
+            self.mine.places = [damping]
+
+        def again(self, _: Model) -> Model:
+            return self.mine
+
+        def without(self, model: Model, gone: list[Place]) -> Model:
+            assert model is self.mine and gone == [damping]
+            return of_loss(self.times * self.mine.loss)
+
+    short, long, slips, lost = Length(1.5), Length(4.0), Length(9.0, True), Length(1.0)
+    lost.mine.loss = np.full(10, np.inf)
+    for at, others, most in (
+        (short, [long, slips, lost], long),
+        (long, [short, slips], long),
+        (slips, [short], slips),
+    ):
+        lengths = SimpleNamespace(at=at, lengths=[at, *others])
+        found = missed(cast(EffectSearch, lengths), at.mine)
+        less = most.without(most.mine, [damping])
+        (key, (lost, _)) = found.popitem()
+        assert (key, lost) == (damping.key, cost(most.mine, less)) and not found
+        assert lost == pytest.approx(0.5 * np.log(most.times), rel=0.1)
 
 
 def test_twins_predict_the_same() -> None:
