@@ -13,7 +13,13 @@ import numpy as np
 
 from easi_jax.errors import UserError
 from easi_jax.io.files import os_reason, regular_file
-from easi_jax.io.models.completed import as_read, held_joint, hold, names_note
+from easi_jax.io.models.completed import (
+    as_read,
+    held_joint,
+    hold,
+    names_note,
+    new_names,
+)
 from easi_jax.model.mjx_model import put_model, simulated
 from easi_jax.model.mujoco_warnings import warnings_to
 from easi_jax.simulation import engine
@@ -48,7 +54,8 @@ def read_mjcf(
     tell: Callable[[str], None] = _warn,
     held: Callable[[mujoco.MjModel], np.ndarray] | None = None,
 ) -> mujoco.MjModel:
-    """The compiled model in ``path``; its joints and actuators without a name get one.
+    """The compiled model in ``path``; its bodies, joints and actuators without a name
+    get one.
 
     Files that it includes, and its meshes, textures and height fields, must lie in
     its folder or below, symbolic links followed: a model from elsewhere cannot read
@@ -72,7 +79,7 @@ def read_mjcf(
             model.names.decode()
             simulated(model)
             note = names_note(model)
-            if note or held:
+            if any(new_names(model).values()) or held:
                 spec = as_read(path)
                 model = spec.compile()
                 if held and not held_joint(model):

@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 
 import easi_jax
+from easi_jax.data.scales import scales_of
 from easi_jax.errors import UserError
+from easi_jax.gap.candidates import places
 from easi_jax.io.logs.columns import log_columns
 from easi_jax.io.logs.reader import first_pose, read_logs
 from easi_jax.io.models.completed import held_joint, names_note, new_names
 from easi_jax.io.models.mjcf import read_mjcf
 from easi_jax.io.models.repaired_mjcf import deviations, repaired_model
 from easi_jax.model.effect_numbers import EffectEntry
+from tests.easi_jax.gap.test_lengths import recorded_of
 from train._gap_config import Config as GapConfig
 from train._gap_problem import read_model
 from train._log_problem import held_of
@@ -68,6 +71,27 @@ def test_what_has_no_name_gets_one_and_is_told_in_one_line(vendor: Path) -> None
     assert deviations(m, mujoco.MjModel.from_xml_path(str(vendor))) == []
     assert "qpos.body4_joint" in log_columns(m).qpos
     assert names_note(m) == ""
+
+
+def test_bodies_alone_get_names_too(tmp_path: Path) -> None:
+    """Two bodies without one: an effect at either is an effect at a place."""
+    path = tmp_path / "arm.xml"
+    link = (
+        '<body pos="0 0 -.3"><joint name="{j}" axis="0 1 0"/><geom size=".05"/>{more}'
+    )
+    inner = link.format(j="b", more="</body>")
+    path.write_text(
+        f"<mujoco><worldbody>{link.format(j='a', more=inner)}</body></worldbody>"
+        '<actuator><motor name="m" joint="a"/></actuator></mujoco>'
+    )
+    told: list[str] = []
+    m = read_mjcf(path, tell=told.append)
+    assert [m.body(b).name for b in range(3)] == ["world", "body1", "body2"]
+    assert not told, "their names say what they are"
+    loads = [
+        p for p in places(m, scales_of(m, [recorded_of(m, 0)])) if p.kind == "body"
+    ]
+    assert {p.at for p in loads if p.effect == "payload_mass"} >= {"body1", "body2"}
 
 
 def test_python_users_are_warned(vendor: Path) -> None:
