@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -96,7 +97,7 @@ def read_excite_problem(config: "Config") -> ExciteProblem:
     most = _numbers("--amplitude", config.amplitude, of_actuator, np.full(m.nu, np.inf))
     rows = round(config.duration / dt) + 1
     bench, more = make_bench(m, limits, dt, rows, config.play)
-    pairs, strengths = _from_gap(config, notes)
+    pairs, strengths = from_gap(config.gap, m, notes)
     return ExciteProblem(
         model.name,
         m,
@@ -285,21 +286,29 @@ def _from_data(
     return runs[0].dt, noise, scales_of(m, runs)
 
 
-def _from_gap(
-    config: "Config", notes: list[str]
+def from_gap(
+    gap: Path | None, m: "mujoco.MjModel", notes: list[str]
 ) -> tuple[list[tuple[str, str]], Strengths]:
-    """What a result of train.gap leaves open, with the strengths that it found."""
-    if config.gap is None:
+    """What a result of train.gap leaves open, with the strengths that it found.
+
+    Of like places the first stands for all: what tells its names apart tells theirs.
+
+    Args:
+        gap: a run folder, or its ``gap.json``.
+        m: the model that it is of.
+        notes: takes what is to be told.
+    """
+    if gap is None:
         return [], {}
     from easi_jax.io.models.effects_file import read_effects
     from easi_jax.io.runs.schemas import GAP, read_checked
 
-    path = config.gap / "gap.json" if config.gap.is_dir() else config.gap
+    path = gap / "gap.json" if gap.is_dir() else gap
     told = read_checked(path, GAP, "a gap.json of train.gap")
     pairs = []
     for effect in told["effects"]:
-        key = f"{effect['effect']}@{effect['at']}"
-        pairs += [(key, other) for other in effect["indistinguishable"]]
+        key = _single(f"{effect['effect']}@{effect['at']}", m)
+        pairs += [(key, _single(other, m)) for other in effect["indistinguishable"]]
     if not pairs:
         notes.append(f"{path} leaves no names open: the test is chosen for all effects")
         return [], {}
@@ -308,3 +317,17 @@ def _from_gap(
     found = read_effects(beside)[0] if beside.exists() else []
     strengths = {f"{e.effect}@{e.at}": e.columns for e in found}
     return list(dict.fromkeys(pairs)), strengths
+
+
+def _single(key: str, m: "mujoco.MjModel") -> str:
+    """``effect@PATTERN`` at the first place of the model that the pattern fits."""
+    from easi_jax.model import addresses as language
+    from easi_jax.model.effect_catalog import CATALOG
+
+    effect, _, at = key.partition("@")
+    for kind in CATALOG[effect].sites if "*" in at and effect in CATALOG else ():
+        if kind in ("joint", "actuator", "body"):
+            fits = language.matching(at, language.names(m, kind))
+            if fits:
+                return f"{effect}@{fits[0]}"
+    return key

@@ -194,7 +194,11 @@ def _record_next(
             outcome.x,
             outcome.active,
             f.place,
-            [known[key] for key in f.indistinguishable[:_ASKED]],
+            # What all actuators have alike is offered once, and told by groups.
+            [
+                known.get(key) or known[f"{key.partition('@')[0]}@"]
+                for key in f.indistinguishable[:_ASKED]
+            ],
             problem.fit,
             analysis.data.noise[: problem.model.mj_model.nv],
             horizon,

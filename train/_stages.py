@@ -255,8 +255,8 @@ def found_check(seeds: Sequence[int], names: Sequence[str], found: Any) -> None:
         why = diverged(jax.tree.map(lambda x, i=i: x[i], found), names)
         if why:
             raise UserError(
-                f"seed {seed}: the fit diverged: {why}; another seed or --no-refine "
-                "may do, but please report it: the fault is in easi_jax"
+                f"seed {seed}: the fit diverged: {why}; another seed may do, but "
+                "please report it: the fault is in easi_jax"
             )
 
 

@@ -397,11 +397,11 @@ class Analysis:
         windows = self._windows.all(held, seconds, len(data.fit))
         if windows is None:
             return self.held_out
-        every, most = len(windows), at.predictor.capacity
-        if every > most:
-            windows = windows.take(np.arange(most) * every // most)
         predictor = at.predictor.on(filled(windows))
-        return self._held_out(windows, predictor, 0, at.channels)
+        found = self._held_out(windows, predictor, 0, at.channels)
+        if at.own_steps:
+            found.steps = steps_error(predictor, data)[: len(windows)]
+        return found
 
     def _finer(self, at: Fitting) -> Predictor:
         """Predictions in the windows of ``at``, but of sensors, by native MuJoCo with

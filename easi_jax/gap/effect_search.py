@@ -111,12 +111,13 @@ class Places:
         self._dropped |= {p.key for p in gone}
 
     def singles(self, place: Place) -> list[Place]:
-        """Of each actuator what a shared effect is of all."""
-        return [
-            p
-            for p in self.everywhere
-            if (p.effect, p.kind, p.tied) == (place.effect, "actuator", ())
-        ]
+        """What an effect of several places is at each of them."""
+        each: dict[str, Place] = {}
+        for p in self.everywhere:
+            mine = p.kind == "actuator" if place.shared else p.at in place.tied
+            if mine and p.effect == place.effect and not p.tied and p.at:
+                each.setdefault(p.key, p)  # of some shapes the first
+        return [*each.values()]
 
     def groups(self) -> dict[str, tuple[str, ...]]:
         """Names of actuators that are like each other, by their pattern; none by the
@@ -218,8 +219,7 @@ class EffectSearch:
                     break
             else:
                 self.tell(f"- {place.key}: windows of no length need it")
-                less = self.at.without(found, [place])
-                found = self.at.selector.fit(less.places, less.fit.x)
+                found = self.at.without(found, [place])
         return found
 
     def _added(self, at: Fitting, start: Model, spared: Collection[str]) -> Model:
@@ -394,10 +394,10 @@ class EffectSearch:
     def _apart(
         self, model: Model, rivals: dict[str, list[Model]]
     ) -> tuple[Model, dict[str, list[Model]]]:
-        """The model with what each actuator has in place of what all have, where one of
+        """The model with what each place has in place of what all have, where one of
         them differs."""
         named = {p.key for p in model.places}
-        for place in [p for p in model.places if p.shared]:
+        for place in [p for p in model.places if p.shared or p.tied]:
             singles = self.offered.singles(place)
             new = [p for p in singles if p.key not in named]
             if len(new) == len(singles):
@@ -409,7 +409,7 @@ class EffectSearch:
         return model, rivals
 
     def each(self, x: np.ndarray, place: Place, singles: Sequence[Place]) -> np.ndarray:
-        """A vector in which these actuators have by themselves what all had."""
+        """A vector in which these places have by themselves what all had."""
         out, columns = x.copy(), self.at.selector.columns
         shared = columns(place)
         out[shared] = self.at.neutral[shared]

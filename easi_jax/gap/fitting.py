@@ -324,14 +324,16 @@ class Fitting:
             self.begin(self.plain(model.fit.x))
         return self.selector.fit(model.places, self.vector(model.fit.x))
 
-    def without(self, model: Model, gone: Sequence[Place]) -> Model:
-        """A model of these windows fitted without some of its effects. What is left may
-        be what no machine has: that says no more of what went."""
+    def without(
+        self, model: Model, gone: Sequence[Place], possible: bool = True
+    ) -> Model:
+        """A model of these windows fitted without some of its effects; ``possible`` as
+        of `Selector.model`."""
         kept = [p for p in model.places if p not in gone]
         x = model.fit.x
         for place in gone:
             x = self.selector.without(x, place, kept)
-        return self.selector.fit(kept, x, possible=False)
+        return self.selector.fit(kept, x, possible)
 
     def stuck(self, model: Model) -> list[int]:
         """The model's own parameters that a refit moved to a bound."""

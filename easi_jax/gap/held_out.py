@@ -23,7 +23,7 @@ class HeldOut:
     Attributes:
         m: the model that was recorded.
         runs: that ``windows.run`` counts.
-        predictor: that predicts them, as its last blocks.
+        predictor: that predicts them, among others or alone.
         windows: W of them.
         channels: that are compared.
         starts: their start states.

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from easi_jax.errors import UserError
 from easi_jax.estimation.blocks import too_few
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.decisions import DECIDE
@@ -19,6 +20,9 @@ from easi_jax.gap.verdict import Openness, openness, surely_better, verdict_of
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.results import Site
 
+# Nats, of an effect without which predictions are not finite: as with e^20 times the
+# squared error.
+_BLOWS_UP = 10.0
 _AS_IF_ALL = (
     "standard deviations of what is named count as if nothing else were missing; what "
     "is may have moved the values by more"
@@ -107,7 +111,7 @@ def stated(
         # With one noise that all tell: the refit beside the better floor.
         refit.open = openness(refit.figures.square, end.noise, scale)
         if judged.shown:
-            judge = _Judge(search, held_out, base, end)
+            judge = _Judge(search, held_out, judges, base, end)
             found, numbers = judge.found(rivals), judge.numbers
         else:
             notes.append(_not_named(model, judged.fine))
@@ -170,16 +174,30 @@ def missed(search: EffectSearch, model: Model) -> dict[str, tuple[float, float]]
     """
     found: dict[str, list[tuple[float, float]]] = {p.key: [] for p in model.places}
     for length in search.lengths:
-        mine = model if length is search.at else length.again(model)
-        slips = length.sticks and length is not search.at
-        if slips or not np.isfinite(mine.loss).all():
+        mine = _in_windows(length, search.at, model)
+        if mine is None:
             continue
         for place in model.places:
-            less = length.without(mine, [place])
-            lost = cost(mine, less)
-            if np.isfinite(lost):
-                found[place.key].append((lost, certainty(mine, less)))
+            less = length.without(mine, [place], possible=False)
+            if np.isfinite(less.loss).all():
+                found[place.key].append((cost(mine, less), certainty(mine, less)))
+            else:
+                found[place.key].append((_BLOWS_UP, certainty(mine, less)))
     return {key: max(each, default=(0.0, 0.0)) for key, each in found.items()}
+
+
+def _in_windows(length: Fitting, at: Fitting, model: Model) -> Model | None:
+    """A model of the windows ``at`` in those of another length; None where these say
+    nothing of it."""
+    if length is at:
+        return model
+    if at.sticks and length.steps > at.steps:
+        return None
+    try:
+        mine = length.again(model)
+    except UserError:  # most predictions that long are not finite
+        return None
+    return None if length.sticks or not np.isfinite(mine.loss).all() else mine
 
 
 def _on_deviations(windows: int, verdict: str) -> list[str]:
@@ -212,21 +230,28 @@ class _Judge:
     of own steps.
 
     Args:
+        held_out: whose figures are told, and ``judges``, that say which names and
+            places do as well as others.
         base: the model without effects.
         end: with all of them.
     """
 
     def __init__(
-        self, search: EffectSearch, held_out: HeldOut, base: Model, end: _Look
+        self,
+        search: EffectSearch,
+        held_out: HeldOut,
+        judges: HeldOut,
+        base: Model,
+        end: _Look,
     ) -> None:
-        self.search, self.held_out = search, held_out
+        self.search, self.held_out, self.judges = search, held_out, judges
         self.at, self.model, self.end = search.at, end.model, end
         self.whole, self.base = self._fair(end.model), self._fair(base)
         self.numbers = _numbers(self.at, self.model)
 
     def _fair(self, model: Model) -> Figures:
         x = model.fit.x
-        return self.held_out.figures(self.at.plain(x), self.at.share(x))
+        return self.judges.figures(self.at.plain(x), self.at.share(x))
 
     def found(self, rivals: Mapping[str, Sequence[Model]]) -> list[Found]:
         """All effects, what it costs most to take out first."""
@@ -289,27 +314,29 @@ class _Judge:
             return self.search.each(x, place, [single[name] for name in names])
 
         every = list(groups)
-        squares = self._squares([only([k for k in every if k != at]) for at in every])
-        (mine,) = self._squares([x])
-        scale = self.held_out.channels.scale
+        judges, scale = self.judges, self.judges.channels.scale
+        parted = [only([k for k in every if k != at]) for at in every]
+        squares = self._squares(judges, parted)
+        (mine,) = self._squares(judges, [x])
         order = np.argsort(-np.asarray(measure.gap(squares.mean(1), scale)))
         ranked = [every[i] for i in order]
         worse = [every[i] for i in order if not self._as_good(mine, squares[i])]
         seen = worse or ranked
         if 1 < len(every) == len(seen) and all(groups.values()):
             return (Site("*", whole.gap, tuple(single)),)
-        some = self._squares([only(seen[:k]) for k in range(1, len(seen))])
+        parted = [only(seen[:k]) for k in range(1, len(seen))]
+        some, scale = self._squares(self.held_out, parted), self.held_out.channels.scale
         gaps = [*(float(measure.gap(s.mean(0), scale)) for s in some), whole.gap]
         return tuple(map(Site, seen, gaps, (groups[at] for at in seen)))
 
-    def _squares(self, vectors: Sequence[np.ndarray]) -> np.ndarray:
+    def _squares(self, windows: HeldOut, vectors: Sequence[np.ndarray]) -> np.ndarray:
         """Mean squares of each held-out window, ``(B, W, c)``."""
-        return self.held_out.squares(np.array([self.at.plain(x) for x in vectors]))
+        return windows.squares(np.array([self.at.plain(x) for x in vectors]))
 
     def _as_good(self, mine: np.ndarray, theirs: np.ndarray) -> bool:
         """Whether the difference of two held-out gaps may be none, or is in favor;
         from mean squares of each window, ``(W, c)``."""
-        scale = self.held_out.channels.scale
+        scale = self.judges.channels.scale
         weights = measure.resampled(len(mine), 1)
         d = measure.gap(weights @ theirs, scale) - measure.gap(weights @ mine, scale)
         # Twins differ by rounding alone.

@@ -120,7 +120,8 @@ def _parameter(
     start = max(value - half, low), min(value + half, high)
     if EFFECT_TABLE[column].is_shift:
         high = min(high, _FARTHER * start[1])
-    at = "all" if len(alike) == m.nu > 1 else "+".join(e.at for e in alike)
+    every = entry.kind == "actuator" and len(alike) == m.nu > 1
+    at = "all" if every else "+".join(e.at for e in alike)
     place = f"@{at}" if at else ""
     name = public_name(f"{entry.effect}{place}.{EFFECT_TABLE[column].word}")
     return Parameter(name, addresses, value, start, (low, high), unit, log=False)

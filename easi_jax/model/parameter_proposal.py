@@ -190,7 +190,7 @@ def like_places(m: mujoco.MjModel, kind: str) -> dict[str, tuple[str, ...]]:
 def _stated(m: mujoco.MjModel, kind: str, i: int) -> tuple[float, ...]:
     """Numbers of a joint, an actuator or a body."""
     if kind == "body":
-        return (float(m.body_mass[i]),)
+        return (float(f"{m.body_mass[i]:.9g}"),)  # but for rounding of mirrored meshes
     if kind == "joint":
         d = int(m.jnt_dofadr[i])
         own = (m.dof_damping[d], m.dof_frictionloss[d], m.dof_armature[d])

@@ -50,6 +50,7 @@ ELSEWHERE = {
     "sensor_faults": {
         *("_LONGEST", "PIECES", "_SAME_STEP", "_TRIED", "_TRY", "_ROUNDING"),
     },
+    "statements": {"_BLOWS_UP"},
     "summary": {"_SHOWN", "_LEAST"},
     "verdict": {"_MISSED"},
     "whitening": {"_GROUPS", "_FIRST"},

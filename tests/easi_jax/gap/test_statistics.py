@@ -14,6 +14,7 @@ from easi_jax.data.recording import Run, physics_steps
 from easi_jax.data.scales import scales_of
 from easi_jax.data.sensor_channels import Sensors
 from easi_jax.data.windows import fitted_velocity, lead_rows
+from easi_jax.errors import UserError
 from easi_jax.estimation.starts import Starts, floor
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.analysis import WindowsOf
@@ -596,28 +597,31 @@ def test_an_effect_is_missed_as_in_the_windows_that_show_it_most() -> None:
     class Length:
         """Windows of one length, in which errors grow so much without the effect."""
 
-        def __init__(self, times: float, sticks: bool = False) -> None:
-            self.times, self.sticks = times, sticks
+        def __init__(self, times: float, steps: int, sticks: bool = False) -> None:
+            self.times, self.steps, self.sticks = times, steps, sticks
             self.mine = of_loss(10.0 + rng.random(10))
             self.mine.places = [damping]
 
         def again(self, _: Model) -> Model:
+            if self.times == np.inf:
+                raise UserError("most predictions are not finite")
             return self.mine
 
-        def without(self, model: Model, gone: list[Place]) -> Model:
-            assert model is self.mine and gone == [damping]
+        def without(self, model: Model, gone: list[Place], possible: bool) -> Model:
+            assert model is self.mine and gone == [damping] and not possible
             return of_loss(self.times * self.mine.loss)
 
-    short, long, slips, lost = Length(1.5), Length(4.0), Length(9.0, True), Length(1.0)
+    short, long, lost = Length(1.5, 5), Length(4.0, 50), Length(1.0, 50)
+    slips, blows_up = Length(9.0, 20, sticks=True), Length(np.inf, 50)
     lost.mine.loss = np.full(10, np.inf)
     for at, others, most in (
-        (short, [long, slips, lost], long),
+        (short, [long, slips, lost, blows_up], long),
         (long, [short, slips], long),
-        (slips, [short], slips),
+        (slips, [short, Length(20.0, 50)], slips),
     ):
         lengths = SimpleNamespace(at=at, lengths=[at, *others])
         found = missed(cast(EffectSearch, lengths), at.mine)
-        less = most.without(most.mine, [damping])
+        less = most.without(most.mine, [damping], possible=False)
         (key, (lost, _)) = found.popitem()
         assert (key, lost) == (damping.key, cost(most.mine, less)) and not found
         assert lost == pytest.approx(0.5 * np.log(most.times), rel=0.1)

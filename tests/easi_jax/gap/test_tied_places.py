@@ -23,6 +23,7 @@ from tests.commands import command
 from tests.easi_jax.gap.test_lengths import DT, recorded_of
 from tests.easi_jax.gap.test_statistics import of_loss
 from train import gap
+from train._excite_problem import from_gap
 
 LEG = """<body name="{n}_thigh" pos="{x} 0 1"><joint name="{n}_hip" axis="0 1 0"
 damping="0.1"/><geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" mass="0.5"/>
@@ -96,6 +97,37 @@ def test_bodies_that_are_alike_may_be_heavier_alike(offered: dict[str, Place]) -
     np.testing.assert_allclose(np.flatnonzero(heavier), calves)
     assert not any(p.tied for p in offered.values() if p.effect == "com_offset")
     assert [*like_places(m, "body")] == ["*_thigh", "*_calf"]
+
+
+def test_what_several_have_is_one_at_each() -> None:
+    """Of a mass that may spread or not, the one that acts at the center of mass."""
+    m = robot()
+    given = m, ParameterSpace(()), scales_of(m, [recorded_of(m, 0)])
+    offered = effect_search.Places(*given)
+    every = {p.key: p for p in offered.offered}
+    for key, names in (
+        ("payload_mass@*_calf", ["left_calf", "right_calf"]),
+        ("coulomb_friction@*_hip", ["left_hip", "right_hip"]),
+        ("actuator_delay@", ["left_hip", "left_knee", "right_hip", "right_knee"]),
+    ):
+        singles = offered.singles(every[key])
+        assert [p.at for p in singles] == names and not any(p.tied for p in singles)
+        fitted = [sum(p.fitted) for p in (every[key], singles[0])]
+        assert fitted[0] == fitted[1]
+    assert [*offered.groups()] == ["*_hip", "*_knee"]
+
+
+def test_a_next_test_is_chosen_for_the_first_of_like_places(tmp_path: Path) -> None:
+    """Of commands that all come late, and of what may be in their place."""
+    others = ["actuator_lag@*_hip", "actuator_lag@*_knee", "armature@left_knee"]
+    late = {"effect": "actuator_delay", "at": "*", "indistinguishable": others}
+    path = tmp_path / "gap.json"
+    path.write_text(json.dumps({"effects": [late]}))
+    pairs, strengths = from_gap(path, robot(), [])
+    first = "actuator_delay@left_hip"
+    lags = ["actuator_lag@left_hip", "actuator_lag@left_knee", "armature@left_knee"]
+    assert pairs == [(first, k) for k in lags] + [(k, first) for k in lags]
+    assert not strengths
 
 
 def test_drives_that_are_all_alike_are_tied() -> None:
