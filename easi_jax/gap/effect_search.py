@@ -294,7 +294,7 @@ class EffectSearch:
             if c.place.key != place.key
             and (self._likely is None or c.place.key in self._likely)
         ]
-        short = shortlist(screened(chosen, without, others))
+        short = shortlist(screened(chosen, without, others), chosen.sticks)
         out = chosen.fitted(without.places, without.fit, short)
         return sorted(out, key=lambda m: m.loss.mean())
 

@@ -140,6 +140,7 @@ class Fitting:
         least = known_noise(data.resolution / math.sqrt(12), data.motion)
         starts.believe(errors, data.noise, least)
         self.sticks |= starts.bent > _BENT
+        chosen.sticks = self.sticks
         if self.sticks:
             chosen.moved = still
             starts.linearize(x, still)

@@ -40,7 +40,8 @@ class Selector:
 
     ``steps``, where set, is an error of all predictions ``(count, T, c)`` of which a
     share is nobody's fault. That share is one number more at the end of the vectors.
-    ``moved (count, s)`` are offsets of the windows' starts.
+    ``moved (count, s)`` are offsets of the windows' starts; ``sticks`` says that errors
+    bend with these.
 
     Args:
         predictor: predictions, of the fitted windows in its first blocks.
@@ -67,6 +68,7 @@ class Selector:
         self.own = tuple(range(predictor.own))
         self.weight = np.ones(self.count)
         self.steps: np.ndarray | None = None
+        self.sticks = False
         self.moved = np.zeros((self.count, predictor.size))
 
     @property

@@ -21,6 +21,9 @@ from easi_jax.gap.table import Place
 from easi_jax.io.runs.step_cache import Arrays
 
 _SHORTLIST = 7  # names that are fitted in full at each stage
+# The same where something sticks and slips, so that a step promises little: a weak
+# drive of a sliding foot promised half of what it does (benchmarks.floor).
+_MORE = 14
 _STARTS = 2  # of each
 _HOPELESS = 4.0  # times the best promise; beyond, only the first few are fitted
 _FEW = 2  # blocks of windows that effects are first tried on, of a larger robot ...
@@ -224,16 +227,23 @@ def expanded(
     """A model with one effect more, the most promising ones, best first; and the
     names of all by what they promise."""
     tried = screened(selector, base, candidates)
-    models = selector.fitted(base.places, base.fit, shortlist(tried))
+    short = shortlist(tried, selector.sticks)
+    models = selector.fitted(base.places, base.fit, short)
     names = dict.fromkeys(c.place.key for _, c in tried)
     return sorted(models, key=rank), [*names]
 
 
-def shortlist(screened: Sequence[tuple[float, Candidate]]) -> list[Candidate]:
+def shortlist(
+    screened: Sequence[tuple[float, Candidate]], sticks: bool = False
+) -> list[Candidate]:
     """The most promising names with the best starts of each; and the special cases of
     those names, and what like places have alike, which promise less but ask for less.
+
+    Args:
+        screened: with what each promises, best first.
+        sticks: whether something sticks and slips: promises are rough.
     """
-    chosen = _promising(screened)
+    chosen = _promising(screened, _MORE if sticks else _SHORTLIST)
     general = [mine[0].place for mine in chosen.values()]
     for _, c in screened:
         if any(contains(g, c.place) or _is_one_of(g, c.place) for g in general):
@@ -250,15 +260,15 @@ def _is_one_of(single: Place, alike: Place) -> bool:
 
 
 def _promising(
-    screened: Sequence[tuple[float, Candidate]],
+    screened: Sequence[tuple[float, Candidate]], most: int
 ) -> dict[str, list[Candidate]]:
     chosen: dict[str, list[Candidate]] = {}
     first = screened[0][0] if screened else 0.0
     for cost, c in screened:
         mine = chosen.get(c.place.key)
         if mine is None:
-            hopeless = cost > _HOPELESS * first and len(chosen) >= _SHORTLIST // 2
-            if len(chosen) == _SHORTLIST or hopeless:
+            hopeless = cost > _HOPELESS * first and len(chosen) >= most // 2
+            if len(chosen) == most or hopeless:
                 continue
             mine = chosen.setdefault(c.place.key, [])
         if len(mine) < _STARTS:

@@ -44,7 +44,7 @@ ELSEWHERE = {
     },
     "result": {"_ANYTHING", "_ALIKE", "_TELLS"},
     "screening": {
-        *("_SHORTLIST", "_STARTS", "_HOPELESS", "_FEW", "_LONG", "_SIMULATED"),
+        *("_SHORTLIST", "_MORE", "_STARTS", "_HOPELESS", "_FEW", "_LONG", "_SIMULATED"),
         *("_HOLDS", "_AT_ONCE"),
     },
     "sensor_faults": {

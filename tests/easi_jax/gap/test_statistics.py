@@ -747,6 +747,8 @@ def test_special_cases_of_the_promising_are_tried(
     names = [c.place.effect for c in shortlist(screened)]
     assert names[0] == "stribeck_friction" and names[-1] == "coulomb_friction"
     assert len(names) < len(last)
+    rough = [c.place.effect for c in shortlist(screened, sticks=True)]
+    assert set(names) < set(rough), "where promises are rough, more are tried"
     assert "coulomb_friction" not in [
         c.place.effect for c in shortlist([s for s in screened if s[0] > 10.0])
     ]
