@@ -111,7 +111,9 @@ class Decisions:
     once, by maximum likelihood, to 57 names of 37 generated machines that were not
     kept, whose gaps were tens of floors. `benchmarks.gap_confidence` tests it on
     others: on 420 names of machines of all gaps, what is within `closed` floors counted
-    as open anyway, the likeliest value is 0.85."""
+    as open anyway, the likeliest value is 0.85. These costs were of windows of one
+    length. Today's are of the length that shows an effect most; the curve is not fitted
+    to them yet."""
 
     steep: float = 2.6
     """How fast that changes with the logarithm of the loss; likewise."""
