@@ -75,6 +75,18 @@ MACHINES = {
         0.2,
         ("coulomb_friction|stribeck_friction", "actuator_gain|payload_mass|armature"),
     ),
+    # Its model has neither friction nor rotors.
+    "double_pendulum": Simulator(
+        "dfki_double_pendulum",
+        tuple(f"trajectory_0{k}.csv" for k in (0, 2, 4, 6)),
+        tuple(f"trajectory_0{k}.csv" for k in (1, 3, 5)),
+        0.2,
+        tuple(
+            f"{e}@{joint}"
+            for joint in ("elbow", "shoulder")
+            for e in ("armature", "coulomb_friction")
+        ),
+    ),
     # In a stand; its public users report armature and friction of the calves.
     "go2_in_air": Simulator(
         "go2_in_air",
