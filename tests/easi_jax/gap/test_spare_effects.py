@@ -68,7 +68,7 @@ def test_rivals_are_looked_for_among_likely_names(
 
     monkeypatch.setattr(effect_search, "screened", screened)
     at = _Windows({"a": 1.0, "d": 2.0}, set())
-    selector = SimpleNamespace(fitted=lambda *given: [])
+    selector = SimpleNamespace(fitted=lambda *given: [], sticks=False)
     every = [SimpleNamespace(place=SimpleNamespace(key=k)) for k in "abc"]
     search: Any = SimpleNamespace(
         at=SimpleNamespace(selector=selector, without=at.without),
