@@ -11,25 +11,13 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from benchmarks.gap_real import MACHINES, Simulator, analysed, check
+from benchmarks.gap_real import MACHINES, analysed, check
 from benchmarks.gap_score import keys_of
 from train._command import main, say, show_table
 from train._options import EngineOptions
 
-DOUBLE = Simulator(
-    "dfki_double_pendulum",
-    tuple(f"trajectory_0{k}.csv" for k in (0, 2, 4, 6)),
-    tuple(f"trajectory_0{k}.csv" for k in (1, 3, 5)),
-    0.2,
-    (
-        *("armature@elbow", "armature@shoulder"),
-        *("coulomb_friction@elbow", "coulomb_friction@shoulder"),
-    ),
-)
-MADE = {
-    "double_pendulum": DOUBLE,
-    **{k: MACHINES[k] for k in ("emps", "cartpole", "pendulum")},
-}
+NAMES = "double_pendulum", "emps", "cartpole", "pendulum"
+MADE = {name: MACHINES[name] for name in NAMES}
 
 
 @dataclasses.dataclass(frozen=True)
