@@ -20,7 +20,7 @@ import json
 import tempfile
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -346,15 +346,15 @@ def _seconds(rows: list[dict[str, Any]]) -> str:
     return f"{np.median([row['seconds'] for row in rows]):.0f}" if rows else ""
 
 
-def _found(row: dict[str, Any]) -> bool:
-    return any(name.split("@")[0] == row["hidden"] for name in row["named"])
+def _found(row: dict[str, Any], also: Sequence[str] = ()) -> bool:
+    names = (*row["named"], *also)
+    return any(name.split("@")[0] == row["hidden"] for name in names)
 
 
 def _listed(row: dict[str, Any]) -> bool:
     """Found, or among what the data do not tell from what was: a weaker drive of one
     mass that a refitted damping slows is a heavier mass."""
-    alike = row.get("alike", ())
-    return _found(row) or any(name.split("@")[0] == row["hidden"] for name in alike)
+    return _found(row, row.get("alike", ()))
 
 
 def _by_margin(rows: list[dict[str, Any]]) -> list[tuple[str, list[dict[str, Any]]]]:

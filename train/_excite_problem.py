@@ -325,9 +325,7 @@ def _single(key: str, m: "mujoco.MjModel") -> str:
     from easi_jax.model.effect_catalog import CATALOG
 
     effect, _, at = key.partition("@")
-    for kind in CATALOG[effect].sites if "*" in at and effect in CATALOG else ():
-        if kind in ("joint", "actuator", "body"):
-            fits = language.matching(at, language.names(m, kind))
-            if fits:
-                return f"{effect}@{fits[0]}"
-    return key
+    sites = CATALOG[effect].sites if effect in CATALOG and "*" in at else {}
+    kinds = [kind for kind in ("joint", "actuator", "body") if kind in sites]
+    each = (language.matching(at, language.names(m, kind)) for kind in kinds)
+    return next((f"{effect}@{names[0]}" for names in each if names), key)

@@ -48,7 +48,6 @@ class Fitting:
         selector: fits sets of effects.
         starts: of the windows.
         channels: that are compared.
-        sticks: whether errors bend with starts: see `whiten`.
         gap, floor: of the windows where they were last whitened.
         own_steps: error of the model's own steps, in floors; 0 where it does not show.
         unseen_steps: of predictions ``(W, T, c)``, that does not show but may move what
@@ -75,7 +74,7 @@ class Fitting:
         given = data.m, predictor, data.fit, data.scales, data.noise
         self.starts = window_starts(*given, chosen.blocks, count, steps + 1)
         self.channels = self._channels(ignored)
-        self.sticks = self._begun = False
+        self._begun = False
         self.gap = self.floor = self.own_steps = 0.0
         self.unseen_steps: np.ndarray | None = None
 
@@ -96,6 +95,11 @@ class Fitting:
                 "or lengthen --horizon"
             )
         return found
+
+    @property
+    def sticks(self) -> bool:
+        """Whether errors bend with starts: see `whiten`."""
+        return self.selector.sticks
 
     @property
     def neutral(self) -> np.ndarray:
@@ -139,8 +143,7 @@ class Fitting:
             )
         least = known_noise(data.resolution / math.sqrt(12), data.motion)
         starts.believe(errors, data.noise, least)
-        self.sticks |= starts.bent > _BENT
-        chosen.sticks = self.sticks
+        chosen.sticks |= starts.bent > _BENT
         if self.sticks:
             chosen.moved = still
             starts.linearize(x, still)

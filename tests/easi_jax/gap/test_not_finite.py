@@ -107,10 +107,10 @@ def test_fits_go_on_with_the_windows_that_are_left() -> None:
 def test_a_model_that_blows_up_is_told_in_one_line() -> None:
     made = object.__new__(Fitting)
     lost = repeated(*range(8))
-    made.starts, made.sticks = held_out(lost).starts, False
+    made.starts = held_out(lost).starts
     made.data = None  # type: ignore[assignment]
     made.selector = SimpleNamespace(  # type: ignore[assignment]
-        moved=np.zeros((W, 2 * NV)), errors=lost
+        moved=np.zeros((W, 2 * NV)), errors=lost, sticks=False
     )
     with pytest.raises(UserError, match="not finite: the model blows up"):
         made.whiten(np.zeros(1))
