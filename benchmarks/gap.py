@@ -152,6 +152,7 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
     return {
         "mechanism": answer["mechanism"],
         "truth": list(truth),
+        "unknown": keys_of(e for e in answer["effects"] if e["kind"] == "outside"),
         "named": named,
         "there": [
             _there(e, n, answer, part)

@@ -40,9 +40,9 @@ RIVALS = 8  # names in the place of another that are followed up
 _STAGES = 8  # of adding one and taking out what has become needless
 _RIPPLES = [0.75 * k for k in range(3, 27)]  # cycles over the range of a joint
 _BEAM = 3  # sets of effects that are followed
-# Names that promised most, of a larger robot, that are tried beside all sets of effects
-# but the first, and as rivals (benchmarks.gap_times).
-_LIKELY = 60
+# Names that promised most, that are tried beside all sets of effects but the first, and
+# as rivals (benchmarks.gap_times).
+_LIKELY = 20
 _LOST = 0.25  # of the motion: errors of a model that does not follow it
 
 
@@ -154,10 +154,7 @@ class EffectSearch:
         self.lengths, self.settles, self.offered = lengths, settles, offered
         self.tell = tell
         self.at = lengths[settles]
-        # Of a larger robot, names that promised most at any stage, or came in since.
-        self._likely: set[str] | None = (
-            set() if self.at.predictor.simulator.wide else None
-        )
+        self._likely: set[str] = set()  # promised most at any stage, or came in since
 
     def select(self, start: Model) -> Model:
         """A model of `at`'s windows with the effects that windows of any length show;
@@ -249,10 +246,9 @@ class EffectSearch:
                     if not likely or c.place.key in likely
                 ]
                 models, names = expanded(chosen, parent, more)
-                if self._likely is not None:
-                    names = names[:_LIKELY]
-                    self._likely |= {*names, *(p.key for p in model.places)}
-                likely = likely or {*names, *(p.key for p in model.places)}
+                names = {*names[:_LIKELY], *(p.key for p in model.places)}
+                self._likely |= names
+                likely = likely or names
                 for m in models:
                     key = keys(m)
                     if key not in found or m.loss.mean() < found[key].loss.mean():
@@ -280,9 +276,7 @@ class EffectSearch:
 
     def offer(self, addresses: Sequence[str]) -> None:
         """Offers as effects what some of the model's own parameters would do."""
-        new = self.offered.offer(addresses)
-        if self._likely is not None:
-            self._likely |= {p.key for p in new}
+        self._likely |= {p.key for p in self.offered.offer(addresses)}
 
     def rivals(self, model: Model, place: Place) -> list[Model]:
         """Other names refitted in the place of one effect, best first."""
@@ -291,8 +285,7 @@ class EffectSearch:
         others = [
             c
             for c in self.offered.candidates(model.places)
-            if c.place.key != place.key
-            and (self._likely is None or c.place.key in self._likely)
+            if c.place.key != place.key and c.place.key in self._likely
         ]
         short = shortlist(screened(chosen, without, others), chosen.sticks)
         out = chosen.fitted(without.places, without.fit, short)

@@ -8,6 +8,7 @@ import numpy as np
 from easi_jax.gap.decisions import DECIDE
 from easi_jax.gap.effect_set import Model
 from easi_jax.gap.table import Place
+from easi_jax.model.effect_catalog import RARE
 
 _TINY = 1e-300
 _UNLIKELY = 1e-6  # probability of a name beside a rival, that odds are never beyond
@@ -28,7 +29,8 @@ def _in_errors(d: np.ndarray, least: float) -> float:
 
 
 def rank(model: Model) -> float:
-    """Cross-validated loss, with a handicap for what machines rarely have."""
+    """Cross-validated loss, with a handicap for what machines rarely have, and an
+    advantage for what nearly all have."""
     return float(model.loss.mean()) * (1.0 + DECIDE.rare * model.unlikely)
 
 
@@ -54,7 +56,7 @@ def better(model: Model, base: Model, floor: float) -> bool:
     if base.gap.mean() < (DECIDE.open_from * floor) ** 2:
         helps *= DECIDE.helps_when_closed
     known = {p.key for p in base.places}
-    rare = any(p.row.is_rare for p in model.places if p.key not in known)
+    rare = any(p.row.rarity == RARE for p in model.places if p.key not in known)
     both = ((model.loss, base.loss), (model.gap, base.gap))
     gain = [1 - a.mean() / max(b.mean(), 1e-300) for a, b in both]
     large = min(gain) > DECIDE.large_gain
@@ -144,8 +146,8 @@ def probability(model: Model, rival: Model) -> float:
 
     In units of the noise and of the gap, on average over both, as `better` asks; where
     only a few windows tell the two apart, also by those, one by one. What fits as well
-    with more numbers is less likely by a half standard error for each; what only adds
-    to the model counts less, however well it does.
+    with more numbers is less likely by a half standard error for each, and so is what
+    fewer machines have; what only adds to the model counts less, however well it does.
     """
     t = 0.0
     for mine, theirs in ((model.loss, rival.loss), (model.gap, rival.gap)):
@@ -158,7 +160,7 @@ def probability(model: Model, rival: Model) -> float:
         # Windows overlap by a half.
         single = np.mean(list(map(advantage, mine, theirs))) / sqrt(2)
         t = max(t, float(single), key=abs)
-    t += 0.5 * (size_of(rival) - size_of(model))
+    t += 0.5 * (size_of(rival) - size_of(model) + rival.unlikely - model.unlikely)
     if contains(rival.places[-1], model.places[-1]):
         t = max(t, -1.0) + 1.0
     return 0.5 * (1 + erf(t / sqrt(2)))

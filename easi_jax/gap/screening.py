@@ -136,10 +136,14 @@ class Screening:
         """By number, those whose predictions are finite."""
         if not asked:
             return {}
+        counts = [len(a.vectors) for a in asked]
         whole = np.concatenate([a.vectors for a in asked])
-        of_linear = np.repeat(reckoned, [len(a.vectors) for a in asked])
-        errors = self._whitened(whole, of_linear)
-        parts = np.split(errors, np.cumsum([len(a.vectors) for a in asked])[:-1])
+        # Many begin as the model is without them.
+        _, first, same = np.unique(
+            whole, axis=0, return_index=True, return_inverse=True
+        )
+        errors = self._whitened(whole[first], np.repeat(reckoned, counts)[first])
+        parts = np.split(errors[same.reshape(-1)], np.cumsum(counts)[:-1])
         out = {}
         for i, (c, a, part) in enumerate(zip(candidates, asked, parts, strict=True)):
             if np.isfinite(part).all():

@@ -99,11 +99,11 @@ class Place:
         return bool(values[0] > 0 and low <= values[1] / values[0] <= high)
 
     def unlikely(self, values: np.ndarray) -> int:
-        """For how many reasons few machines have it with these values of its columns:
-        a rare effect, an unusual size."""
+        """For how many reasons few machines have it with these values of its columns: a
+        rare effect, an unusual size; one less where nearly all machines have it."""
         low, high = self.row.usual
         usual = np.all((values >= low) & (values <= high))
-        return self.row.is_rare + (not usual)
+        return self.row.rarity + (not usual)
 
 
 def name_of(m: mujoco.MjModel, kind: str, i: int) -> str:

@@ -21,6 +21,8 @@ from easi_jax.model.body_extent import room_for_mass
 from easi_jax.model.contact_pairs import ContactPair
 from easi_jax.model.effect_numbers import NO_FORCE_LIMIT, NUMBERS, EffectNumber
 
+RARE, COMMON = 1, -1  # rarity of effects; of others 0
+
 
 @dataclass(frozen=True)
 class Scales:
@@ -272,8 +274,8 @@ class Effect:
             and ``pair`` in braces.
         sites: where it can sit: joint, actuator, body, geom (a pair of them) or model
             (the whole of it), and what it is there.
-        is_rare: few machines have it; it is named only where it does clearly better
-            than what most machines have.
+        rarity: `RARE` where few machines have it, which is named only where it does
+            clearly better than what others have; `COMMON` where nearly all have it.
         usual: values outside these are as unlikely as a rare effect.
         contains: an effect that it is with some of its numbers at zero.
         refits: kind and quantity of the model (`easi_jax.model.quantities`) that says
@@ -291,7 +293,7 @@ class Effect:
     name: str
     sentence: str
     sites: Mapping[str, Site]
-    is_rare: bool = False
+    rarity: int = 0
     usual: tuple[float, float] = (-np.inf, np.inf)
     contains: str = ""
     refits: tuple[str, str] = ("", "")
@@ -435,7 +437,7 @@ _ROWS = (
                 ((0.0, 0.0, 0.0),),
             )
         },
-        is_rare=True,
+        rarity=RARE,
         mjcf=effect_mjcf.BODY,
     ),
     Effect(
@@ -452,6 +454,7 @@ _ROWS = (
                 ((0.0,), (0.1,)),
             )
         },
+        rarity=COMMON,
         refits=("joint", "frictionloss"),
         mjcf=effect_mjcf.COULOMB,
     ),
@@ -463,6 +466,7 @@ _ROWS = (
                 *("damping", "damping", "torque per speed", _has("damping"), 20, 0.03)
             )
         },
+        rarity=COMMON,
         refits=("joint", "damping"),
         mjcf=effect_mjcf.DAMPING,
     ),
@@ -479,7 +483,7 @@ _ROWS = (
                 able=lambda o: o.m.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4,
             ),
         },
-        is_rare=True,
+        rarity=RARE,
     ),
     Effect(
         "constant_force",
@@ -504,7 +508,7 @@ _ROWS = (
                 ((0.0, 0.0),),
             )
         },
-        is_rare=True,
+        rarity=RARE,
         contains="constant_force",
         rests=True,
         refits=("joint", "stiffness"),
@@ -525,7 +529,7 @@ _ROWS = (
                 ((0.05, 0.05, 0.1), (0.05, 0.05, 0.4)),
             )
         },
-        is_rare=True,
+        rarity=RARE,
         contains="coulomb_friction",
         told=_told_stribeck,
     ),
@@ -537,6 +541,7 @@ _ROWS = (
                 *("armature", "armature", "inertia", _has("armature"), 20, 0.03)
             )
         },
+        rarity=COMMON,
         refits=("joint", "armature"),
         mjcf=effect_mjcf.ARMATURE,
     ),
@@ -575,7 +580,7 @@ _ROWS = (
                 ((0.01, 0.6), (0.03, 0.6), (0.1, 0.6)),
             )
         },
-        is_rare=True,
+        rarity=RARE,
     ),
     Effect(
         "torque_ripple",
@@ -591,7 +596,7 @@ _ROWS = (
                 ((0.03, np.nan, 0.0), (0.03, np.nan, np.pi / 2)),
             )
         },
-        is_rare=True,
+        rarity=RARE,
         is_sine=True,
         told=_told_ripple,
     ),
@@ -617,7 +622,7 @@ _ROWS = (
         {"actuator": _factor("kv", 0.0)},
         # Where it is more than the model has, a joint with more damping is the same,
         # and more common.
-        is_rare=True,
+        rarity=RARE,
         usual=_USUAL,
         refits=("actuator", "kv"),
         mjcf=effect_mjcf.DRIVE,
@@ -674,7 +679,7 @@ _ROWS = (
                 _seldom_met,
             )
         },
-        is_rare=True,
+        rarity=RARE,
         refits=("actuator", "force_limit"),
         mjcf=effect_mjcf.LIMIT,
     ),
@@ -690,13 +695,13 @@ _ROWS = (
                 ((0.08,), (0.3,), (0.7,)),
             )
         },
-        is_rare=True,
+        rarity=RARE,
     ),
     Effect(
         "gravity_tilt",
         "the base is tilted (roll {roll}, pitch {pitch})",
         {"model": _vector("tilt", ("roll", "pitch"), "1", 0.6, 0.01)},
-        is_rare=True,
+        rarity=RARE,
         usual=(-0.25, 0.25),
         mjcf=effect_mjcf.TILT,
     ),

@@ -55,11 +55,12 @@ def test_what_is_neither_probable_nor_missed_is_spared(
     assert [p.key for p in found] == spared
 
 
-@pytest.mark.parametrize(("likely", "tried"), [(None, ["b", "c"]), ({"a", "c"}, ["c"])])
+@pytest.mark.parametrize(
+    ("likely", "tried"), [({"a", "b", "c"}, ["b", "c"]), ({"a", "c"}, ["c"])]
+)
 def test_rivals_are_looked_for_among_likely_names(
-    likely: set[str] | None, tried: list[str], monkeypatch: pytest.MonkeyPatch
+    likely: set[str], tried: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All are likely of a smaller robot."""
     asked: list[str] = []
 
     def screened(chosen: object, base: object, others: list[Any]) -> list[Any]:

@@ -691,6 +691,28 @@ def test_of_twins_the_one_of_a_usual_size_comes_first(
     assert rank(heavy) < rank(weak) < rank(replace(heavy, loss=1.2 * even))
 
 
+def test_of_names_that_do_as_well_what_most_machines_have_is_likelier(
+    model: mujoco.MjModel, runs: list[Run]
+) -> None:
+    """Half a standard error for each reason: Phi(0.5) beside an ordinary effect, Phi(1)
+    beside a rare one."""
+    found = {p.effect: p for p in places(model, scales_of(model, runs))}
+    fit = Fitted(np.zeros(1), np.arange(1), np.zeros(1), np.zeros(1), 1.0)
+
+    def alike(name: str) -> Model:
+        place = found[name]
+        unlikely = place.unlikely(np.ones(len(place.columns)))
+        return Model([place], fit, np.ones(10), np.ones(10), unlikely=unlikely)
+
+    names = "coulomb_friction", "actuator_gain", "quadratic_drag"
+    common, ordinary, rare = map(alike, names)
+    assert rank(common) < rank(ordinary) < rank(rare)
+    assert probability(common, ordinary) == pytest.approx(0.69, abs=0.01)
+    assert probability(ordinary, rare) == pytest.approx(0.69, abs=0.01)
+    assert probability(common, rare) == pytest.approx(0.84, abs=0.01)
+    assert probability(common, alike("armature")) == 0.5
+
+
 def test_what_is_contained_comes_first_where_nearly_as_good(
     model: mujoco.MjModel, runs: list[Run]
 ) -> None:
