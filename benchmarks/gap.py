@@ -93,30 +93,35 @@ def run(config: Config) -> None:
         }
         with config.out.open("a") as file:
             file.write(json.dumps(row) + "\n")
-        truth, named = (", ".join(row[k]) or "-" for k in ("truth", "named"))
-        say(
-            f"{config.kind} {seed}: {row['mechanism']}, {truth} -> {named} "
-            f"({row['verdict']}), {'right' if row['right'] else 'WRONG'}, "
-            f"{row['seconds']:.0f} s"
-        )
+        say(f"{config.kind} {seed}: {told(row)}")
+
+
+def told(row: dict[str, Any]) -> str:
+    """What is said of a line."""
+    truth, named = (", ".join(row[k]) or "-" for k in ("truth", "named"))
+    right = "right" if row["right"] else "WRONG"
+    return (
+        f"{row['mechanism']}, {truth} -> {named} ({row['verdict']}), {right}, "
+        f"{row['seconds']:.0f} s"
+    )
 
 
 def solved(data: Path, out: Path) -> dict[str, Any]:
     """Runs train.gap on a case that was written to ``data``, and grades it."""
-    from train import gap
-
     began = time.perf_counter()
-    gap.run(
-        gap.Config(
-            model=str(data / "model.xml"),
-            data=tuple(sorted(data.glob("run*.csv"))),
-            out=out,
-        )
-    )
+    told = asked(data, out)
     seconds = time.perf_counter() - began
-    told = json.loads((out / "gap.json").read_text())
     answer = json.loads((data / "answer.json").read_text())
     return {**graded(told, answer), "seconds": seconds}
+
+
+def asked(data: Path, out: Path, **options: Any) -> dict[str, Any]:
+    """What train.gap tells of such a case, with other options than its own."""
+    from train import gap
+
+    model, runs = str(data / "model.xml"), tuple(sorted(data.glob("run*.csv")))
+    gap.run(gap.Config(model=model, data=runs, out=out, **options))
+    return json.loads((out / "gap.json").read_text())
 
 
 def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:

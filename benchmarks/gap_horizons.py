@@ -17,6 +17,7 @@ from train._command import main, say, show_table
 from train._options import EngineOptions
 
 NAMES = "double_pendulum", "emps", "cartpole", "pendulum"
+HORIZONS = 0.2, 0.05, 0.5, 1.0  # of the report [s]
 MADE = {name: MACHINES[name] for name in NAMES}
 
 
@@ -28,7 +29,7 @@ class Config(EngineOptions):
     """Folder of the recordings."""
     machines: tuple[str, ...] = tuple(MADE)
     """Which of them."""
-    horizons: tuple[float, ...] = (0.2, 0.05, 0.5, 1.0)
+    horizons: tuple[float, ...] = HORIZONS
     """Of the report [s]."""
 
 
@@ -51,12 +52,17 @@ def run(config: Config) -> None:
             f"gap_horizons_{name}",
             command_of("benchmarks.gap_horizons", chosen),
             {"machine": name, "folder": MADE[name].folder},
-            same_names=len({tuple(sorted(keys_of(f["effects"]))) for f in found}) == 1,
+            same_names=is_same(found),
             farthest_value=farthest(found),
             horizons=found,
         )
         show_table(name, ("horizon [s]", "verdict", "gap", "names"), table(found))
         say(f"written: {path}")
+
+
+def is_same(found: list[dict[str, Any]]) -> bool:
+    """Whether the same effects are named, in any order."""
+    return len({tuple(sorted(keys_of(f["effects"]))) for f in found}) == 1
 
 
 def farthest(found: list[dict[str, Any]]) -> float:

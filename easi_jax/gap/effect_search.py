@@ -12,6 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 import mujoco
 import numpy as np
 
+from easi_jax.errors import UserError
 from easi_jax.gap.candidates import places, ripples
 from easi_jax.gap.decisions import DECIDE
 from easi_jax.gap.discretization_error import within_a_step
@@ -19,6 +20,7 @@ from easi_jax.gap.effect_set import Candidate, Model, keys, last
 from easi_jax.gap.fitting import Fitting
 from easi_jax.gap.model_comparison import (
     better,
+    certainty,
     confidence,
     cost,
     odds_of,
@@ -44,6 +46,9 @@ _BEAM = 3  # sets of effects that are followed
 # as rivals (benchmarks.gap_times).
 _LIKELY = 20
 _LOST = 0.25  # of the motion: errors of a model that does not follow it
+# Nats, of an effect without which predictions are not finite: as with e^20 times the
+# squared error.
+_BLOWS_UP = 10.0
 
 
 class Places:
@@ -357,19 +362,50 @@ class EffectSearch:
     ) -> list[Place]:
         """The effect that is missed least, where nothing is open without it and its
         name is not even probable; none else."""
-        without = {p.key: self.at.without(model, [p]) for p in model.places}
+        x = model.fit.x
+        idle = [
+            p
+            for p in model.places
+            if not self.at.misses(x, self.at.without(model, [p]).fit.x)
+        ]
+        if not idle:
+            return []
         # What is not open may be of any cause.
-        costs = {
-            key: cost(model, less, DECIDE.open_from) for key, less in without.items()
-        }
-        for place in sorted(model.places, key=lambda p: costs[p.key]):
+        each = self.missed(model, DECIDE.open_from)
+        for place in sorted(idle, key=lambda p: each[p.key]):
             among = rivals[place.key][:RIVALS]
             odds = odds_of(last(model, place), among, self.at.windows.led)
-            if confidence(costs[place.key], odds) >= DECIDE.probable:
-                continue
-            if not self.at.misses(model.fit.x, without[place.key].fit.x):
+            if confidence(each[place.key][0], odds) < DECIDE.probable:
                 return [place]
         return []
+
+    def missed(
+        self, model: Model, within: float = DECIDE.closed
+    ) -> dict[str, tuple[float, float]]:
+        """What it costs to take each effect of a model out, and how sure that is, in
+        windows of the length that shows it most.
+
+        Nothing is added across lengths, which share rows. Where feet stick and slip,
+        what is long is not linear in what lacks, and has no say.
+
+        Args:
+            model: of the windows `at`.
+            within: as of `cost`.
+
+        Returns:
+            `cost` and `certainty` by the effect's key.
+        """
+        found: dict[str, list[tuple[float, float]]] = {p.key: [] for p in model.places}
+        for length in self.lengths:
+            mine = _in_windows(length, self.at, model)
+            if mine is None:
+                continue
+            for place in model.places:
+                less = length.without(mine, [place], possible=False)
+                finite = np.isfinite(less.loss).all()
+                lost = cost(mine, less, within) if finite else _BLOWS_UP
+                found[place.key].append((lost, certainty(mine, less)))
+        return {key: max(each, default=(0.0, 0.0)) for key, each in found.items()}
 
     def _tell_gone(self, places: Sequence[Place], why: str) -> None:
         for place in places:
@@ -409,6 +445,20 @@ class EffectSearch:
         for single in singles:
             out[columns(single)] += x[shared] - out[shared]
         return out
+
+
+def _in_windows(length: Fitting, at: Fitting, model: Model) -> Model | None:
+    """A model of the windows ``at`` in those of another length; None where these say
+    nothing of it."""
+    if length is at:
+        return model
+    if at.sticks and length.steps > at.steps:
+        return None
+    try:
+        mine = length.again(model)
+    except UserError:  # most predictions that long are not finite
+        return None
+    return None if length.sticks or not np.isfinite(mine.loss).all() else mine
 
 
 def _of_a_step(place: Place, step: float) -> str:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from easi_jax.errors import UserError
 from easi_jax.estimation.blocks import too_few
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.decisions import DECIDE
@@ -13,16 +12,13 @@ from easi_jax.gap.effect_search import RIVALS, EffectSearch
 from easi_jax.gap.effect_set import Model, last
 from easi_jax.gap.fitting import Fitting
 from easi_jax.gap.held_out import HeldOut
-from easi_jax.gap.model_comparison import certainty, confidence, cost, odds_of
+from easi_jax.gap.model_comparison import confidence, odds_of
 from easi_jax.gap.result import Figures, Found, Numbers, Outcome, score_of
 from easi_jax.gap.table import Place
 from easi_jax.gap.verdict import Openness, openness, surely_better, verdict_of
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.model.results import Site
 
-# Nats, of an effect without which predictions are not finite: as with e^20 times the
-# squared error.
-_BLOWS_UP = 10.0
 _AS_IF_ALL = (
     "standard deviations of what is named count as if nothing else were missing; what "
     "is may have moved the values by more"
@@ -159,47 +155,6 @@ def stated(
     )
 
 
-def missed(search: EffectSearch, model: Model) -> dict[str, tuple[float, float]]:
-    """What it costs to take each effect of a model out, and how sure that is, in
-    windows of the length that shows it most.
-
-    Nothing is added across lengths, which share rows. Where feet stick and slip, what
-    is long is not linear in what lacks, and has no say.
-
-    Args:
-        model: of the windows ``search.at``.
-
-    Returns:
-        `cost` and `certainty` by the effect's key.
-    """
-    found: dict[str, list[tuple[float, float]]] = {p.key: [] for p in model.places}
-    for length in search.lengths:
-        mine = _in_windows(length, search.at, model)
-        if mine is None:
-            continue
-        for place in model.places:
-            less = length.without(mine, [place], possible=False)
-            if np.isfinite(less.loss).all():
-                found[place.key].append((cost(mine, less), certainty(mine, less)))
-            else:
-                found[place.key].append((_BLOWS_UP, certainty(mine, less)))
-    return {key: max(each, default=(0.0, 0.0)) for key, each in found.items()}
-
-
-def _in_windows(length: Fitting, at: Fitting, model: Model) -> Model | None:
-    """A model of the windows ``at`` in those of another length; None where these say
-    nothing of it."""
-    if length is at:
-        return model
-    if at.sticks and length.steps > at.steps:
-        return None
-    try:
-        mine = length.again(model)
-    except UserError:  # most predictions that long are not finite
-        return None
-    return None if length.sticks or not np.isfinite(mine.loss).all() else mine
-
-
 def _on_deviations(windows: int, verdict: str) -> list[str]:
     left = [_AS_IF_ALL] if verdict == "unexplained" else []
     return [*too_few(windows, "windows"), *left]
@@ -255,7 +210,7 @@ class _Judge:
 
     def found(self, rivals: Mapping[str, Sequence[Model]]) -> list[Found]:
         """All effects, what it costs most to take out first."""
-        numbers, each = self.numbers, missed(self.search, self.model)
+        numbers, each = self.numbers, self.search.missed(self.model)
         costs = {key: lost for key, (lost, _) in each.items()}
         places = sorted(self.model.places, key=lambda p: -costs[p.key])
         found = []

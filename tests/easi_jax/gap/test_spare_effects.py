@@ -15,6 +15,7 @@ class _Windows:
 
     def __init__(self, worth: dict[str, float], missed: set[str]) -> None:
         self.worth, self.missed = worth, missed
+        self.steps, self.sticks = 1, False
         self.windows = SimpleNamespace(led=np.ones(1, bool))
 
     def model(self, keys: list[str]) -> Any:
@@ -23,9 +24,12 @@ class _Windows:
         places = [SimpleNamespace(key=k) for k in keys]
         return SimpleNamespace(places=places, loss=loss, fit=SimpleNamespace(x=keys))
 
-    def without(self, model: Any, gone: list[Any]) -> Any:
+    def without(self, model: Any, gone: list[Any], possible: bool = True) -> Any:
         left = [p.key for p in model.places if p not in gone]
         return self.model(left)
+
+    def again(self, model: Any) -> Any:
+        return self.model([p.key for p in model.places])
 
     def misses(self, x: list[str], less: list[str]) -> bool:
         return bool(set(x) - set(less) & self.missed)
@@ -49,10 +53,22 @@ def test_what_is_neither_probable_nor_missed_is_spared(
 ) -> None:
     at = _Windows(worth, missed)
     monkeypatch.setattr(effect_search, "last", lambda model, place: model)
-    search: Any = SimpleNamespace(at=at)
+    search: Any = EffectSearch([at], 0, SimpleNamespace(), print)  # type: ignore
     model: Any = at.model(list(worth))
-    found = EffectSearch._spare(search, model, {key: [] for key in worth})
+    found = search._spare(model, {key: [] for key in worth})
     assert [p.key for p in found] == spared
+
+
+def test_what_windows_of_another_length_show_is_not_spared(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(effect_search, "last", lambda model, place: model)
+    short, long = _Windows({"friction": 0.1}, set()), _Windows({"friction": 3.0}, set())
+    model = short.model(["friction"])
+    for lengths, spared in (([short], ["friction"]), ([short, long], [])):
+        search: Any = EffectSearch(lengths, 0, SimpleNamespace(), print)  # type: ignore
+        found = search._spare(model, {"friction": []})
+        assert [p.key for p in found] == spared
 
 
 @pytest.mark.parametrize(

@@ -46,7 +46,6 @@ from easi_jax.gap.model_comparison import (
 from easi_jax.gap.predictor import BLOCK, Predictor
 from easi_jax.gap.screening import as_sine, shortlist
 from easi_jax.gap.sensor_faults import reading_faults
-from easi_jax.gap.statements import missed
 from easi_jax.gap.table import Place
 from easi_jax.gap.whitening import Residuals, make_residuals, row_groups
 from easi_jax.gap.window_set import window_set
@@ -620,7 +619,7 @@ def test_an_effect_is_missed_as_in_the_windows_that_show_it_most() -> None:
         (slips, [short, Length(20.0, 50)], slips),
     ):
         lengths = SimpleNamespace(at=at, lengths=[at, *others])
-        found = missed(cast(EffectSearch, lengths), at.mine)
+        found = EffectSearch.missed(cast(EffectSearch, lengths), at.mine)
         less = most.without(most.mine, [damping], possible=False)
         (key, (lost, _)) = found.popitem()
         assert (key, lost) == (damping.key, cost(most.mine, less)) and not found
