@@ -28,7 +28,7 @@ from easi_jax.errors import UserError
 from easi_jax.gap import gap_metric as measure
 from easi_jax.gap.batched_least_squares import bounds_of
 from easi_jax.gap.discretization_error import FINER
-from easi_jax.gap.effect_search import EffectSearch, Places
+from easi_jax.gap.effect_search import RIVALS, EffectSearch, Places
 from easi_jax.gap.effect_set import Model
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.fitting import STEPS_SEEN, Fitting, steps_error
@@ -60,20 +60,28 @@ _NO_LAWS = (
 
 
 @dataclass(frozen=True)
-class _Chosen:
+class Chosen:
     """Effects that fitting data show.
 
     Attributes:
         base: the model without them.
         model: with them.
         rivals: of each, best first.
+        judges: held-out windows as long as those that effects come from.
         notes: on what was left out.
     """
 
     base: Model
     model: Model
     rivals: Mapping[str, Sequence[Model]]
+    judges: HeldOut
     notes: list[str]
+
+    @property
+    def names(self) -> set[str]:
+        """Keys of the effects and of their rivals that are followed up."""
+        others = (m for each in self.rivals.values() for m in each[:RIVALS])
+        return {p.key for p in self.model.places} | {m.places[-1].key for m in others}
 
 
 class Analysis:
@@ -301,15 +309,16 @@ class Analysis:
         chosen = self._chosen()
         listed = time.perf_counter()
         proposed = proposed_laws(self, chosen.model)
-        poorer: _Chosen | None = None
+        poorer: Chosen | None = None
         laws: list[str] = []
         if proposed:
             laws = [f"{add_law(p.law, p.sizes)}@{p.law.at}" for p in proposed]
             for p in proposed:
                 unit = p.law.unit_of_force(self.m)
                 self.tell(f"a law is proposed: {p.law.shown(p.sizes, unit)}")
-            kept = [p.key for p in chosen.model.places]
-            other = Analysis(*self._given, **self._more, only=[*kept, *laws])
+            # A rival may be right beside a law.
+            only = chosen.names | {*laws}
+            other = Analysis(*self._given, **self._more, only=only)
             other.journal = self.journal
             other.predictor.early[:] = self.predictor.early
             richer = other._chosen()
@@ -331,7 +340,7 @@ class Analysis:
             law_seconds=beyond,
         )
 
-    def _chosen(self) -> _Chosen:
+    def _chosen(self) -> Chosen:
         """The effects that fitting data show."""
         search = self.search
         at = search.at
@@ -361,10 +370,12 @@ class Analysis:
             model = search.select(search.beside(base, model))
         if model.places:
             base, model = search.at.again(base), search.at.again(model)
-        model, rivals, notes = search.needful(model, self.step)
-        return _Chosen(base, model, rivals, notes)
+        judges = self.judges(search.at)
+        judges.starts.noise = search.at.starts.noise
+        model, rivals, notes = search.needful(model, self.step, judges.gains)
+        return Chosen(base, model, rivals, judges, notes)
 
-    def _stated(self, c: _Chosen) -> Outcome:
+    def _stated(self, c: Chosen) -> Outcome:
         """What held-out data say of them."""
         search = self.search
         at = search.at
@@ -375,7 +386,7 @@ class Analysis:
         if at.sticks or len(c.model.fit.active):
             noises = at.doubt_steps(c.model.fit.x, self._finer(at))
         found = c.base, c.model, c.rivals
-        windows = self.held_out, self.judges(at)
+        windows = self.held_out, c.judges
         outcome = stated(search, *windows, self.space, *found, self.step)
         if not at.sticks or noises < STEPS_SEEN:
             return outcome

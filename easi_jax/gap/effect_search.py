@@ -7,7 +7,7 @@ length says is never added to what another does: they share rows.
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -49,6 +49,11 @@ _LOST = 0.25  # of the motion: errors of a model that does not follow it
 # Nats, of an effect without which predictions are not finite: as with e^20 times the
 # squared error.
 _BLOWS_UP = 10.0
+_NOT_MISSED = (
+    "the data are predicted a little better with it, but nothing is open without it, "
+    "and so little may be of another cause"
+)
+_NO_GAIN = "the fitting data are predicted better with it, the held-out data are not"
 
 
 class Places:
@@ -328,24 +333,31 @@ class EffectSearch:
             seen.add(keys(model))
 
     def needful(
-        self, model: Model, step: float
+        self, model: Model, step: float, gains: Callable[[np.ndarray, np.ndarray], bool]
     ) -> tuple[Model, dict[str, list[Model]], list[str]]:
         """The model less what says nothing of the machine, with the rivals of what is
-        left, and notes; ``step`` is that of the physics [s]."""
+        left, and notes.
+
+        Args:
+            step: of the physics [s].
+            gains: whether held-out data are predicted better by a vector than by
+                another.
+        """
         model, rivals = self.exchanged(model)
         notes: list[str] = []
         for _ in range(DECIDE.most):
             brief = [p for p in model.places if self._brief(model, p, step)]
             idle = [p for p in model.places if p not in brief and self._idle(model, p)]
-            spare = [] if brief or idle else self._spare(model, rivals)
+            why = {} if brief or idle else self._spare(model, rivals, gains)
+            spare = [p for p in model.places if p.key in why]
             gone = [*brief, *idle, *spare]
             if not gone:
                 break
             self._tell_gone(brief, "less than a physics step")
             self._tell_gone(idle, "does nothing")
-            self._tell_gone(spare, "nothing is open without it, nor is it probable")
+            self._tell_gone(spare, "missed by no data, nor is it probable")
             notes += [_of_a_step(p, step) for p in brief]
-            notes += [_spared(p) for p in spare]
+            notes += [f"{key}: {reason}; not named" for key, reason in why.items()]
             self.offered.drop([*brief, *spare])
             less = self.at.without(model, gone)
             self.at.whiten(less.fit.x)
@@ -358,26 +370,32 @@ class EffectSearch:
         return within_a_step(place, float(model.fit.x[first]), step)
 
     def _spare(
-        self, model: Model, rivals: Mapping[str, Sequence[Model]]
-    ) -> list[Place]:
-        """The effect that is missed least, where nothing is open without it and its
-        name is not even probable; none else."""
-        x = model.fit.x
-        idle = [
-            p
-            for p in model.places
-            if not self.at.misses(x, self.at.without(model, [p]).fit.x)
-        ]
-        if not idle:
-            return []
+        self,
+        model: Model,
+        rivals: Mapping[str, Sequence[Model]],
+        gains: Callable[[np.ndarray, np.ndarray], bool],
+    ) -> dict[str, str]:
+        """The key of the effect that is missed least, of those that are not even
+        probable and without which nothing is open, or held-out data are predicted as
+        well; and why it is not named."""
+        x, why = model.fit.x, dict[str, str]()
+        for place in model.places:
+            less = self.at.without(model, [place]).fit.x
+            if not self.at.misses(x, less):
+                why[place.key] = _NOT_MISSED
+            elif not gains(self.at.plain(x), self.at.plain(less)):
+                why[place.key] = _NO_GAIN
+        if not why:
+            return {}
         # What is not open may be of any cause.
         each = self.missed(model, DECIDE.open_from)
-        for place in sorted(idle, key=lambda p: each[p.key]):
+        for place in sorted(model.places, key=lambda p: each[p.key]):
             among = rivals[place.key][:RIVALS]
             odds = odds_of(last(model, place), among, self.at.windows.led)
-            if confidence(each[place.key][0], odds) < DECIDE.probable:
-                return [place]
-        return []
+            probable = confidence(each[place.key][0], odds) >= DECIDE.probable
+            if place.key in why and not probable:
+                return {place.key: why[place.key]}
+        return {}
 
     def missed(
         self, model: Model, within: float = DECIDE.closed
@@ -467,13 +485,6 @@ def _of_a_step(place: Place, step: float) -> str:
         f"step of {1000 * step:.3g} ms, which shifts commands by half of "
         "itself; not named. With a smaller timestep in the model the data could "
         "tell."
-    )
-
-
-def _spared(place: Place) -> str:
-    return (
-        f"{place.key}: the data are predicted a little better with it, but nothing is "
-        "open without it, and so little may be of another cause; not named"
     )
 
 

@@ -8,7 +8,6 @@ import numpy as np
 from easi_jax.gap.decisions import DECIDE
 from easi_jax.gap.effect_set import Model
 from easi_jax.gap.table import Place
-from easi_jax.model.effect_catalog import RARE
 
 _TINY = 1e-300
 _UNLIKELY = 1e-6  # probability of a name beside a rival, that odds are never beyond
@@ -56,7 +55,7 @@ def better(model: Model, base: Model, floor: float) -> bool:
     if base.gap.mean() < (DECIDE.open_from * floor) ** 2:
         helps *= DECIDE.helps_when_closed
     known = {p.key for p in base.places}
-    rare = any(p.row.rarity == RARE for p in model.places if p.key not in known)
+    rare = any(p.rarity > 0 for p in model.places if p.key not in known)
     both = ((model.loss, base.loss), (model.gap, base.gap))
     gain = [1 - a.mean() / max(b.mean(), 1e-300) for a, b in both]
     large = min(gain) > DECIDE.large_gain

@@ -81,6 +81,12 @@ class Place:
         return CATALOG[self.effect]
 
     @property
+    def rarity(self) -> int:
+        """Of its effect at such a place: above zero where few machines have it."""
+        site = self.row.sites.get(self.kind)
+        return self.row.rarity + (site.rarity if site else 0)
+
+    @property
     def key(self) -> str:
         """``effect@at``."""
         return f"{self.effect}@{self.at}"
@@ -103,7 +109,7 @@ class Place:
         rare effect, an unusual size; one less where nearly all machines have it."""
         low, high = self.row.usual
         usual = np.all((values >= low) & (values <= high))
-        return self.row.rarity + (not usual)
+        return self.rarity + (not usual)
 
 
 def name_of(m: mujoco.MjModel, kind: str, i: int) -> str:

@@ -242,12 +242,14 @@ class Site:
             values, or more than one valley. NaN: from a grid.
         more: further starts, as values, from the sizes.
         able: whether it can be there, beside what its numbers refuse.
+        rarity: of the effect at such places, more than elsewhere.
     """
 
     parts: tuple[Part, ...]
     starts: Starts = ((0.0,),)
     more: Callable[[Mapping[str, float]], Starts] = lambda sizes: ()
     able: Callable[[Spot], bool] = lambda o: True
+    rarity: int = 0
 
     def offered(self, o: Spot) -> bool:
         """Whether the effect can be at a place."""
@@ -369,13 +371,18 @@ def _inside(sizes_of: str) -> tuple[Limit, Limit]:
 
 
 def _vector(
-    field: str, names: str | tuple[str, ...], scale: str, high: float, size: float
+    field: str,
+    names: str | tuple[str, ...],
+    scale: str,
+    high: float,
+    size: float,
+    rarity: int = 0,
 ) -> Site:
     parts = tuple(
         Part(f"{field}.{i}", name, scale, -high, high, size)
         for i, name in enumerate(names)
     )
-    return Site(parts, ((0.0,) * len(parts),))
+    return Site(parts, ((0.0,) * len(parts),), rarity=rarity)
 
 
 # A motor is rarely 2.5 times weaker than its data sheet, but may well carry a load that
@@ -490,7 +497,7 @@ _ROWS = (
         'a constant force acts at {kind} "{at}"',
         {
             "joint": _alone("constant", "torque", "torque", -20, 20, 0.03),
-            "body": _vector("force", "xyz", "mass", 200, 0.1),
+            "body": _vector("force", "xyz", "mass", 200, 0.1, RARE),
         },
     ),
     Effect(

@@ -9,6 +9,8 @@ import pytest
 from easi_jax.gap import effect_search
 from easi_jax.gap.effect_search import EffectSearch
 
+ALL = {"friction", "gain", "tilt"}
+
 
 class _Windows:
     """Fits of sets of effects whose losses are given by what each is worth [nats]."""
@@ -31,32 +33,46 @@ class _Windows:
     def again(self, model: Any) -> Any:
         return self.model([p.key for p in model.places])
 
+    def plain(self, x: list[str]) -> list[str]:
+        return x
+
     def misses(self, x: list[str], less: list[str]) -> bool:
         return bool(set(x) - set(less) & self.missed)
 
 
 @pytest.mark.parametrize(
-    ("worth", "missed", "spared"),
+    ("worth", "missed", "seen", "spared"),
     [
-        ({"friction": 3.0, "gain": 0.2, "tilt": 0.1}, {"friction"}, ["tilt"]),
-        ({"friction": 3.0, "gain": 0.2}, {"friction", "gain"}, []),
-        ({"friction": 3.0, "gain": 2.0}, set(), []),
-        ({"friction": 3.0, "gain": 0.1, "tilt": 0.2}, {"gain"}, ["tilt"]),
+        ({"friction": 3.0, "gain": 0.2, "tilt": 0.1}, {"friction"}, ALL, ["tilt"]),
+        ({"friction": 3.0, "gain": 0.2}, {"friction", "gain"}, ALL, []),
+        ({"friction": 3.0, "gain": 2.0}, set(), ALL, []),
+        ({"friction": 3.0, "gain": 0.1, "tilt": 0.2}, {"gain"}, ALL, ["tilt"]),
+        ({"friction": 3.0, "gain": 0.2}, ALL, {"friction"}, ["gain"]),
+        ({"friction": 3.0, "gain": 2.0}, ALL, {"friction"}, []),
     ],
-    ids=["least first", "missed", "probable", "one of two"],
+    ids=[
+        *("least first", "missed", "probable", "one of two"),
+        *("not held out", "probable all the same"),
+    ],
 )
 def test_what_is_neither_probable_nor_missed_is_spared(
     worth: dict[str, float],
     missed: set[str],
+    seen: set[str],
     spared: list[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """``seen``: what held-out data are predicted better with."""
     at = _Windows(worth, missed)
     monkeypatch.setattr(effect_search, "last", lambda model, place: model)
     search: Any = EffectSearch([at], 0, SimpleNamespace(), print)  # type: ignore
     model: Any = at.model(list(worth))
-    found = search._spare(model, {key: [] for key in worth})
-    assert [p.key for p in found] == spared
+
+    def gains(x: list[str], less: list[str]) -> bool:
+        return bool(set(x) - set(less) & seen)
+
+    found = search._spare(model, {key: [] for key in worth}, gains)
+    assert [*found] == spared
 
 
 def test_what_windows_of_another_length_show_is_not_spared(
@@ -67,8 +83,8 @@ def test_what_windows_of_another_length_show_is_not_spared(
     model = short.model(["friction"])
     for lengths, spared in (([short], ["friction"]), ([short, long], [])):
         search: Any = EffectSearch(lengths, 0, SimpleNamespace(), print)  # type: ignore
-        found = search._spare(model, {"friction": []})
-        assert [p.key for p in found] == spared
+        found = search._spare(model, {"friction": []}, lambda x, less: True)
+        assert [*found] == spared
 
 
 @pytest.mark.parametrize(

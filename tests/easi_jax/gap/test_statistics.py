@@ -17,7 +17,7 @@ from easi_jax.data.windows import fitted_velocity, lead_rows
 from easi_jax.errors import UserError
 from easi_jax.estimation.starts import Starts, floor
 from easi_jax.gap import gap_metric as measure
-from easi_jax.gap.analysis import WindowsOf
+from easi_jax.gap.analysis import Chosen, WindowsOf
 from easi_jax.gap.batched_least_squares import (
     Bounds,
     Fitted,
@@ -32,6 +32,7 @@ from easi_jax.gap.effect_search import EffectSearch
 from easi_jax.gap.effect_set import Candidate, Model
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.forward_selection import Selector
+from easi_jax.gap.held_out import HeldOut
 from easi_jax.gap.model_comparison import (
     advantage,
     are_twins,
@@ -710,6 +711,25 @@ def test_of_names_that_do_as_well_what_most_machines_have_is_likelier(
     assert probability(ordinary, rare) == pytest.approx(0.69, abs=0.01)
     assert probability(common, rare) == pytest.approx(0.84, abs=0.01)
     assert probability(common, alike("armature")) == 0.5
+
+
+def test_a_force_on_a_body_is_rarer_than_one_at_a_joint(
+    model: mujoco.MjModel, runs: list[Run]
+) -> None:
+    """A pendulum that is too heavy is not pulled down."""
+    every = places(model, scales_of(model, runs))
+    forces = {p.kind: p.rarity for p in every if p.effect == "constant_force"}
+    assert forces["body"] > forces["joint"] == 0
+
+
+def test_beside_a_law_the_rivals_of_effects_are_offered_again() -> None:
+    mine = Place("actuator_lag", "motor", "actuator", (), ())
+    other = Place("actuator_delay", "motor", "actuator", (), ())
+    model, rival = of_loss(np.ones(10)), of_loss(np.ones(10))
+    model.places, rival.places = [mine], [other]
+    held_out = cast(HeldOut, None)
+    chosen = Chosen(model, model, {mine.key: [rival]}, held_out, [])
+    assert chosen.names == {mine.key, other.key}
 
 
 def test_what_is_contained_comes_first_where_nearly_as_good(
