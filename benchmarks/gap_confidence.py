@@ -1,14 +1,14 @@
 """Whether the confidence of ``train.gap`` comes true, and the curve that it follows.
 
-    python -m benchmarks.gap --kind mixed --seeds 61000 61010 --cheap --engine mujoco \
-        --out benchmarks/results/gap_confidence.jsonl
+    python -m benchmarks.gap --kind mixed --seeds 80200 80210 --cheap \
+        --out benchmarks/results/gap_curve.jsonl
     python -m benchmarks.gap_confidence
 
-Reads the lines that the first command adds (kinds ``single``, ``pair``, ``several``:
-known effects; ``mixed``: one beside one that no table has; ``outside``: that alone) and
-counts how often what was stated is there. The curve of
-`easi_jax.gap.model_comparison.confidence` is fitted to them anew by maximum likelihood,
-for comparison with the one in the code, which was fitted to older seeds.
+The curve of `easi_jax.gap.model_comparison.confidence` is fitted by maximum likelihood
+to the lines that the first command adds (kinds ``single``, ``pair``, ``several``: known
+effects; ``mixed`` and ``real``: known beside unknown ones; ``outside``: unknown ones
+alone). It is tested on machines that it was not fitted to: of these lines with each
+mechanism left out in turn, and of the frozen set (`benchmarks.gap_frozen`).
 """
 
 import dataclasses
@@ -19,19 +19,18 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.gap_score import brier, judged
-from easi_jax.gap.decisions import DECIDE
-from easi_jax.gap.model_comparison import confidence
+from benchmarks.gap_frozen import FROZEN, RESULTS
+from benchmarks.gap_score import brier
+from easi_jax.gap.model_comparison import Curve, confidence
 from train._command import main, say, show_table
 
-RESULTS = Path(__file__).parent / "results"
-LINES = RESULTS / "gap_confidence.jsonl"
-FAMILIES = {"outside": "unknown", "mixed": "mixed"}  # all other kinds: known
+LINES = RESULTS / "gap_curve.jsonl"
+FAMILIES = {"outside": "unknown", "mixed": "mixed", "real": "mixed"}  # others: known
 _BINS = 5
 _SURE = 0.8
-_GAPS = 2.5, 5.0, 15.0  # floors, that bins of older lines end at
-_SIZES = *map(str, _GAPS), "more"
-_OLDER = "gap_cases.jsonl", "gap_cases_fitted.jsonl", "gap_confidence.jsonl"
+# Of the curve's numbers, as a normal prior of so many units: few names tell little of
+# how steep it is, and names that are all right would make it a step.
+_PRIOR = 3.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +38,9 @@ class Config:
     """Counts how often what train.gap names is there, by the confidence stated."""
 
     lines: Path = LINES
-    """Lines of benchmarks.gap."""
+    """Lines of benchmarks.gap, that the curve is fitted to."""
+    frozen: Path = FROZEN
+    """Lines of benchmarks.gap_frozen; without the file that part is left out."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,25 +50,50 @@ class Said:
     Attributes:
         confidence: stated, ``(n,)``.
         cost: of taking them out [nats], ``(n,)``.
+        sure: standard errors between blocks by which they help, ``(n,)``.
+        odds: of their rivals, ``(n,)``.
         there: whether they, or a twin, are in the machine, ``(n,)`` bool.
         family: known, mixed or unknown, ``(n,)``.
+        mechanism: ``(n,)``.
     """
 
     confidence: np.ndarray
     cost: np.ndarray
+    sure: np.ndarray
+    odds: np.ndarray
     there: np.ndarray
     family: np.ndarray
+    mechanism: np.ndarray
+
+    def some(self, which: np.ndarray) -> "Said":
+        """A part of them."""
+        return Said(**{name: x[which] for name, x in vars(self).items()})
+
+    def by(self, curve: Curve) -> "Said":
+        """With the confidence that a curve would state."""
+        each = zip(self.cost, self.sure, self.odds, strict=True)
+        stated = [confidence(c, s, o, curve) for c, s, o in each]
+        return dataclasses.replace(self, confidence=np.array(stated))
 
 
 def said(rows: Sequence[dict[str, Any]]) -> Said:
     """All that was named in some lines."""
-    of = [FAMILIES.get(r["kind"], "known") for r in rows for _ in r["named"]]
 
     def every(key: str) -> np.ndarray:
-        return np.array([x for r in rows for x in r[key]])
+        return np.array([x for r in rows for x in r[key]], float)
 
-    there = every("there").astype(bool)
-    return Said(every("confidence"), every("removal_cost"), there, np.array(of))
+    def of_row(value: Any) -> np.ndarray:
+        return np.array([value(r) for r in rows for _ in r["named"]])
+
+    return Said(
+        confidence=every("confidence"),
+        cost=every("removal_cost"),
+        sure=every("removal_sure"),
+        odds=every("rival_odds"),
+        there=every("there").astype(bool),
+        family=of_row(lambda r: FAMILIES.get(r["kind"], "known")),
+        mechanism=of_row(lambda r: r["mechanism"]),
+    )
 
 
 def figures(stated: np.ndarray, there: np.ndarray) -> dict[str, float]:
@@ -91,9 +117,10 @@ def figures(stated: np.ndarray, there: np.ndarray) -> dict[str, float]:
     }
 
 
-def by_family(part: Said, families: Sequence[str]) -> dict[str, dict[str, float]]:
-    """`figures` of each family that has names."""
-    each = {family: part.family == family for family in families}
+def by_family(part: Said) -> dict[str, dict[str, float]]:
+    """`figures` of all, and of each family that has names."""
+    each = {"all": np.ones(len(part.there), bool)}
+    each |= {f: part.family == f for f in ("known", "mixed", "unknown")}
     return {
         family: figures(part.confidence[mine], part.there[mine])
         for family, mine in each.items()
@@ -101,93 +128,60 @@ def by_family(part: Said, families: Sequence[str]) -> dict[str, dict[str, float]
     }
 
 
-def fitted(part: Said) -> np.ndarray:
-    """Logarithms of the curve's two numbers that make what was the case most likely,
-    ``(2,)``."""
+def fitted(part: Said) -> Curve:
+    """The curve that makes what was the case most likely."""
     from scipy.optimize import minimize
 
-    alone = np.array([confidence(c, 0.0) for c in part.cost])
-    odds = np.maximum(alone / np.maximum(part.confidence, 1e-9) - 1.0, 0.0)
-
     def unlikely(at: np.ndarray) -> float:
-        each = zip(part.cost, odds, strict=True)
-        p = np.array([confidence(c, o, *np.exp(at)) for c, o in each])
-        p = np.clip(p, 1e-3, 1 - 1e-3)
-        return -float(np.sum(np.where(part.there, np.log(p), np.log(1 - p))))
+        p = np.clip(part.by(Curve(*at)).confidence, 1e-3, 1 - 1e-3)
+        likely = np.where(part.there, np.log(p), np.log(1 - p))
+        return 0.5 * float(np.sum((at / _PRIOR) ** 2)) - float(np.sum(likely))
 
-    return minimize(unlikely, np.zeros(2), method="Nelder-Mead").x
-
-
-def by_gaps(rows: Sequence[dict[str, Any]], anyway: float) -> Said:
-    """All that was named in some lines, the cost from the gap before and after each
-    effect joined: for lines that do not hold it. The confidence is the curve's, without
-    rivals; families are sizes of the gap.
-
-    Args:
-        rows: of ``benchmarks.gap``.
-        anyway: times the floor, within which all counts as open with an effect, too.
-    """
-    cost, there, gap = [], [], []
-    for r in rows:
-        floor, least = r["gap"]["floor"], anyway**2 - 1.0
-        path = [r["gap"]["refit"], *r["gap_after"]]
-        left = [max((x / floor) ** 2 - 1.0, 0.0) + least for x in path]
-        for k, (ok, _) in enumerate(judged([r])):
-            without = max(left[k] - left[k + 1], 0.0) + left[-1]
-            cost.append(0.5 * np.log(without / left[-1]))
-            there.append(bool(ok))
-            gap.append(path[0] / floor)
-    sizes = np.array(_SIZES)[np.searchsorted(_GAPS, gap)]
-    stated = [confidence(c, 0.0) for c in cost]
-    return Said(*(np.array(x) for x in (stated, cost, there, sizes)))
+    return Curve(*map(float, minimize(unlikely, np.zeros(3), method="Nelder-Mead").x))
 
 
-def _of_gaps() -> dict[str, Any]:
-    """How true the curve comes by the size of the gap, for two ways to reckon with what
-    is nearly closed."""
-    every = [
-        json.loads(line)
-        for name in _OLDER
-        for line in (RESULTS / name).read_text().splitlines()
-    ]
-    found = {}
-    for name in ("open_from", "closed"):
-        part = by_gaps(every, getattr(DECIDE, name))
-        even, steep = np.exp(fitted(part))
-        found[name] = {
-            "all": figures(part.confidence, part.there),
-            "by gap, in floors at most": by_family(part, _SIZES),
-            "curve": {"even [nats]": float(even), "steep": float(steep)},
-        }
-    return found
+def left_out(part: Said) -> Said:
+    """With the confidence that a curve would state that was fitted to all mechanisms
+    but its own."""
+    out = part.confidence.copy()
+    for mechanism in np.unique(part.mechanism):
+        mine = part.mechanism == mechanism
+        out[mine] = part.some(mine).by(fitted(part.some(~mine))).confidence
+    return dataclasses.replace(part, confidence=out)
 
 
 def run(config: Config) -> None:
-    """Counts, and fits the curve again."""
+    """Fits, tests and writes."""
+    from benchmarks._cells import read_rows
     from benchmarks._common import command_of, write_result
     from easi_jax.errors import UserError
 
     if not config.lines.is_file():
         raise UserError(f"{config.lines} is not there; python -m benchmarks.gap --help")
     rows = [json.loads(line) for line in config.lines.read_text().splitlines()]
-    every = said(rows)
-    told = {"all": figures(every.confidence, every.there)}
-    told |= by_family(every, ("known", "mixed", "unknown"))
-    even, steep = np.exp(fitted(every))
-    show_table(
-        "Confidence of train.gap",
-        ("family", *next(iter(told.values()))),
-        [(k, *(f"{x:.3g}" for x in f.values())) for k, f in told.items()],
-    )
+    every, curve = said(rows), fitted(said(rows))
+    told = {"mechanism left out": by_family(left_out(every))}
+    frozen = read_rows(config.frozen)
+    if any(r["named"] for r in frozen):
+        told["frozen set, as stated"] = by_family(said(frozen))
+    for name, families in told.items():
+        show_table(
+            f"Confidence of train.gap: {name}",
+            ("family", *next(iter(families.values()))),
+            [(k, *(f"{x:.3g}" for x in f.values())) for k, f in families.items()],
+        )
     path = write_result(
         "gap_confidence",
         command_of("benchmarks.gap_confidence", config),
-        {"lines": len(rows), "commits": sorted({r["commit"] for r in rows})},
+        {
+            "lines": len(rows),
+            "frozen": len(frozen),
+            "commits": sorted({r["commit"] for r in rows}),
+        },
         families=told,
-        curve={"even [nats]": float(even), "steep": float(steep)},
-        by_gaps=_of_gaps(),
+        curve=dataclasses.asdict(curve),
     )
-    say(f"fitted anew: even at {even:.2f} nats, steepness {steep:.2g}")
+    say(f"fitted: {', '.join(f'{k} {v:.3g}' for k, v in vars(curve).items())}")
     say(f"written: {path}")
 
 

@@ -107,18 +107,15 @@ class Decisions:
     """Of the noise: names whose predictions differ by less, RMS, are twins: 100
     independent rows would tell them apart by one standard error."""
 
-    even: float = 0.83
-    """Nats for each number, lost without an effect, at which its name is as often wrong
-    as right: half the logarithm of what is then open, by what is open with it. Fitted
-    once, by maximum likelihood, to 57 names of 37 generated machines that were not
-    kept, whose gaps were tens of floors. `benchmarks.gap_confidence` tests it on
-    others: on 420 names of machines of all gaps, what is within `closed` floors counted
-    as open anyway, the likeliest value is 0.85. These costs were of windows of one
-    length. Today's are of the length that shows an effect most; the curve is not fitted
-    to them yet."""
+    curve_even: float = 0.48
+    """Logarithm of the odds that a name is right whose removal costs one nat, by one
+    standard error between blocks: TODO."""
 
-    steep: float = 2.6
-    """How fast that changes with the logarithm of the loss; likewise."""
+    curve_by_cost: float = 2.6
+    """How these grow with the logarithm of the nats; likewise."""
+
+    curve_by_sure: float = 0.0
+    """How they grow with that of the standard errors; likewise."""
 
     does_nothing: float = 1e-3
     """Of the largest error: an effect that changes less was fitted to nothing. No test:

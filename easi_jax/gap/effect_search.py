@@ -109,6 +109,17 @@ class Places:
             for s in p.starts[: 1 if p.row.is_sine else None]
         ]
 
+    def shapes(self, taken: Sequence[Place]) -> list[Candidate]:
+        """The same effects in their other shape: a mass that is spread in place of a
+        point."""
+        return [
+            Candidate(p, s)
+            for mine in taken
+            for p in self.offered
+            if p.key == mine.key and not all(p.fitted) and p.starts != mine.starts
+            for s in p.starts
+        ]
+
     def offer(self, addresses: Sequence[str]) -> list[Place]:
         """Offers as effects what some of the model's own parameters would do, and
         returns these."""
@@ -282,6 +293,7 @@ class EffectSearch:
             at.whiten(model.fit.x)
             model = chosen.fit(model.places, model.fit.x)
             model = chosen.richer(model, self.offered.candidates(model.places))
+            model = chosen.shaped(model, self.offered.shapes(model.places), spared)
         return model
 
     def offer(self, addresses: Sequence[str]) -> None:
@@ -392,7 +404,7 @@ class EffectSearch:
         for place in sorted(model.places, key=lambda p: each[p.key]):
             among = rivals[place.key][:RIVALS]
             odds = odds_of(last(model, place), among, self.at.windows.led)
-            probable = confidence(each[place.key][0], odds) >= DECIDE.probable
+            probable = confidence(*each[place.key], odds) >= DECIDE.probable
             if place.key in why and not probable:
                 return {place.key: why[place.key]}
         return {}

@@ -264,18 +264,52 @@ class Selector:
         """The model with effects replaced by ones that contain them and do better."""
         for place in list(model.places):
             more = [c for c in candidates if contains(c.place, place)]
-            if not more:
-                continue
-            kept = [p for p in model.places if p is not place]
-            found = self.fitted(kept, model.fit, more)
-            if not found:
-                continue
-            best = min(found, key=lambda m: m.loss.mean())
+            best = self._replaced(model, place, more)
             # Of one nature at one place: also a small gain says which.
-            if better(best, model, 0.0):
-                order = [best.places[-1] if p is place else p for p in model.places]
-                model = replace(best, places=order)
+            if best is not None and better(best, model, 0.0):
+                model = best
         return model
+
+    def shaped(
+        self,
+        model: Model,
+        shapes: Sequence[Candidate],
+        spared: Collection[str] = (),
+    ) -> Model:
+        """The model with effects in another shape where that does better, or needs
+        fewer others: which one they have shows only once the others are in. A mass that
+        is spread, less some inertia, is a point.
+
+        Args:
+            spared: as of `needed`.
+        """
+        for place in list(model.places):
+            other = [c for c in shapes if c.place.key == place.key]
+            best = self._replaced(model, place, other)
+            if best is None:
+                continue
+            less = self.needed(best, spared)
+            fewer = len(less.places) < len(model.places)
+            if fewer and not better(model, less, self.floor):
+                model = less
+            elif best.loss.mean() < model.loss.mean():
+                model = best
+        return model
+
+    def _replaced(
+        self, model: Model, place: Place, candidates: Sequence[Candidate]
+    ) -> Model | None:
+        """The model with the best of some candidates in the place of an effect; None
+        where there is none."""
+        if not candidates:
+            return None
+        kept = [p for p in model.places if p is not place]
+        found = self.fitted(kept, model.fit, candidates)
+        if not found:
+            return None
+        best = min(found, key=lambda m: m.loss.mean())
+        order = [best.places[-1] if p is place else p for p in model.places]
+        return replace(best, places=order)
 
     def needed(self, model: Model, spared: Collection[str] = ()) -> Model:
         """The model less the effects that it predicts as well without, but those that

@@ -8,6 +8,7 @@ import pytest
 
 from easi_jax.gap import effect_search
 from easi_jax.gap.effect_search import EffectSearch
+from easi_jax.gap.forward_selection import Selector
 
 ALL = {"friction", "gain", "tilt"}
 
@@ -114,3 +115,46 @@ def test_rivals_are_looked_for_among_likely_names(
     model.fit = SimpleNamespace(x=[], places=[])
     assert EffectSearch.rivals(search, model, model.places[0]) == []
     assert asked == tried
+
+
+@pytest.mark.parametrize(
+    ("point", "point_alone", "chosen"),
+    [
+        (1.0, 1.0, ["mass"]),
+        (0.9, 50.0, ["mass", "inertia"]),
+        (1.1, 50.0, None),
+    ],
+    ids=["needs fewer", "does better", "neither"],
+)
+def test_the_shape_of_an_effect_is_asked_for_again_beside_the_others(
+    point: float, point_alone: float, chosen: list[str] | None
+) -> None:
+    """A mass that is spread, less some inertia, is a point: losses of a point with the
+    inertia and alone, where that of both as they are is 1."""
+
+    def fitted(loss: float, *keys: str) -> Any:
+        even = loss + 1e-3 * np.arange(10)
+        places = [SimpleNamespace(key=k, rarity=0) for k in keys]
+        active = np.arange(len(keys))
+        windows = np.zeros((2, 0))
+        return SimpleNamespace(
+            places=places,
+            loss=even,
+            gap=even,
+            windows=windows,
+            fit=SimpleNamespace(active=active, residual=np.zeros(0)),
+        )
+
+    spread = fitted(1.0, "mass", "inertia")
+    other, alone = fitted(point, "mass", "inertia"), fitted(point_alone, "mass")
+    shape: Any = SimpleNamespace(place=SimpleNamespace(key="mass"))
+    selector: Any = SimpleNamespace(
+        floor=0.1,
+        _replaced=lambda model, place, shapes: other if shapes else None,
+        needed=lambda model, spared: alone if point_alone < 10 else model,
+    )
+    found = Selector.shaped(selector, spread, [shape])
+    if chosen is None:
+        assert found is spread
+    else:
+        assert found is (alone if len(chosen) == 1 else other)
