@@ -3,7 +3,7 @@
     python -m benchmarks.gap --kind single --seeds 0 60 --cheap
 
 Cases come from ``tests/gap_cases``; the workflow sees ``model.xml`` and the runs, the
-grader below alone sees the answer. One line a case is added to ``gap_cases.jsonl``;
+grader below alone sees the answer. One line a case is added to ``gap_curve.jsonl``;
 cases that are there already are left out, so a run that was stopped goes on.
 """
 
@@ -12,6 +12,7 @@ import itertools
 import json
 import tempfile
 import time
+from math import exp
 from pathlib import Path
 from typing import Any
 
@@ -40,14 +41,14 @@ class Config(EngineOptions):
     wide: bool = False
     """Machines of one to twelve joints, 50 to 1000 Hz, slow and fast, with velocities,
     also late or filtered ones, drives with an activation, gaps to thousands of floors
-    and laws that no table has; give --out gap_wide.jsonl."""
+    and laws that no table has."""
     coarse: bool = False
     """Models whose own physics step is seen in the gap; give --out gap_coarse.jsonl."""
     effect: str = ""
     """The hidden effect, drawn where not given; give --out gap_contacts.jsonl or so."""
     mechanism: str = ""
     """The machine, drawn where not given."""
-    out: Path = RESULTS / "gap_cases.jsonl"
+    out: Path = RESULTS / "gap_curve.jsonl"
     """Where a line for each case is added."""
 
 
@@ -131,9 +132,9 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
     first names have to be the truth's, in any order (``found``). ``listed``: what is
     among the names that the held-out data do not tell from one of those. ``there``: of
     each name whether that acts at this place; an effect in another law does, where it
-    takes half of the gap, or of what was left of it before it joined, and so does a law
-    that was found where one acts that no table has. Velocities that are late or
-    filtered are named besides, rightly.
+    takes half of the gap, of what was left of it before it joined, or of what is left
+    without it, and so does a law that was found where one acts that no table has.
+    Velocities that are late or filtered are named besides, rightly.
     """
     known = [e for e in answer["effects"] if e["kind"] != "outside"]
     truth = dict(zip(keys_of(known), (set(e["twins"]) for e in known), strict=True))
@@ -204,7 +205,9 @@ def _there(
     """Whether a named effect acts at its place; it takes a share of what is left."""
     if effect["effect"] == "found_law":
         return effect["at"] in answer["laws"]
-    half = max(effect["explains"] or 0.0, taken) >= _HALF
+    # Of what is open without it; a fault of a reading has no cost.
+    alone = 1.0 - exp(-2.0 * (effect["removal_cost"] or 0.0))
+    half = max(effect["explains"] or 0.0, taken, alone) >= _HALF
     return any(
         name in {key, *e["twins"]} or (half and name in e["kindred"])
         for key, e in zip(keys_of(answer["effects"]), answer["effects"], strict=True)

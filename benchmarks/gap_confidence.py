@@ -21,16 +21,14 @@ import numpy as np
 
 from benchmarks.gap_frozen import FROZEN, RESULTS
 from benchmarks.gap_score import brier
-from easi_jax.gap.model_comparison import Curve, confidence
+from easi_jax.gap.model_comparison import confidence
 from train._command import main, say, show_table
 
 LINES = RESULTS / "gap_curve.jsonl"
 FAMILIES = {"outside": "unknown", "mixed": "mixed", "real": "mixed"}  # others: known
 _BINS = 5
 _SURE = 0.8
-# Of the curve's numbers, as a normal prior of so many units: few names tell little of
-# how steep it is, and names that are all right would make it a step.
-_PRIOR = 3.0
+_UNKNOWN = 1 / 3  # of the names that the curve is fitted to: beside unknown effects
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +48,6 @@ class Said:
     Attributes:
         confidence: stated, ``(n,)``.
         cost: of taking them out [nats], ``(n,)``.
-        sure: standard errors between blocks by which they help, ``(n,)``.
         odds: of their rivals, ``(n,)``.
         there: whether they, or a twin, are in the machine, ``(n,)`` bool.
         family: known, mixed or unknown, ``(n,)``.
@@ -59,7 +56,6 @@ class Said:
 
     confidence: np.ndarray
     cost: np.ndarray
-    sure: np.ndarray
     odds: np.ndarray
     there: np.ndarray
     family: np.ndarray
@@ -69,26 +65,27 @@ class Said:
         """A part of them."""
         return Said(**{name: x[which] for name, x in vars(self).items()})
 
-    def by(self, curve: Curve) -> "Said":
+    def by(self, even: float, steep: float) -> "Said":
         """With the confidence that a curve would state."""
-        each = zip(self.cost, self.sure, self.odds, strict=True)
-        stated = [confidence(c, s, o, curve) for c, s, o in each]
+        each = zip(self.cost, self.odds, strict=True)
+        stated = [confidence(c, o, even, steep) for c, o in each]
         return dataclasses.replace(self, confidence=np.array(stated))
 
 
 def said(rows: Sequence[dict[str, Any]]) -> Said:
-    """All that was named in some lines."""
+    """All that was named in some lines, but faults of readings, which are judged by
+    themselves."""
+    named = [(r, k) for r in rows for k, x in enumerate(r["removal_cost"]) if x]
 
     def every(key: str) -> np.ndarray:
-        return np.array([x for r in rows for x in r[key]], float)
+        return np.array([r[key][k] for r, k in named], float)
 
     def of_row(value: Any) -> np.ndarray:
-        return np.array([value(r) for r in rows for _ in r["named"]])
+        return np.array([value(r) for r, _ in named])
 
     return Said(
         confidence=every("confidence"),
         cost=every("removal_cost"),
-        sure=every("removal_sure"),
         odds=every("rival_odds"),
         there=every("there").astype(bool),
         family=of_row(lambda r: FAMILIES.get(r["kind"], "known")),
@@ -128,16 +125,21 @@ def by_family(part: Said) -> dict[str, dict[str, float]]:
     }
 
 
-def fitted(part: Said) -> Curve:
-    """The curve that makes what was the case most likely."""
+def fitted(part: Said) -> tuple[float, float]:
+    """The curve that makes what was the case most likely: even [nats] and steep."""
     from scipy.optimize import minimize
 
-    def unlikely(at: np.ndarray) -> float:
-        p = np.clip(part.by(Curve(*at)).confidence, 1e-3, 1 - 1e-3)
-        likely = np.where(part.there, np.log(p), np.log(1 - p))
-        return 0.5 * float(np.sum((at / _PRIOR) ** 2)) - float(np.sum(likely))
+    known = part.family == "known"
+    share = np.where(known, 1 - _UNKNOWN, _UNKNOWN)
+    weight = share / np.where(known, known.mean(), 1 - known.mean())
 
-    return Curve(*map(float, minimize(unlikely, np.zeros(3), method="Nelder-Mead").x))
+    def unlikely(at: np.ndarray) -> float:
+        p = np.clip(part.by(*np.exp(at)).confidence, 1e-3, 1 - 1e-3)
+        each = np.where(part.there, np.log(p), np.log(1 - p))
+        return -float(weight @ each)
+
+    even, steep = np.exp(minimize(unlikely, np.zeros(2), method="Nelder-Mead").x)
+    return float(even), float(steep)
 
 
 def left_out(part: Said) -> Said:
@@ -146,7 +148,7 @@ def left_out(part: Said) -> Said:
     out = part.confidence.copy()
     for mechanism in np.unique(part.mechanism):
         mine = part.mechanism == mechanism
-        out[mine] = part.some(mine).by(fitted(part.some(~mine))).confidence
+        out[mine] = part.some(mine).by(*fitted(part.some(~mine))).confidence
     return dataclasses.replace(part, confidence=out)
 
 
@@ -159,7 +161,8 @@ def run(config: Config) -> None:
     if not config.lines.is_file():
         raise UserError(f"{config.lines} is not there; python -m benchmarks.gap --help")
     rows = [json.loads(line) for line in config.lines.read_text().splitlines()]
-    every, curve = said(rows), fitted(said(rows))
+    every = said(rows)
+    even, steep = fitted(every)
     told = {"mechanism left out": by_family(left_out(every))}
     frozen = read_rows(config.frozen)
     if any(r["named"] for r in frozen):
@@ -179,9 +182,9 @@ def run(config: Config) -> None:
             "commits": sorted({r["commit"] for r in rows}),
         },
         families=told,
-        curve=dataclasses.asdict(curve),
+        curve={"even [nats]": even, "steep": steep},
     )
-    say(f"fitted: {', '.join(f'{k} {v:.3g}' for k, v in vars(curve).items())}")
+    say(f"fitted: even at {even:.2f} nats, steepness {steep:.2g}")
     say(f"written: {path}")
 
 

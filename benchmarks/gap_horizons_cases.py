@@ -20,6 +20,7 @@ from benchmarks.gap_score import keys_of
 from train._command import main
 from train._options import EngineOptions
 
+LINES = RESULTS / "gap_horizons_cases.jsonl"
 COUNT = 40
 _LACKING_NONE = "none", "wrong_own"
 
@@ -28,7 +29,7 @@ _LACKING_NONE = "none", "wrong_own"
 class Config(Share, EngineOptions):
     """Asks train.gap about the same generated machines at several horizons."""
 
-    out: Path = RESULTS / "gap_horizons_cases.jsonl"
+    out: Path = LINES
     """Where a line for each machine is added."""
 
 

@@ -16,6 +16,9 @@ from benchmarks.coverage_summary import judged as covered
 from benchmarks.coverage_summary import share
 from benchmarks.found_laws import CLOSED, LIKE
 from benchmarks.found_laws import GOALS as LAW_GOALS
+from benchmarks.gap_frozen import COUNT, FROZEN, MIXTURE
+from benchmarks.gap_horizons_cases import COUNT as SMALL
+from benchmarks.gap_horizons_cases import LINES as HORIZONS
 from benchmarks.gap_real import MACHINES
 from benchmarks.gap_score import (
     GOALS,
@@ -37,39 +40,27 @@ from benchmarks.gap_times import EFFECTS
 from benchmarks.gap_times import GOALS as TIME_GOALS
 from benchmarks.loop import HIDDEN
 
-KINDS = ("none", "single", "pair", "wrong_own", "outside")
 EMPS_GOAL = 8e-4  # m, over 0.5 s of the pulses
+_FIGURES = {"mean confidence": ".2f", "Brier score": ".3f", "calibration error": ".3f"}
 
 
 def _cases(rows: list[Any]) -> list[str]:
-    commits = ", ".join(sorted({short(r["commit"]) for r in rows}))
+    commits = ", ".join(sorted({short(r["versions"]["commit"]) for r in rows}))
+    kinds = {kind: [r for r in rows if r["kind"] == kind] for kind in MIXTURE}
     pairs = judged(rows)
     bins = [(f"{c:.2f}", f"{s:.2f}", n) for c, s, n in calibration(pairs)]
     return [
-        f"{len(rows)} generated cases (`python -m benchmarks.gap`), commits {commits}.",
+        f"{len(rows)} of {COUNT} generated machines (`python -m "
+        f"benchmarks.gap_frozen`; the others are not run), commit {commits}, by seeds "
+        "that nothing was fitted to. Of each kind every other machine has one or two "
+        "joints at usual rates; the rest have one to twelve, at 50 to 1000 Hz, slow "
+        "and fast, with velocities that may be late or filtered, and gaps to thousands "
+        "of floors.",
         markdown_table(
             ("what", "cases", "95 % (Wilson)", "goal", ""),
             [*_goals(rows), *_sizes(rows)],
         ),
         "Listed as alike: the held-out data do not tell it from the one named.",
-        markdown_table(("confidence stated", "share right", "names"), bins),
-        f"Brier score {brier(pairs):.3f} over {len(pairs)} names.",
-        "![Calibration of the stated confidence](gap_calibration.svg)",
-        "![What each true effect was named](gap_confusion.svg)",
-        "The counts are in `gap_confusion.json`.",
-    ]
-
-
-def _fitted(rows: list[Any]) -> list[str]:
-    """Cases by the measure of today: of before are those above."""
-    kinds = {kind: [r for r in rows if r["kind"] == kind] for kind in KINDS}
-    commits = ", ".join(sorted({short(r["commit"]) for r in rows}))
-    return [
-        f"{len(rows)} generated machines of one or two joints (`python -m "
-        f"benchmarks.gap --engine mujoco --cheap`), commits {commits}. Starts of "
-        "windows are fitted with each model's own dynamics, and verdicts are by "
-        "channel; the cases above are of the measure before. Seeds from 90000 and from "
-        "91000 on, none left out.",
         table(
             [(kind, some) for kind, some in kinds.items() if some],
             {
@@ -86,6 +77,11 @@ def _fitted(rows: list[Any]) -> list[str]:
             },
         ),
         *_spreads(rows),
+        markdown_table(("confidence stated", "share right", "names"), bins),
+        f"Brier score {brier(pairs):.3f} over {len(pairs)} names.",
+        "![Calibration of the stated confidence](gap_calibration.svg)",
+        "![What each true effect was named](gap_confusion.svg)",
+        "The counts are in `gap_confusion.json`.",
     ]
 
 
@@ -101,10 +97,9 @@ def _spreads(rows: list[Any]) -> list[str]:
         for q, hit in inside.items()
     )
     lines = zip((f"{q:.0%}" for q in COVERED), told, strict=True)
-    commits = ", ".join(sorted({short(r["commit"]) for r in rows if "deviations" in r}))
     return [
-        f"True values of the effects that were named right, {len(off)} numbers of the "
-        f"cases since {commits}, inside the intervals that their deviations make:",
+        f"True values of the effects that were named right, {len(off)} numbers, inside "
+        "the intervals that their deviations make:",
         markdown_table(("interval", "inside [95 %] (goal)"), list(lines)),
     ]
 
@@ -187,7 +182,7 @@ def figures(folder: Path) -> dict[str, str]:
     from benchmarks.gap_figures import calibration_curve, confusion_matrix
     from easi_jax.io.files import to_json
 
-    rows = load(folder, "gap_cases.jsonl")
+    rows = load(folder, FROZEN.name)
     if not rows:
         return {}
     counts, pairs = confusion(rows), judged(rows)
@@ -284,52 +279,26 @@ def _unnamed(r: Any) -> str:
 def _confidence(r: dict[str, Any]) -> list[str]:
     """How often what was named is there, on machines the curve has not seen."""
     families = {"all": "all", "known": "effects of the table"}
-    families |= {"mixed": "one of the table beside one that no table has"}
+    families |= {"mixed": "effects of the table beside ones that no table has"}
     families |= {"unknown": "one that no table has, alone"}
     lines = [
         (
-            *(families[k], f["names"], f["there"], f"{f['mean confidence']:.2f}"),
-            *(f"{f['Brier score']:.3f}", f"{f['calibration error']:.3f}"),
+            *(name, families[k], f["names"], f["there"]),
+            *(f"{f[x]:{d}}" for x, d in _FIGURES.items()),
             f["wrong above 0.8"],
         )
-        for k, f in r["families"].items()
+        for name, told in r["families"].items()
+        for k, f in told.items()
     ]
-    head = ("hidden", "named", "there", "mean confidence", "Brier", "calibration error")
+    head = "machines", "hidden", "named", "there", *_FIGURES, "wrong above 0.8"
+    told = ", ".join(f"{k} {v:.2f}" for k, v in r["curve"].items())
     return [
-        f"`python -m benchmarks.gap_confidence`: {r['config']['lines']} generated "
-        "machines of one or two joints, by seeds that the curve was not fitted to "
-        "(goals: Brier below 0.08; calibration error below 0.05, of each kind below "
-        "0.1; over at least 300 names).",
-        markdown_table((*head, "wrong above 0.8"), lines),
-        *_by_gaps(r.get("by_gaps", {})),
-    ]
-
-
-def _by_gaps(r: dict[str, Any]) -> list[str]:
-    """The curve on names of older lines, by the size of the gap."""
-    if not r:
-        return []
-    head = ("gap, in floors at most", "named", "there", "mean confidence")
-    ways = {
-        "open_from": "within 1.25 floors",
-        "closed": "within 1.05 floors, as stated",
-    }
-    lines = [
-        (
-            *(ways[way], size, f["names"], f["there"], f"{f['mean confidence']:.2f}"),
-            *(f"{f['Brier score']:.3f}", f"{f['calibration error']:.3f}"),
-        )
-        for way, told in r.items()
-        for size, f in (
-            *told["by gap, in floors at most"].items(),
-            ("all", told["all"]),
-        )
-    ]
-    return [
-        "The same curve on names of older lines (costs from the gap before and after "
-        "each effect joined, rivals left out; unknown effects among them), by what "
-        "counts as open with an effect, too:",
-        markdown_table(("counts as open", *head, "Brier", "calibration error"), lines),
+        f"`python -m benchmarks.gap_confidence`: the curve was fitted to "
+        f"{r['config']['lines']} generated machines of one or two joints ({told}). "
+        "Mechanism left out: these, by a curve fitted to the other mechanisms. Goals: "
+        "Brier score below 0.08; calibration error below 0.05, of each kind below 0.1; "
+        "over at least 300 names.",
+        markdown_table(head, lines),
     ]
 
 
@@ -352,6 +321,24 @@ def _horizons(found: dict[str, Any]) -> list[str]:
         "`python -m benchmarks.gap_horizons`: the same names at all horizons on "
         f"{same} of {len(found)} machines; values differ by {100 * far:.2g} % at most.",
         markdown_table(("recordings", "horizon [s]", "named", "gap"), lines),
+    ]
+
+
+def _horizons_cases(rows: list[Any]) -> list[str]:
+    """Names of generated machines at several horizons of the report."""
+    same = sum(r["same_names"] for r in rows)
+    far = max(r["farthest_value"] for r in rows)
+    differ = [
+        (r["key"], *(", ".join(names) or "none" for names in r["named"].values()))
+        for r in rows
+        if not r["same_names"]
+    ]
+    head = ("machine", *(f"{h} s" for h in rows[0]["named"]))
+    return [
+        f"`python -m benchmarks.gap_horizons_cases`: {len(rows)} of {SMALL} generated "
+        f"machines, the same names at all horizons on {same}; values differ by "
+        f"{100 * far:.2g} % at most.",
+        *([markdown_table(head, differ)] if differ else []),
     ]
 
 
@@ -410,13 +397,7 @@ def _halved(r: dict[str, Any]) -> bool:
 
 _FIRST = next(iter(HIDDEN))
 SECTIONS = (
-    Section("## Hidden effects", "gap_cases.jsonl", "gap", _cases),
-    Section(
-        "### Hidden effects since starts are fitted",
-        "gap_cases_fitted.jsonl",
-        "gap --engine mujoco --cheap --out gap_cases_fitted.jsonl",
-        _fitted,
-    ),
+    Section("## Hidden effects", FROZEN.name, "gap_frozen", _cases),
     Section("", "gap_contacts.jsonl", "gap --effect contact_friction", _contacts),
     Section("", "gap_coarse.jsonl", "gap --coarse --cheap", _coarse, optional=True),
     Section(
@@ -431,6 +412,7 @@ SECTIONS = (
         "gap_horizons",
         _horizons,
     ),
+    Section("", HORIZONS.name, "gap_horizons_cases", _horizons_cases),
     Section("### Laws that no table has", "found_laws.jsonl", "found_laws", _laws),
     Section("## Effects in real recordings", "gap_real_*.json", "gap_real", _real),
     Section("## Time of train.gap", "gap_times.jsonl", "gap_times", _times),

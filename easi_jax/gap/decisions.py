@@ -80,10 +80,11 @@ class Decisions:
     most: int = 5
     """Effects. The largest of the contract's machines has five."""
 
-    probable: float = 0.5
+    probable: float = 0.7
     """Confidence of an effect, with what is within `open_from` floors left out of what
-    it closes, below which it is not named where nothing is open without it. Of 15
-    effects below that in the 27 cases of `benchmarks.gap_confidence` none was right."""
+    it closes, below which it is not named where nothing is open without it, or where
+    held-out data are predicted no better with it: what nobody misses has to be more
+    than twice as likely right as wrong."""
 
     # -- which of several names ------------------------------------------------
 
@@ -107,15 +108,17 @@ class Decisions:
     """Of the noise: names whose predictions differ by less, RMS, are twins: 100
     independent rows would tell them apart by one standard error."""
 
-    curve_even: float = 0.48
-    """Logarithm of the odds that a name is right whose removal costs one nat, by one
-    standard error between blocks: TODO."""
+    even: float = 0.33
+    """Nats for each number, lost without an effect, at which its name is as often wrong
+    as right: half the logarithm of what is then open, by what is open with it. Fitted
+    by maximum likelihood to the names of generated machines, most of which also lack
+    what no effect of the table is (`benchmarks.gap_confidence`, which tests it on
+    others)."""
 
-    curve_by_cost: float = 2.6
-    """How these grow with the logarithm of the nats; likewise."""
-
-    curve_by_sure: float = 0.0
-    """How they grow with that of the standard errors; likewise."""
+    steep: float = 1.0
+    """How fast that changes with the logarithm of the loss; likewise. The standard
+    errors of an effect's help say no more beside its cost: with them mechanisms that
+    were left out were predicted no better."""
 
     does_nothing: float = 1e-3
     """Of the largest error: an effect that changes less was fitted to nothing. No test:

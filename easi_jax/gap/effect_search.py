@@ -38,6 +38,8 @@ from easi_jax.model.parameter_proposal import like_places
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.progress import Tell
 
+Gains = Callable[[np.ndarray, Sequence[np.ndarray]], Sequence[bool]]
+
 RIVALS = 8  # names in the place of another that are followed up
 _STAGES = 8  # of adding one and taking out what has become needless
 _RIPPLES = [0.75 * k for k in range(3, 27)]  # cycles over the range of a joint
@@ -345,15 +347,15 @@ class EffectSearch:
             seen.add(keys(model))
 
     def needful(
-        self, model: Model, step: float, gains: Callable[[np.ndarray, np.ndarray], bool]
+        self, model: Model, step: float, gains: Gains
     ) -> tuple[Model, dict[str, list[Model]], list[str]]:
         """The model less what says nothing of the machine, with the rivals of what is
         left, and notes.
 
         Args:
             step: of the physics [s].
-            gains: whether held-out data are predicted better by a vector than by
-                another.
+            gains: whether held-out data are predicted better by a vector than by each
+                of others.
         """
         model, rivals = self.exchanged(model)
         notes: list[str] = []
@@ -385,18 +387,17 @@ class EffectSearch:
         self,
         model: Model,
         rivals: Mapping[str, Sequence[Model]],
-        gains: Callable[[np.ndarray, np.ndarray], bool],
+        gains: Gains,
     ) -> dict[str, str]:
         """The key of the effect that is missed least, of those that are not even
         probable and without which nothing is open, or held-out data are predicted as
         well; and why it is not named."""
-        x, why = model.fit.x, dict[str, str]()
-        for place in model.places:
-            less = self.at.without(model, [place]).fit.x
-            if not self.at.misses(x, less):
-                why[place.key] = _NOT_MISSED
-            elif not gains(self.at.plain(x), self.at.plain(less)):
-                why[place.key] = _NO_GAIN
+        x, plain = model.fit.x, self.at.plain
+        without = {p.key: self.at.without(model, [p]).fit.x for p in model.places}
+        missed = [key for key, less in without.items() if self.at.misses(x, less)]
+        why = dict.fromkeys([k for k in without if k not in missed], _NOT_MISSED)
+        helped = gains(plain(x), [plain(without[key]) for key in missed])
+        why |= {k: _NO_GAIN for k, ok in zip(missed, helped, strict=True) if not ok}
         if not why:
             return {}
         # What is not open may be of any cause.
@@ -404,7 +405,7 @@ class EffectSearch:
         for place in sorted(model.places, key=lambda p: each[p.key]):
             among = rivals[place.key][:RIVALS]
             odds = odds_of(last(model, place), among, self.at.windows.led)
-            probable = confidence(*each[place.key], odds) >= DECIDE.probable
+            probable = confidence(each[place.key][0], odds) >= DECIDE.probable
             if place.key in why and not probable:
                 return {place.key: why[place.key]}
         return {}

@@ -1,8 +1,7 @@
 """Whether a set of effects is better than another, by their cross-validated losses."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from math import erf, exp, log, sqrt
+from math import erf, sqrt
 
 import numpy as np
 
@@ -11,7 +10,6 @@ from easi_jax.gap.effect_set import Model
 from easi_jax.gap.table import Place
 
 _TINY = 1e-300
-_SUREST = 100.0  # standard errors, beyond which an effect is not surer
 _UNLIKELY = 1e-6  # probability of a name beside a rival, that odds are never beyond
 
 
@@ -189,38 +187,24 @@ def certainty(model: Model, less: Model) -> float:
     return advantage(mine, theirs)
 
 
-@dataclass(frozen=True)
-class Curve:
-    """Logarithm of the odds that an effect is there: ``even``, and how it grows with
-    the logarithm of its `cost` [nats] and with that of its `certainty`."""
-
-    even: float = DECIDE.curve_even
-    by_cost: float = DECIDE.curve_by_cost
-    by_sure: float = DECIDE.curve_by_sure
-
-
-_CURVE = Curve()
-
-
-def confidence(lost: float, sure: float, odds: float, curve: Curve = _CURVE) -> float:
+def confidence(
+    lost: float, odds: float, even: float = DECIDE.even, steep: float = DECIDE.steep
+) -> float:
     """Probability that an effect of this name acts at this place.
 
-    What closes little beside what is left, or is not sure to, may mend a little of what
-    no effect is: so it was in generated machines, known effects beside unknown ones
-    among them (`benchmarks.gap_confidence`).
+    What closes little beside what is left may mend a little of what no effect is: so it
+    was in generated machines, known effects beside unknown ones among them
+    (`benchmarks.gap_confidence`).
 
     Args:
         lost: its `cost`.
-        sure: its `certainty`.
         odds: of all its rivals together, but its twins.
-        curve: what the first two say.
+        even: cost of what is as often named wrongly as rightly [nats], and how
+            ``steep`` that is in its logarithm.
     """
-    if lost <= 0 or sure <= 0:
+    if lost <= 0:
         return 0.0
-    # Infinite where predictions without it are not finite.
-    sure = min(sure, _SUREST)
-    of_it = curve.even + curve.by_cost * log(lost) + curve.by_sure * log(sure)
-    return 1.0 / (1.0 + exp(min(-of_it, 50.0))) / (1.0 + odds)
+    return 1.0 / (1.0 + (even / lost) ** steep) / (1.0 + odds)
 
 
 def odds_of(mine: Model, rivals: Sequence[Model], led: np.ndarray) -> float:

@@ -227,7 +227,7 @@ class _Judge:
                 Found(
                     place,
                     numbers.values(place),
-                    confidence(*each[place.key], odds),
+                    confidence(costs[place.key], odds),
                     [k for k in dict.fromkeys(same) if k not in mine],
                     figures.gap,
                     numbers.fitted(place),

@@ -33,7 +33,7 @@ ELSEWHERE = {
     "linear_response": {
         *("_SPACING", "_MOVED", "_LEAST", "_MOST", "_ALIKE", "_STUCK", "_BATCH"),
     },
-    "model_comparison": {"_TINY", "_UNLIKELY", "_SUREST"},
+    "model_comparison": {"_TINY", "_UNLIKELY"},
     "offered_terms": {
         *("_WIDTH", "_BENDS", "_LAGS", "_WARMS", "_PAIRED", "_PLAIN", "_TWO"),
         "_THREE",

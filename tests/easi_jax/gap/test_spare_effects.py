@@ -69,8 +69,8 @@ def test_what_is_neither_probable_nor_missed_is_spared(
     search: Any = EffectSearch([at], 0, SimpleNamespace(), print)  # type: ignore
     model: Any = at.model(list(worth))
 
-    def gains(x: list[str], less: list[str]) -> bool:
-        return bool(set(x) - set(less) & seen)
+    def gains(x: list[str], others: list[list[str]]) -> list[bool]:
+        return [bool(set(x) - set(less) & seen) for less in others]
 
     found = search._spare(model, {key: [] for key in worth}, gains)
     assert [*found] == spared
@@ -84,7 +84,9 @@ def test_what_windows_of_another_length_show_is_not_spared(
     model = short.model(["friction"])
     for lengths, spared in (([short], ["friction"]), ([short, long], [])):
         search: Any = EffectSearch(lengths, 0, SimpleNamespace(), print)  # type: ignore
-        found = search._spare(model, {"friction": []}, lambda x, less: True)
+        found = search._spare(
+            model, {"friction": []}, lambda x, others: [True] * len(others)
+        )
         assert [*found] == spared
 
 

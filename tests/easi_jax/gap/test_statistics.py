@@ -27,6 +27,7 @@ from easi_jax.gap.batched_least_squares import (
     window_weights,
 )
 from easi_jax.gap.candidates import places, ripples
+from easi_jax.gap.decisions import DECIDE
 from easi_jax.gap.discretization_error import error_of_steps, within_a_step
 from easi_jax.gap.effect_search import EffectSearch
 from easi_jax.gap.effect_set import Candidate, Model
@@ -34,7 +35,6 @@ from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.forward_selection import Selector
 from easi_jax.gap.held_out import HeldOut
 from easi_jax.gap.model_comparison import (
-    Curve,
     advantage,
     are_twins,
     better,
@@ -581,17 +581,12 @@ def of_loss(loss: np.ndarray) -> Model:
 
 
 def test_what_costs_much_to_take_out_is_sure() -> None:
-    sure = [confidence(lost, 5.0, 0.0) for lost in (0.0, 0.1, 0.5, 1.0, 3.0)]
+    sure = [confidence(lost, 0.0) for lost in (0.0, 0.01, 0.1, 1.0, 10.0)]
     assert sure == sorted(sure) and sure[0] == 0.0
-    assert sure[1] < 0.05 and sure[2] < 0.5 < sure[3] and 0.9 < sure[-1] < 1.0
-    assert confidence(3.0, 5.0, 1.0) == pytest.approx(0.5 * sure[-1])
-    assert confidence(1e-300, 5.0, 0.0) < 1e-9 and confidence(3.0, 0.0, 0.0) == 0.0
-    assert confidence(3.0, np.inf, 0.0) <= 1.0
-    # Odds of e to 1 at one nat and one standard error; 8 times as much at two nats.
-    curve = Curve(even=1.0, by_cost=3.0, by_sure=0.5)
-    assert confidence(1.0, 1.0, 0.0, curve) == pytest.approx(1 / (1 + np.exp(-1)))
-    odds = confidence(2.0, 4.0, 0.0, curve)
-    assert odds / (1 - odds) == pytest.approx(np.e * 8 * 2)
+    assert sure[1] < 0.1 and sure[2] < 0.5 < sure[3] and 0.9 < sure[-1] < 1.0
+    assert confidence(3.0, 1.0) == pytest.approx(0.5 * confidence(3.0, 0.0))
+    # Three times the cost that is as often wrong as right.
+    assert confidence(0.6, 0.0, even=0.2, steep=2.0) == pytest.approx(0.9)
 
 
 def test_an_effect_is_missed_as_in_the_windows_that_show_it_most() -> None:
@@ -670,16 +665,16 @@ def test_the_cost_is_what_is_open_without_an_effect_by_what_is_open_with_it() ->
     loss = np.random.default_rng(0).uniform(1.0, 2.0, 10)
     far = 1e4 * loss
     assert cost(of_loss(far), of_loss(4 * far)) == pytest.approx(np.log(2), rel=1e-3)
-    # What closes all of a gap of two floors is likely, and of three sure; a loss of a
-    # little less than 1 is that of a right model.
+    # What closes all of a gap of two floors is likely; a right model's loss is a little
+    # less than 1.
     right = of_loss(np.full(10, 0.9))
     costs = [cost(right, of_loss(np.full(10, x**2))) for x in (0.9, 1.0, 1.25, 2, 3)]
     assert costs == sorted(costs) and costs[:2] == [0.0, 0.0]
-    sure = [confidence(c, 5.0, 0.0) for c in costs]
-    assert sure[2] < 0.6 and 0.8 < sure[3] < 0.9 and 0.9 < sure[4] < 0.95
+    sure = [confidence(c, 0.0) for c in costs]
+    assert sure[2] < 0.75 and 0.8 < sure[3] < 0.9 and sure[3] < sure[4] < 0.95
     # What is not open may be of any cause.
     within = cost(right, of_loss(np.full(10, 1.25**2)), 1.25)
-    assert confidence(within, 5.0, 0.0) < 0.15
+    assert confidence(within, 0.0) < DECIDE.probable
     # A force limit that one block of ten meets costs as much as that one says.
     met = np.where(np.arange(10) == 3, 1e4, loss)
     assert cost(of_loss(loss), of_loss(met)) > 2.0
