@@ -11,6 +11,13 @@ _PATIENCE = 5.0  # s; a stage that takes no longer shows no progress
 
 def run(config: Config) -> None:
     """Reads and checks, finds, writes."""
+    from easi_jax.model.own_effects import registered
+
+    with registered([]):  # laws that are found are of this machine alone
+        _run(config)
+
+
+def _run(config: Config) -> None:
     from easi_jax.devices import runtime
     from easi_jax.errors import UserError
     from easi_jax.io.runs.folder import RunFolder

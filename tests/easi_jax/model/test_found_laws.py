@@ -142,6 +142,25 @@ def test_a_law_is_simulated_as_mujoco_does(m: mujoco.MjModel, how: Engine) -> No
     np.testing.assert_allclose(end.hidden, [z], atol=1e-4)
 
 
+@pytest.mark.parametrize("how", ["mujoco", "mjx"])
+def test_a_law_that_a_model_has_at_zero_alone_is_left_out(
+    m: mujoco.MjModel, how: Engine
+) -> None:
+    """As a program does that is for vectors without laws, whatever is registered."""
+    name = add_law(FoundLaw((("a", 1.0),), (Term("dahl(qvel.a, 0.05)"),)))
+    fixed = {f"effect.{name}.a.c1": -0.3}
+    s = Simulator(m, ParameterSpace(()), 0.01, fixed=fixed, engine=how)
+    given = s.model(jnp.zeros(0))
+    assert given.effects is not None and given.effects.laws
+    ends = []
+    for laws in (given.effects, given.effects.replace(laws=())):
+        model = given.replace(effects=laws, present=("coulomb",))
+        first = s.start(jnp.array([0.1, -0.2]), jnp.array([2.0, 1.0]), model)
+        assert first.hidden == ()
+        ends.append(s.step(model, first, jnp.array([0.1])).qpos)
+    np.testing.assert_array_equal(*ends)
+
+
 DIFFERENCE = '(qpos.a - qpos["left-wrist"])'
 
 
