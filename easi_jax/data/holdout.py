@@ -1,5 +1,6 @@
 """Which data are kept out of a fit."""
 
+import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,7 +17,8 @@ from easi_jax.errors import UserError
 HELD_OUT = 0.25  # of the rows, where whole runs are held out
 _MOST = 0.6  # of the rows, or of a run
 _OF_ONE = 0.3  # of a single run
-_BLOCKS = 3  # in which that lies, where each has room for two horizons
+_BLOCKS = 3  # in which that lies, where each has room for two predictions
+_USUAL = 0.2  # s; of predictions that data are parted for, whatever the horizon
 _REACHED = 99.8  # percentile
 _TRIED = 24  # of very many runs, side by side: a second or two for a thousand of them
 _FURTHER = 4.0  # times as bad as not as far: what fits never see cannot be found
@@ -25,14 +27,8 @@ _FURTHER = 4.0  # times as bad as not as far: what fits never see cannot be foun
 def split_held_out(
     m: mujoco.MjModel, runs: Sequence[Run], horizon: float
 ) -> tuple[list[Run], list[Run], str]:
-    """Runs to fit, runs held out, and a sentence that says which.
-
-    Of two runs or more with room for a prediction, whole runs with a quarter of their
-    rows, and hardly more, whose speeds and drive forces reach about as far as those of
-    the runs left to fit, and rather less far than further; of equals the last. Of a
-    single one blocks that are spread over it (`_blocks_of`), and likewise of the
-    longest where whole runs would be too few rows or nearly all: a bad row near the end
-    of a log parts it in a long run and a short one.
+    """Runs to fit, runs held out, and a sentence that says which: the same for every
+    horizon that those held out are long enough for.
 
     Args:
         horizon: of predictions [s].
@@ -40,14 +36,34 @@ def split_held_out(
     Raises:
         UserError: runs too short to be split.
     """
-    long = [run for run in runs if len(run) >= _least(run, horizon)]
+    # Where runs are too short for that, the horizon that was asked for is told.
+    with contextlib.suppress(UserError):
+        parted = _parted(m, runs, _USUAL)
+        if any(len(run) >= _least(run, horizon) for run in parted[1]):
+            return parted
+    return _parted(m, runs, horizon)
+
+
+def _parted(
+    m: mujoco.MjModel, runs: Sequence[Run], seconds: float
+) -> tuple[list[Run], list[Run], str]:
+    """`split_held_out` for predictions of so many ``seconds``.
+
+    Of two runs or more with room for a prediction, whole runs with a quarter of their
+    rows, and hardly more, whose speeds and drive forces reach about as far as those of
+    the runs left to fit, and rather less far than further; of equals the last. Of a
+    single one blocks that are spread over it (`_blocks_of`), and likewise of the
+    longest where whole runs would be too few rows or nearly all: a bad row near the end
+    of a log parts it in a long run and a short one.
+    """
+    long = [run for run in runs if len(run) >= _least(run, seconds)]
     chosen = None
     if len(long) > 1:
         rows = np.array([len(run) for run in long])
         chosen = _alike(rows, [_reach(m, run) for run in long])
     if chosen is None:
         longest = max(runs, key=len)
-        parts, held, name = _blocks_of(longest, long or runs, horizon)
+        parts, held, name = _blocks_of(longest, long or runs, seconds)
         fit = []
         for run in runs:
             fit += parts if run is longest else [run]
@@ -107,9 +123,9 @@ def _blocks_of(
     run: Run, beside: Sequence[Run], horizon: float
 ) -> tuple[list[Run], list[Run], str]:
     """30 % of a run, or a quarter of it and the runs ``beside`` it, in three blocks,
-    each in the middle of a third of it and behind a gap of one horizon; where those
-    would be shorter than two horizons in two, else its last rows. What is left between
-    them are runs to fit.
+    each in the middle of a third of it and behind a gap of one prediction; where those
+    would be shorter than two predictions in two, else its last rows. What is left
+    between them are runs to fit.
     """
     rows, gap = len(run), window_steps(run.dt, horizon)
     least = _least(run, horizon)

@@ -46,8 +46,7 @@ def measured_runs(
         log: to fit.
         held_out: kept out of every fit; None: a quarter of ``log``
             (`easi_jax.data.holdout.split_held_out`).
-        horizon: of predictions [s]; so much is left out between what is fitted and
-            what is held out of one run.
+        horizon: of predictions [s].
 
     Raises:
         UserError: runs that do not fit the model; too few rows to hold some out.

@@ -75,6 +75,20 @@ def test_of_a_single_run_blocks_behind_gaps_are_held_out():
         np.testing.assert_array_equal(part.sent_until, run.ctrl[: first + len(part)])
 
 
+def test_the_parts_of_a_run_do_not_depend_on_the_horizon():
+    """What is fitted decides on names, which are those of every horizon."""
+    run = make_run(np.arange(1000.0), "arm")
+    usual = [first_and_last(part) for part in split_held_out(SLIDE, [run], 0.2)[:2]]
+    for horizon in (0.05, 0.5, 0.9):
+        fit, held, _ = split_held_out(SLIDE, [run], horizon)
+        assert [first_and_last(fit), first_and_last(held)] == usual, horizon
+    _, held, _ = split_held_out(SLIDE, [run], 1.2)  # blocks of 1 s are too short
+    assert first_and_last(held) == [(700, 999)]
+    # Too short for 0.2 s, but not for 0.1 s.
+    _, (held,), _ = split_held_out(SLIDE, [make_run(np.arange(60.0))], 0.1)
+    assert first_and_last([held]) == [(42, 59)]
+
+
 def test_blocks_of_a_short_run_are_fewer():
     # A prediction of 20 steps, 5 rows before it, and 20 more for a second one.
     fit, held, _ = split_held_out(SLIDE, [make_run(np.arange(330.0))], 0.2)
