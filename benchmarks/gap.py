@@ -12,7 +12,6 @@ import itertools
 import json
 import tempfile
 import time
-from math import exp
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from train._options import EngineOptions
 RESULTS = Path(__file__).parent / "results"
 LARGE = ("arm3", "leg", "arm3", "leg", "arm6")  # in turns
 _EVIDENCE = ("removal_cost", "removal_sure", "rival_odds", "explains")
+_ASKED = "kind", "cheap", "wide", "coarse", "effect", "mechanism"
 _HALF = 0.5  # of the gap, that an effect in another law takes; of the contract
 
 
@@ -61,10 +61,11 @@ def run(config: Config) -> None:
     done = set()
     if config.out.exists():
         rows = [json.loads(line) for line in config.out.read_text().splitlines()]
-        done = {(r["kind"], r["seed"], r["cheap"]) for r in rows}
+        done = {tuple(r["asked"]) for r in rows}
     commit = versions()["commit"]
     for seed in range(*config.seeds):
-        if (config.kind, seed, config.cheap) in done:
+        asked_for = (seed, *(getattr(config, name) for name in _ASKED))
+        if asked_for in done:
             continue
         with tempfile.TemporaryDirectory() as folder:
             data = Path(folder) / "case"
@@ -85,9 +86,9 @@ def run(config: Config) -> None:
                 continue
             row = solved(data, Path(folder) / "gap")
         row = {
+            "asked": asked_for,
             "kind": config.kind,
             "seed": seed,
-            "cheap": config.cheap,
             **row,
             "commit": commit,
             "command": command_of("benchmarks.gap", config),
@@ -132,9 +133,9 @@ def graded(told: dict[str, Any], answer: dict[str, Any]) -> dict[str, Any]:
     first names have to be the truth's, in any order (``found``). ``listed``: what is
     among the names that the held-out data do not tell from one of those. ``there``: of
     each name whether that acts at this place; an effect in another law does, where it
-    takes half of the gap, of what was left of it before it joined, or of what is left
-    without it, and so does a law that was found where one acts that no table has.
-    Velocities that are late or filtered are named besides, rightly.
+    takes half of the gap, or of what was left of it before it joined, and so does a law
+    that was found where one acts that no table has. Velocities that are late or
+    filtered are named besides, rightly.
     """
     known = [e for e in answer["effects"] if e["kind"] != "outside"]
     truth = dict(zip(keys_of(known), (set(e["twins"]) for e in known), strict=True))
@@ -205,9 +206,7 @@ def _there(
     """Whether a named effect acts at its place; it takes a share of what is left."""
     if effect["effect"] == "found_law":
         return effect["at"] in answer["laws"]
-    # Of what is open without it; a fault of a reading has no cost.
-    alone = 1.0 - exp(-2.0 * (effect["removal_cost"] or 0.0))
-    half = max(effect["explains"] or 0.0, taken, alone) >= _HALF
+    half = max(effect["explains"] or 0.0, taken) >= _HALF
     return any(
         name in {key, *e["twins"]} or (half and name in e["kindred"])
         for key, e in zip(keys_of(answer["effects"]), answer["effects"], strict=True)

@@ -75,7 +75,9 @@ class Said:
 def said(rows: Sequence[dict[str, Any]]) -> Said:
     """All that was named in some lines, but faults of readings, which are judged by
     themselves."""
-    named = [(r, k) for r in rows for k, x in enumerate(r["removal_cost"]) if x]
+    named = [
+        (r, k) for r in rows for k, x in enumerate(r["removal_cost"]) if x is not None
+    ]
 
     def every(key: str) -> np.ndarray:
         return np.array([r[key][k] for r, k in named], float)

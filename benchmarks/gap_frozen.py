@@ -66,19 +66,26 @@ def cells() -> list[Cell]:
 
 def run(config: Config) -> None:
     """Makes, runs and grades each case."""
-    if not config.list:
-        check_commit(config.out)
-    run_cells(cells(), config, _solve, told)
+    # Of the code that is imported now: files may change while this runs.
+    commit = "" if config.list else commit_for(config.out)
+
+    def solve(cell: Cell) -> dict[str, Any]:
+        return {"commit": commit, **_solve(cell)}
+
+    run_cells(cells(), config, solve, told)
 
 
-def check_commit(out: Path) -> None:
-    """UserError where lines of another commit are there, or files have changed since
-    this one."""
+def commit_for(out: Path) -> str:
+    """The commit of this code.
+
+    Raises:
+        UserError: there are lines of another one, or files have changed since.
+    """
     from easi_jax.errors import UserError
     from easi_jax.io.runs.versions import versions
 
     commit = versions()["commit"] or ""
-    others = {r["versions"]["commit"] for r in read_rows(out, ("versions",))} - {commit}
+    others = {r["commit"] for r in read_rows(out, ("commit",))} - {commit}
     if others:
         first = sorted(others)[0]
         raise UserError(
@@ -88,6 +95,7 @@ def check_commit(out: Path) -> None:
         )
     if commit.endswith("+"):
         raise UserError("files were changed since the last commit: commit them first")
+    return commit
 
 
 def _solve(cell: Cell) -> dict[str, Any]:

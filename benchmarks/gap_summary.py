@@ -45,13 +45,14 @@ _FIGURES = {"mean confidence": ".2f", "Brier score": ".3f", "calibration error":
 
 
 def _cases(rows: list[Any]) -> list[str]:
-    commits = ", ".join(sorted({short(r["versions"]["commit"]) for r in rows}))
+    commits = ", ".join(sorted({short(r["commit"]) for r in rows}))
+    left = "" if len(rows) == COUNT else "; the others are not run"
     kinds = {kind: [r for r in rows if r["kind"] == kind] for kind in MIXTURE}
     pairs = judged(rows)
     bins = [(f"{c:.2f}", f"{s:.2f}", n) for c, s, n in calibration(pairs)]
     return [
         f"{len(rows)} of {COUNT} generated machines (`python -m "
-        f"benchmarks.gap_frozen`; the others are not run), commit {commits}, by seeds "
+        f"benchmarks.gap_frozen`{left}), commit {commits}, by seeds "
         "that nothing was fitted to. Of each kind every other machine has one or two "
         "joints at usual rates; the rest have one to twelve, at 50 to 1000 Hz, slow "
         "and fast, with velocities that may be late or filtered, and gaps to thousands "
@@ -188,11 +189,11 @@ def figures(folder: Path) -> dict[str, str]:
     counts, pairs = confusion(rows), judged(rows)
     bins = calibration(pairs)
     reach = [wilson(round(share * n), n) for _, share, n in bins]
-    return {
-        "gap_confusion.json": to_json(counts),
-        "gap_confusion.svg": confusion_matrix(counts),
-        "gap_calibration.svg": calibration_curve(bins, reach),
-    }
+    found = {"gap_calibration.svg": calibration_curve(bins, reach)}
+    if counts:
+        found["gap_confusion.json"] = to_json(counts)
+        found["gap_confusion.svg"] = confusion_matrix(counts)
+    return found
 
 
 def _loop(robot: str, found: dict[str, Any]) -> list[str]:
@@ -278,7 +279,7 @@ def _unnamed(r: Any) -> str:
 
 def _confidence(r: dict[str, Any]) -> list[str]:
     """How often what was named is there, on machines the curve has not seen."""
-    families = {"all": "all", "known": "effects of the table"}
+    families = {"all": "all", "known": "effects of the table, or nothing"}
     families |= {"mixed": "effects of the table beside ones that no table has"}
     families |= {"unknown": "one that no table has, alone"}
     lines = [
@@ -294,7 +295,8 @@ def _confidence(r: dict[str, Any]) -> list[str]:
     told = ", ".join(f"{k} {v:.2f}" for k, v in r["curve"].items())
     return [
         f"`python -m benchmarks.gap_confidence`: the curve was fitted to "
-        f"{r['config']['lines']} generated machines of one or two joints ({told}). "
+        f"{r['config']['lines']} generated machines, most of one or two joints, "
+        f"commits {', '.join(map(short, r['config']['commits']))} ({told}). "
         "Mechanism left out: these, by a curve fitted to the other mechanisms. Goals: "
         "Brier score below 0.08; calibration error below 0.05, of each kind below 0.1; "
         "over at least 300 names.",

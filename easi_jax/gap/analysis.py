@@ -67,14 +67,12 @@ class Chosen:
         base: the model without them.
         model: with them.
         rivals: of each, best first.
-        judges: held-out windows as long as those that effects come from.
         notes: on what was left out.
     """
 
     base: Model
     model: Model
     rivals: Mapping[str, Sequence[Model]]
-    judges: HeldOut
     notes: list[str]
 
     @property
@@ -370,10 +368,8 @@ class Analysis:
             model = search.select(search.beside(base, model))
         if model.places:
             base, model = search.at.again(base), search.at.again(model)
-        judges = self.judges(search.at)
-        judges.starts.noise = search.at.starts.noise
-        model, rivals, notes = search.needful(model, self.step, judges.gains)
-        return Chosen(base, model, rivals, judges, notes)
+        model, rivals, notes = search.needful(model, self.step)
+        return Chosen(base, model, rivals, notes)
 
     def _stated(self, c: Chosen) -> Outcome:
         """What held-out data say of them."""
@@ -386,7 +382,7 @@ class Analysis:
         if at.sticks or len(c.model.fit.active):
             noises = at.doubt_steps(c.model.fit.x, self._finer(at))
         found = c.base, c.model, c.rivals
-        windows = self.held_out, c.judges
+        windows = self.held_out, self.judges(at)
         outcome = stated(search, *windows, self.space, *found, self.step)
         if not at.sticks or noises < STEPS_SEEN:
             return outcome

@@ -72,19 +72,24 @@ class Decisions:
     errors of as many windows, taken 1.4 times as large since windows overlap."""
 
     rare: float = 0.1
-    """Relative loss by which an effect that machines rarely have has to be better than
-    others, and these than friction, damping and rotor inertia, which nearly all drives
-    have: a prior for the kind of effect. Beside a rival it is half a standard error
-    between blocks, as each further number is: odds of 1 to 1.6. No test."""
+    """Relative loss: a prior for the kind of effect. By so much a rare effect has to be
+    better than an ordinary one, and an ordinary one than friction, damping or rotor
+    inertia, which nearly all drives have. Beside a rival each of these steps is half a
+    standard error between blocks, as each further number is: odds of 1 to 2.2. No
+    test."""
+
+    tried: int = 20
+    """Names that promise most at a stage: only these are tried beside the other sets of
+    effects, and only what was among them at some stage is a rival. No test: a twin
+    promises as much as its twin."""
 
     most: int = 5
     """Effects. The largest of the contract's machines has five."""
 
     probable: float = 0.7
     """Confidence of an effect, with what is within `open_from` floors left out of what
-    it closes, below which it is not named where nothing is open without it, or where
-    held-out data are predicted no better with it: what nobody misses has to be more
-    than twice as likely right as wrong."""
+    it closes, below which it is not named where nothing is open without it: what nobody
+    misses has to be more than twice as likely right as wrong."""
 
     # -- which of several names ------------------------------------------------
 
@@ -108,14 +113,14 @@ class Decisions:
     """Of the noise: names whose predictions differ by less, RMS, are twins: 100
     independent rows would tell them apart by one standard error."""
 
-    even: float = 0.33
+    even: float = 0.28
     """Nats for each number, lost without an effect, at which its name is as often wrong
     as right: half the logarithm of what is then open, by what is open with it. Fitted
     by maximum likelihood to the names of generated machines, most of which also lack
     what no effect of the table is (`benchmarks.gap_confidence`, which tests it on
     others)."""
 
-    steep: float = 1.0
+    steep: float = 0.89
     """How fast that changes with the logarithm of the loss; likewise. The standard
     errors of an effect's help say no more beside its cost: with them mechanisms that
     were left out were predicted no better."""

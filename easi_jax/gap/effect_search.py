@@ -7,7 +7,7 @@ length says is never added to what another does: they share rows.
 """
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -38,24 +38,14 @@ from easi_jax.model.parameter_proposal import like_places
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.progress import Tell
 
-Gains = Callable[[np.ndarray, Sequence[np.ndarray]], Sequence[bool]]
-
 RIVALS = 8  # names in the place of another that are followed up
 _STAGES = 8  # of adding one and taking out what has become needless
 _RIPPLES = [0.75 * k for k in range(3, 27)]  # cycles over the range of a joint
 _BEAM = 3  # sets of effects that are followed
-# Names that promised most, that are tried beside all sets of effects but the first, and
-# as rivals (benchmarks.gap_times).
-_LIKELY = 20
 _LOST = 0.25  # of the motion: errors of a model that does not follow it
 # Nats, of an effect without which predictions are not finite: as with e^20 times the
 # squared error.
 _BLOWS_UP = 10.0
-_NOT_MISSED = (
-    "the data are predicted a little better with it, but nothing is open without it, "
-    "and so little may be of another cause"
-)
-_NO_GAIN = "the fitting data are predicted better with it, the held-out data are not"
 
 
 class Places:
@@ -269,7 +259,7 @@ class EffectSearch:
                     if not likely or c.place.key in likely
                 ]
                 models, names = expanded(chosen, parent, more)
-                names = {*names[:_LIKELY], *(p.key for p in model.places)}
+                names = {*names[: DECIDE.tried], *(p.key for p in model.places)}
                 self._likely |= names
                 likely = likely or names
                 for m in models:
@@ -347,31 +337,24 @@ class EffectSearch:
             seen.add(keys(model))
 
     def needful(
-        self, model: Model, step: float, gains: Gains
+        self, model: Model, step: float
     ) -> tuple[Model, dict[str, list[Model]], list[str]]:
         """The model less what says nothing of the machine, with the rivals of what is
-        left, and notes.
-
-        Args:
-            step: of the physics [s].
-            gains: whether held-out data are predicted better by a vector than by each
-                of others.
-        """
+        left, and notes; ``step`` is that of the physics [s]."""
         model, rivals = self.exchanged(model)
         notes: list[str] = []
         for _ in range(DECIDE.most):
             brief = [p for p in model.places if self._brief(model, p, step)]
             idle = [p for p in model.places if p not in brief and self._idle(model, p)]
-            why = {} if brief or idle else self._spare(model, rivals, gains)
-            spare = [p for p in model.places if p.key in why]
+            spare = [] if brief or idle else self._spare(model, rivals)
             gone = [*brief, *idle, *spare]
             if not gone:
                 break
             self._tell_gone(brief, "less than a physics step")
             self._tell_gone(idle, "does nothing")
-            self._tell_gone(spare, "missed by no data, nor is it probable")
+            self._tell_gone(spare, "nothing is open without it, nor is it probable")
             notes += [_of_a_step(p, step) for p in brief]
-            notes += [f"{key}: {reason}; not named" for key, reason in why.items()]
+            notes += [_spared(p) for p in spare]
             self.offered.drop([*brief, *spare])
             less = self.at.without(model, gone)
             self.at.whiten(less.fit.x)
@@ -384,31 +367,26 @@ class EffectSearch:
         return within_a_step(place, float(model.fit.x[first]), step)
 
     def _spare(
-        self,
-        model: Model,
-        rivals: Mapping[str, Sequence[Model]],
-        gains: Gains,
-    ) -> dict[str, str]:
-        """The key of the effect that is missed least, of those that are not even
-        probable and without which nothing is open, or held-out data are predicted as
-        well; and why it is not named."""
-        x, plain = model.fit.x, self.at.plain
-        without = {p.key: self.at.without(model, [p]).fit.x for p in model.places}
-        missed = [key for key, less in without.items() if self.at.misses(x, less)]
-        why = dict.fromkeys([k for k in without if k not in missed], _NOT_MISSED)
-        helped = gains(plain(x), [plain(without[key]) for key in missed])
-        why |= {k: _NO_GAIN for k, ok in zip(missed, helped, strict=True) if not ok}
-        if not why:
-            return {}
+        self, model: Model, rivals: Mapping[str, Sequence[Model]]
+    ) -> list[Place]:
+        """The effect that is missed least, of those that are not probable and without
+        which nothing is open; none else."""
+        x = model.fit.x
+        idle = [
+            p
+            for p in model.places
+            if not self.at.misses(x, self.at.without(model, [p]).fit.x)
+        ]
+        if not idle:
+            return []
         # What is not open may be of any cause.
         each = self.missed(model, DECIDE.open_from)
-        for place in sorted(model.places, key=lambda p: each[p.key]):
+        for place in sorted(idle, key=lambda p: each[p.key]):
             among = rivals[place.key][:RIVALS]
             odds = odds_of(last(model, place), among, self.at.windows.led)
-            probable = confidence(each[place.key][0], odds) >= DECIDE.probable
-            if place.key in why and not probable:
-                return {place.key: why[place.key]}
-        return {}
+            if confidence(each[place.key][0], odds) < DECIDE.probable:
+                return [place]
+        return []
 
     def missed(
         self, model: Model, within: float = DECIDE.closed
@@ -428,14 +406,15 @@ class EffectSearch:
         """
         found: dict[str, list[tuple[float, float]]] = {p.key: [] for p in model.places}
         for length in self.lengths:
-            mine = _in_windows(length, self.at, model)
-            if mine is None:
-                continue
-            for place in model.places:
-                less = length.without(mine, [place], possible=False)
-                finite = np.isfinite(less.loss).all()
-                lost = cost(mine, less, within) if finite else _BLOWS_UP
-                found[place.key].append((lost, certainty(mine, less)))
+            with length.as_before():
+                mine = _in_windows(length, self.at, model)
+                if mine is None:
+                    continue
+                for place in model.places:
+                    less = length.without(mine, [place], possible=False)
+                    finite = np.isfinite(less.loss).all()
+                    lost = cost(mine, less, within) if finite else _BLOWS_UP
+                    found[place.key].append((lost, certainty(mine, less)))
         return {key: max(each, default=(0.0, 0.0)) for key, each in found.items()}
 
     def _tell_gone(self, places: Sequence[Place], why: str) -> None:
@@ -498,6 +477,13 @@ def _of_a_step(place: Place, step: float) -> str:
         f"step of {1000 * step:.3g} ms, which shifts commands by half of "
         "itself; not named. With a smaller timestep in the model the data could "
         "tell."
+    )
+
+
+def _spared(place: Place) -> str:
+    return (
+        f"{place.key}: the data are predicted a little better with it, but nothing is "
+        "open without it, and so little may be of another cause; not named"
     )
 
 

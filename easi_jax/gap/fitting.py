@@ -1,7 +1,8 @@
 """Windows of one length, to which sets of effects are fitted."""
 
+import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -327,6 +328,16 @@ class Fitting:
         else:
             self.begin(self.plain(model.fit.x))
         return self.selector.fit(model.places, self.vector(model.fit.x))
+
+    @contextlib.contextmanager
+    def as_before(self) -> Iterator[None]:
+        """Afterwards the starts, and whether something sticks, are what they were."""
+        chosen = self.selector
+        kept = chosen.sticks, chosen.moved
+        try:
+            yield
+        finally:
+            chosen.sticks, chosen.moved = kept
 
     def without(
         self, model: Model, gone: Sequence[Place], possible: bool = True

@@ -284,6 +284,8 @@ class Selector:
             spared: as of `needed`.
         """
         for place in list(model.places):
+            if place not in model.places:  # needless beside another shape
+                continue
             other = [c for c in shapes if c.place.key == place.key]
             best = self._replaced(model, place, other)
             if best is None:

@@ -59,12 +59,6 @@ class HeldOut:
         """Figures of a vector ``(n,)``, by the slopes of the last `look`."""
         return self._figures(x, self._fitted(x[None])[1][0], share)
 
-    def gains(self, x: np.ndarray, others: Sequence[np.ndarray]) -> list[bool]:
-        """Whether a vector leaves less of a gap than each of others, each with starts
-        of its own."""
-        gap = self.look(x).gap if others else 0.0
-        return [gap < self.figures(other).gap for other in others]
-
     def squares(self, x: np.ndarray, share: float = 0.0) -> np.ndarray:
         """Mean squares of each window for vectors ``(B, n)``, ``(B, W, c)``."""
         out = [np.zeros((0, len(self.windows), self.starts.compared))]

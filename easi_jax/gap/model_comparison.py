@@ -30,7 +30,7 @@ def _in_errors(d: np.ndarray, least: float) -> float:
 def rank(model: Model) -> float:
     """Cross-validated loss, with a handicap for what machines rarely have, and an
     advantage for what nearly all have."""
-    return float(model.loss.mean()) * (1.0 + DECIDE.rare * model.unlikely)
+    return float(model.loss.mean()) * (1.0 + DECIDE.rare) ** model.unlikely
 
 
 def better(model: Model, base: Model, floor: float) -> bool:

@@ -24,7 +24,7 @@ ELSEWHERE = {
     },
     "candidates": {"_PAIRS"},
     "discretization_error": {"FINER", "_OWN_SHIFT"},
-    "effect_search": {"RIVALS", "_STAGES", "_BEAM", "_LIKELY", "_LOST", "_BLOWS_UP"},
+    "effect_search": {"RIVALS", "_STAGES", "_BEAM", "_LOST", "_BLOWS_UP"},
     "excitation_coverage": {"_PAST", "_STILL", "_MOST"},
     "fitting": {"_DRAWS", "_PAIRS", "STEPS_SEEN", "_WHOLE", "_BENT", "_LET_PASS"},
     "forward_selection": {"_LOST"},

@@ -1,5 +1,6 @@
 """What is not probable, and what nobody would miss, is not named."""
 
+import contextlib
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,8 +10,6 @@ import pytest
 from easi_jax.gap import effect_search
 from easi_jax.gap.effect_search import EffectSearch
 from easi_jax.gap.forward_selection import Selector
-
-ALL = {"friction", "gain", "tilt"}
 
 
 class _Windows:
@@ -34,46 +33,35 @@ class _Windows:
     def again(self, model: Any) -> Any:
         return self.model([p.key for p in model.places])
 
-    def plain(self, x: list[str]) -> list[str]:
-        return x
+    def as_before(self) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext()
 
     def misses(self, x: list[str], less: list[str]) -> bool:
         return bool(set(x) - set(less) & self.missed)
 
 
 @pytest.mark.parametrize(
-    ("worth", "missed", "seen", "spared"),
+    ("worth", "missed", "spared"),
     [
-        ({"friction": 3.0, "gain": 0.2, "tilt": 0.1}, {"friction"}, ALL, ["tilt"]),
-        ({"friction": 3.0, "gain": 0.2}, {"friction", "gain"}, ALL, []),
-        ({"friction": 3.0, "gain": 2.0}, set(), ALL, []),
-        ({"friction": 3.0, "gain": 0.1, "tilt": 0.2}, {"gain"}, ALL, ["tilt"]),
-        ({"friction": 3.0, "gain": 0.2}, ALL, {"friction"}, ["gain"]),
-        ({"friction": 3.0, "gain": 2.0}, ALL, {"friction"}, []),
+        ({"friction": 3.0, "gain": 0.2, "tilt": 0.1}, {"friction"}, ["tilt"]),
+        ({"friction": 3.0, "gain": 0.2}, {"friction", "gain"}, []),
+        ({"friction": 3.0, "gain": 2.0}, set(), []),
+        ({"friction": 3.0, "gain": 0.1, "tilt": 0.2}, {"gain"}, ["tilt"]),
     ],
-    ids=[
-        *("least first", "missed", "probable", "one of two"),
-        *("not held out", "probable all the same"),
-    ],
+    ids=["least first", "missed", "probable", "one of two"],
 )
 def test_what_is_neither_probable_nor_missed_is_spared(
     worth: dict[str, float],
     missed: set[str],
-    seen: set[str],
     spared: list[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """``seen``: what held-out data are predicted better with."""
     at = _Windows(worth, missed)
     monkeypatch.setattr(effect_search, "last", lambda model, place: model)
     search: Any = EffectSearch([at], 0, SimpleNamespace(), print)  # type: ignore
     model: Any = at.model(list(worth))
-
-    def gains(x: list[str], others: list[list[str]]) -> list[bool]:
-        return [bool(set(x) - set(less) & seen) for less in others]
-
-    found = search._spare(model, {key: [] for key in worth}, gains)
-    assert [*found] == spared
+    found = search._spare(model, {key: [] for key in worth})
+    assert [p.key for p in found] == spared
 
 
 def test_what_windows_of_another_length_show_is_not_spared(
@@ -84,10 +72,8 @@ def test_what_windows_of_another_length_show_is_not_spared(
     model = short.model(["friction"])
     for lengths, spared in (([short], ["friction"]), ([short, long], [])):
         search: Any = EffectSearch(lengths, 0, SimpleNamespace(), print)  # type: ignore
-        found = search._spare(
-            model, {"friction": []}, lambda x, others: [True] * len(others)
-        )
-        assert [*found] == spared
+        found = search._spare(model, {"friction": []})
+        assert [p.key for p in found] == spared
 
 
 @pytest.mark.parametrize(
@@ -160,3 +146,30 @@ def test_the_shape_of_an_effect_is_asked_for_again_beside_the_others(
         assert found is spread
     else:
         assert found is (alone if len(chosen) == 1 else other)
+
+
+def test_what_another_shape_made_needless_is_not_asked_for_its_own() -> None:
+    """It would be fitted beside the others, and named nowhere."""
+    mass, other = (SimpleNamespace(key=f"mass@{b}", rarity=0) for b in "ab")
+
+    def fitted(*places: Any) -> Any:
+        even = 1.0 + 1e-3 * np.arange(10)
+        fit = SimpleNamespace(active=np.arange(len(places)), residual=np.zeros(0))
+        every = [*places]
+        windows = np.zeros((2, 0))
+        return SimpleNamespace(
+            places=every, loss=even, gap=even, windows=windows, fit=fit
+        )
+
+    both, alone, asked = fitted(mass, other), fitted(mass), []
+
+    def replaced(model: Any, place: Any, shapes: list[Any]) -> Any:
+        asked.append(place)
+        return both
+
+    selector: Any = SimpleNamespace(
+        floor=0.1, _replaced=replaced, needed=lambda model, spared: alone
+    )
+    shapes: Any = [SimpleNamespace(place=p) for p in (mass, other)]
+    assert Selector.shaped(selector, both, shapes) is alone
+    assert asked == [mass]

@@ -1,5 +1,6 @@
 """Fits, noise floors and whitening on problems whose answers are known."""
 
+import contextlib
 import copy
 from dataclasses import replace
 from types import SimpleNamespace
@@ -33,7 +34,6 @@ from easi_jax.gap.effect_search import EffectSearch
 from easi_jax.gap.effect_set import Candidate, Model
 from easi_jax.gap.effect_vector import Layout
 from easi_jax.gap.forward_selection import Selector
-from easi_jax.gap.held_out import HeldOut
 from easi_jax.gap.model_comparison import (
     advantage,
     are_twins,
@@ -605,6 +605,9 @@ def test_an_effect_is_missed_as_in_the_windows_that_show_it_most() -> None:
             self.mine = of_loss(10.0 + rng.random(10))
             self.mine.places = [damping]
 
+        def as_before(self) -> contextlib.AbstractContextManager[None]:
+            return contextlib.nullcontext()
+
         def again(self, _: Model) -> Model:
             if self.times == np.inf:
                 raise UserError("most predictions are not finite")
@@ -710,6 +713,10 @@ def test_of_names_that_do_as_well_what_most_machines_have_is_likelier(
     names = "coulomb_friction", "actuator_gain", "quadratic_drag"
     common, ordinary, rare = map(alike, names)
     assert rank(common) < rank(ordinary) < rank(rare)
+    # By as much, whatever else is in a model.
+    for beside in (-2, 0, 2):
+        more = [replace(x, unlikely=x.unlikely + beside) for x in (common, ordinary)]
+        assert rank(more[1]) / rank(more[0]) == pytest.approx(1.1)
     assert probability(common, ordinary) == pytest.approx(0.69, abs=0.01)
     assert probability(ordinary, rare) == pytest.approx(0.69, abs=0.01)
     assert probability(common, rare) == pytest.approx(0.84, abs=0.01)
@@ -730,8 +737,7 @@ def test_beside_a_law_the_rivals_of_effects_are_offered_again() -> None:
     other = Place("actuator_delay", "motor", "actuator", (), ())
     model, rival = of_loss(np.ones(10)), of_loss(np.ones(10))
     model.places, rival.places = [mine], [other]
-    held_out = cast(HeldOut, None)
-    chosen = Chosen(model, model, {mine.key: [rival]}, held_out, [])
+    chosen = Chosen(model, model, {mine.key: [rival]}, [])
     assert chosen.names == {mine.key, other.key}
 
 
