@@ -66,22 +66,10 @@ def told(row: Mapping[str, Any]) -> bool:
 
 
 def judged(rows: Sequence[dict[str, Any]]) -> list[tuple[bool, float]]:
-    """For every effect named: whether it is there, and the confidence stated.
-
-    Of lines that do not say it, twins by physics count as there where the case was
-    right as a whole.
-    """
-    out = []
-    for r in rows:
-        if "there" in r:
-            out += zip(r["there"], r["confidence"], strict=True)
-            continue
-        for name, confidence in zip(r["named"], r["confidence"], strict=True):
-            there = name in r["truth"]
-            if not there and r["right"] and r["kind"] in ("single", "pair"):
-                there = name in r["named"][: len(r["truth"])]
-            out.append((there, float(confidence)))
-    return out
+    """For every effect named: whether it is there, and the confidence stated."""
+    return [
+        pair for r in rows for pair in zip(r["there"], r["confidence"], strict=True)
+    ]
 
 
 def brier(pairs: Sequence[tuple[bool, float]]) -> float:

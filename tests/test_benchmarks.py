@@ -75,6 +75,7 @@ def case(
         "kind": kind,
         "truth": truth,
         "named": named,
+        "there": [name in truth for name in named],
         "confidence": [sure] * len(named),
         "verdict": "explained",
         "verdicts": ["explained"] if truth else ["no_gap"],

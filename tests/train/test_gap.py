@@ -14,7 +14,10 @@ from easi_jax.errors import UserError
 from easi_jax.gap.forward_selection import Selector
 from easi_jax.io.models.effects_file import read_effects
 from easi_jax.io.runs.step_cache import Journal
+from easi_jax.model.effect_catalog import CATALOG
 from easi_jax.model.found_effects import FoundEffects
+from easi_jax.model.found_laws import FoundLaw, add_law
+from easi_jax.model.law_terms import Term
 from easi_jax.model.parameters import ParameterSpace
 from easi_jax.simulation.simulator import Simulator
 from easi_jax.simulation.with_effects import simulator_with
@@ -120,6 +123,21 @@ def test_results_are_not_overwritten(
         )
     assert stop.value.code == 2
     assert "--overwrite" in capsys.readouterr().err
+
+
+def test_laws_that_were_found_go_with_the_analysis(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The next machine of the same process has none of them."""
+    names = []
+
+    def finds(_: Any) -> None:
+        names.append(add_law(FoundLaw((("j", 1.0),), (Term("qpos.j**3"),))))
+        assert names[0] in CATALOG
+
+    monkeypatch.setattr(gap, "_run", finds)
+    gap.run(gap.Config())
+    assert names[0] not in CATALOG
 
 
 @pytest.mark.parametrize("after", [2, pytest.param(4, marks=pytest.mark.slow)])
