@@ -76,6 +76,7 @@ def case(
         "truth": truth,
         "named": named,
         "there": [name in truth for name in named],
+        "readings": [],
         "confidence": [sure] * len(named),
         "verdict": "explained",
         "verdicts": ["explained"] if truth else ["no_gap"],
@@ -103,6 +104,9 @@ def test_cases_of_the_gap_are_counted() -> None:
     assert got["false alarms without effect"] == (1, 2)
     assert got["wrong with confidence above 0.8"] == (1, 6)
     assert got["pairs both found"] == (1, 1)
+    late = {**rows[3], "readings": ["sensor_delay@qvel.x"]}
+    assert gap_score.has_right_verdict(late), "late velocities are an effect"
+    assert not gap_score.has_right_verdict(rows[3])
     assert gap_score.confusion(rows) == {"a": {"a": 1, "b": 2}}
     pairs = gap_score.judged(rows)
     assert [ok for ok, _ in pairs] == [True, False, False, False, True, True]
