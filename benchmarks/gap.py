@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from benchmarks._cells import add_row, read_rows
 from benchmarks.gap_score import keys_of
 from train._command import main, say
 from train._options import EngineOptions
@@ -58,10 +59,7 @@ def run(config: Config) -> None:
     from easi_jax.io.runs.versions import versions
     from tests.gap_cases import CaseError, draw_case
 
-    done = set()
-    if config.out.exists():
-        rows = [json.loads(line) for line in config.out.read_text().splitlines()]
-        done = {tuple(r["asked"]) for r in rows}
+    done = {tuple(r["asked"]) for r in read_rows(config.out, ("asked",))}
     commit = versions()["commit"]
     for seed in range(*config.seeds):
         asked_for = (seed, *(getattr(config, name) for name in _ASKED))
@@ -93,8 +91,7 @@ def run(config: Config) -> None:
             "commit": commit,
             "command": command_of("benchmarks.gap", config),
         }
-        with config.out.open("a") as file:
-            file.write(json.dumps(row) + "\n")
+        add_row(config.out, row)
         say(f"{config.kind} {seed}: {told(row)}")
 
 

@@ -12,7 +12,6 @@ mechanism left out in turn, and of the frozen set (`benchmarks.gap_frozen`).
 """
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -160,9 +159,9 @@ def run(config: Config) -> None:
     from benchmarks._common import command_of, write_result
     from easi_jax.errors import UserError
 
-    if not config.lines.is_file():
-        raise UserError(f"{config.lines} is not there; python -m benchmarks.gap --help")
-    rows = [json.loads(line) for line in config.lines.read_text().splitlines()]
+    rows = read_rows(config.lines)
+    if not rows:
+        raise UserError(f"{config.lines}: no lines; python -m benchmarks.gap --help")
     every = said(rows)
     even, steep = fitted(every)
     told = {"mechanism left out": by_family(left_out(every))}

@@ -292,16 +292,30 @@ def _confidence(r: dict[str, Any]) -> list[str]:
         for k, f in told.items()
     ]
     head = "machines", "hidden", "named", "there", *_FIGURES, "wrong above 0.8"
-    told = ", ".join(f"{k} {v:.2f}" for k, v in r["curve"].items())
+    curve = ", ".join(f"{k} {v:.2f}" for k, v in r["curve"].items())
     return [
         f"`python -m benchmarks.gap_confidence`: the curve was fitted to "
         f"{r['config']['lines']} generated machines, most of one or two joints, "
-        f"commits {', '.join(map(short, r['config']['commits']))} ({told}). "
+        f"commits {', '.join(map(short, r['config']['commits']))} ({curve}). "
         "Mechanism left out: these, by a curve fitted to the other mechanisms. Goals: "
         "Brier score below 0.08; calibration error below 0.05, of each kind below 0.1; "
         "over at least 300 names.",
         markdown_table(head, lines),
+        *(f"{name}: {_judged(told)}." for name, told in r["families"].items()),
     ]
+
+
+def _judged(told: dict[str, dict[str, float]]) -> str:
+    """Figures of `benchmarks.gap_confidence` by their goals."""
+    every = told["all"]
+    error = all(
+        f["calibration error"] < (0.05 if family == "all" else 0.1)
+        for family, f in told.items()
+    )
+    return (
+        f"Brier score {met(every['Brier score'] < 0.08)}, calibration error "
+        f"{met(error)}, names {met(every['names'] >= 300)}"
+    )
 
 
 def _horizons(found: dict[str, Any]) -> list[str]:

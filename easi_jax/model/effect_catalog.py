@@ -371,18 +371,13 @@ def _inside(sizes_of: str) -> tuple[Limit, Limit]:
 
 
 def _vector(
-    field: str,
-    names: str | tuple[str, ...],
-    scale: str,
-    high: float,
-    size: float,
-    rarity: int = 0,
+    field: str, names: str | tuple[str, ...], scale: str, high: float, size: float
 ) -> Site:
     parts = tuple(
         Part(f"{field}.{i}", name, scale, -high, high, size)
         for i, name in enumerate(names)
     )
-    return Site(parts, ((0.0,) * len(parts),), rarity=rarity)
+    return Site(parts, ((0.0,) * len(parts),))
 
 
 # A motor is rarely 2.5 times weaker than its data sheet, but may well carry a load that
@@ -497,7 +492,7 @@ _ROWS = (
         'a constant force acts at {kind} "{at}"',
         {
             "joint": _alone("constant", "torque", "torque", -20, 20, 0.03),
-            "body": _vector("force", "xyz", "mass", 200, 0.1, RARE),
+            "body": replace(_vector("force", "xyz", "mass", 200, 0.1), rarity=RARE),
         },
     ),
     Effect(

@@ -363,10 +363,11 @@ def in_step(
     Args:
         d: before `forward`.
         rotor: drives before the step (`backlash.Rotor`); empty where none has play.
-        hidden: what laws remember (`own_laws.next_states`).
+        hidden: what laws remember (`own_laws.next_states`); an empty tuple where none
+            acts (`has_own`).
     """
     at, dof = scalar_places(m).T
-    if e.laws and not isinstance(d.time, tuple):
+    if e.laws and not isinstance(hidden, tuple):
         d = acting(d, e.own, e.laws, hidden)
     v = d.qvel
     fall = jnp.exp(-jnp.square(v / e.stribeck))

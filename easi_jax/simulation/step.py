@@ -217,8 +217,6 @@ def substep(model: Any, state: Physics, ctrl: jax.Array, wide: bool = False) -> 
     e, rotor, own = model.effects, state.rotor, {}
     if effects.has_own(e, model.present):
         d, own = d.replace(time=state.time), later(model, state, ctrl, m.opt.timestep)
-    elif e is not None:
-        e = e.replace(laws=())
     if e is not None:
         m, d, rotor = effects.in_step(m, d, e, rotor, state.hidden)
     with refusals(NotImplementedError):

@@ -105,6 +105,14 @@ def test_rivals_are_looked_for_among_likely_names(
     assert asked == tried
 
 
+def fitted(loss: float, *places: Any) -> Any:
+    """A set of effects with its loss, each of one number."""
+    even = loss + 1e-3 * np.arange(10)
+    fit = SimpleNamespace(active=np.arange(len(places)), residual=np.zeros(0))
+    given = {"places": [*places], "windows": np.zeros((2, 0)), "fit": fit}
+    return SimpleNamespace(loss=even, gap=even, **given)
+
+
 @pytest.mark.parametrize(
     ("point", "point_alone", "chosen"),
     [
@@ -120,21 +128,9 @@ def test_the_shape_of_an_effect_is_asked_for_again_beside_the_others(
     """A mass that is spread, less some inertia, is a point: losses of a point with the
     inertia and alone, where that of both as they are is 1."""
 
-    def fitted(loss: float, *keys: str) -> Any:
-        even = loss + 1e-3 * np.arange(10)
-        places = [SimpleNamespace(key=k, rarity=0) for k in keys]
-        active = np.arange(len(keys))
-        windows = np.zeros((2, 0))
-        return SimpleNamespace(
-            places=places,
-            loss=even,
-            gap=even,
-            windows=windows,
-            fit=SimpleNamespace(active=active, residual=np.zeros(0)),
-        )
-
-    spread = fitted(1.0, "mass", "inertia")
-    other, alone = fitted(point, "mass", "inertia"), fitted(point_alone, "mass")
+    mass, inertia = (SimpleNamespace(key=k, rarity=0) for k in ("mass", "inertia"))
+    spread = fitted(1.0, mass, inertia)
+    other, alone = fitted(point, mass, inertia), fitted(point_alone, mass)
     shape: Any = SimpleNamespace(place=SimpleNamespace(key="mass"))
     selector: Any = SimpleNamespace(
         floor=0.1,
@@ -152,16 +148,7 @@ def test_what_another_shape_made_needless_is_not_asked_for_its_own() -> None:
     """It would be fitted beside the others, and named nowhere."""
     mass, other = (SimpleNamespace(key=f"mass@{b}", rarity=0) for b in "ab")
 
-    def fitted(*places: Any) -> Any:
-        even = 1.0 + 1e-3 * np.arange(10)
-        fit = SimpleNamespace(active=np.arange(len(places)), residual=np.zeros(0))
-        every = [*places]
-        windows = np.zeros((2, 0))
-        return SimpleNamespace(
-            places=every, loss=even, gap=even, windows=windows, fit=fit
-        )
-
-    both, alone, asked = fitted(mass, other), fitted(mass), []
+    both, alone, asked = fitted(1.0, mass, other), fitted(1.0, mass), []
 
     def replaced(model: Any, place: Any, shapes: list[Any]) -> Any:
         asked.append(place)
